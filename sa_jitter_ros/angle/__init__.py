@@ -1,0 +1,1 @@
+"""From keyphasor to angle: pulse detection, pulse validation, angle laws, resampling."""

@@ -1,0 +1,1 @@
+"""From trigger cycles to averages: streaming averages, recovery of pulse errors, indicators."""

@@ -1,0 +1,1 @@
+"""Machines whose truth is known."""

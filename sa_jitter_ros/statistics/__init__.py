@@ -1,0 +1,1 @@
+"""What pulse jitter does to an average: exact moments, laws of the amplitude, design."""
