@@ -1,0 +1,142 @@
+"""
+Resampling: values of a sampled signal between its samples.
+
+One operator serves all channels: the value at a position is a weighted sum of the samples around it,
+so that the positions of a trigger cycle make a sparse matrix, applied to samples x channels at once.
+The weights come from a table of the kernel over `PHASES` fractions of a sample, interpolated linearly
+(error below 2e-6). Positions that are further apart than the samples need an anti-alias filter: the
+kernel is stretched, which moves its cut-off from half the sampling rate to `cutoff` times that; the
+band-limited kernel is made longer then, flat to 0.8 and closed from 1.0 of the cut-off on.
+
+What an interpolator costs is its gain at the frequency f (`gain`): none to speak of for the default
+(Kaiser-windowed sinc, below 0.001 dB to 0.32 fs), but sinc^2(f/fs) for linear interpolation, which at
+f_kp = fs costs three times what the pulse jitter costs.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError, SignalError
+from scipy import sparse
+
+FloatArray = NDArray[np.float64]
+
+PHASES = 512
+_SPLINE_POLE = np.sqrt(3.0) - 2.0
+# method: half-width of its kernel in samples
+_HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
+METHODS = tuple(_HALF_WIDTH)
+_KAISER_BETA = 9.0
+
+
+def _kernel(method: str, x: FloatArray, half: int) -> FloatArray:
+    """Impulse response of an interpolator at `x` samples from its centre, zero beyond `half`."""
+    d = np.abs(x)
+    if method == 'linear':
+        return np.maximum(1.0 - d, 0.0)
+    if method == 'cubic':  # Keys 1981, cubic convolution with a = -1/2
+        inner = (1.5 * d - 2.5) * d * d + 1.0
+        outer = ((-0.5 * d + 2.5) * d - 4.0) * d + 2.0
+        return np.where(d < 1.0, inner, np.where(d < 2.0, outer, 0.0))
+    if method == 'spline':  # cardinal cubic spline (Unser 1999, Eq. 22)
+        total = np.zeros_like(d)
+        for k in range(-half - 2, half + 3):
+            e = np.abs(x - k)
+            b3 = np.where(e < 1.0, 2.0 / 3.0 - e * e + e**3 / 2.0,
+                          np.where(e < 2.0, (2.0 - e) ** 3 / 6.0, 0.0))
+            total += -6.0 * _SPLINE_POLE / (1.0 - _SPLINE_POLE**2) * _SPLINE_POLE ** abs(k) * b3
+        return total
+    window = np.sqrt(np.maximum(1.0 - (d / half) ** 2, 0.0))
+    taper: FloatArray = np.i0(_KAISER_BETA * window) / np.i0(_KAISER_BETA)
+    return np.where(d < half, np.sinc(x) * taper, 0.0)
+
+
+def _stretch(method: str, cutoff: float) -> tuple[int, float]:
+    """Half-width of the kernel at unit stretch, and the stretch."""
+    half = _HALF_WIDTH[_known(method)]
+    if method == 'band_limited' and cutoff < 1.0:
+        # Three times as sharp, and shifted, so that the stop band begins at the cut-off itself.
+        return 3 * half, 0.9 * cutoff
+    return half, cutoff
+
+
+@lru_cache(maxsize=64)
+def _table(method: str, cutoff: float) -> tuple[FloatArray, FloatArray, int]:
+    """Weights at each phase, their steps to the next phase, and the half-width in samples."""
+    half, stretch = _stretch(method, cutoff)
+    width = margin(method, cutoff=cutoff)
+    phases = max(int(np.ceil(PHASES * stretch)), 16)
+    fraction = np.arange(phases + 1)[:, None] / phases
+    taps = np.arange(1 - width, width + 1)[None, :]
+    weights = _kernel(method, stretch * (taps - fraction), half)
+    weights /= weights.sum(axis=1, keepdims=True)  # a constant stays what it is
+    return np.ascontiguousarray(weights[:-1]), np.diff(weights, axis=0), width
+
+
+def _known(method: str) -> str:
+    if method not in _HALF_WIDTH:
+        raise ParameterError(f'interpolation is {method!r}: give one of {", ".join(METHODS)}')
+    return method
+
+
+def margin(method: str, *, cutoff: float = 1.0) -> int:
+    """Samples that interpolation needs on either side of a position."""
+    half, stretch = _stretch(method, cutoff)
+    return int(np.ceil(half / stretch))
+
+
+def gain(method: str, frequency: FloatArray) -> FloatArray:
+    """
+    Gain of an interpolator at `frequency` in units of the sampling rate.
+
+    It is the Fourier transform of the kernel: sinc^2 for linear, 3 sinc^4 / (2 + cos 2 pi f) for the
+    cubic spline.
+    """
+    half = _HALF_WIDTH[_known(method)]
+    x, step = np.linspace(-half, half, 2 * half * PHASES + 1, retstep=True)
+    phase = 2.0 * np.pi * np.multiply.outer(np.asarray(frequency, dtype=np.float64), x)
+    return np.asarray(np.cos(phase) @ _kernel(method, x, half) * step)
+
+
+def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'band_limited',
+                cutoff: float = 1.0) -> FloatArray:
+    """
+    Values of `samples` (n, channels) at `positions` (m,), counted in samples from the first.
+
+    Positions must lie within [0, n - 1]; towards either end the signal is continued by point
+    reflection. `cutoff` in (0, 1] is the band that survives, as a fraction of half the sampling
+    rate. Returns (m, channels). Raises `SignalError` for positions outside the samples or the wrong
+    number of dimensions, `ParameterError` for an unknown method or cut-off.
+    """
+    if not 0.0 < cutoff <= 1.0:
+        raise ParameterError(f'cutoff is {cutoff}: give more than 0 and at most 1')
+    if samples.ndim != 2 or positions.ndim != 1:
+        raise SignalError(f'samples have {samples.ndim} and positions {positions.ndim} dimensions: '
+                          'give (sample, channel) and (position,)')
+    table, steps, half = _table(method, cutoff)
+    if positions.size == 0:
+        return np.empty((0, samples.shape[1]))
+    low, high = float(positions.min()), float(positions.max())
+    if not (low >= 0.0 and high <= len(samples) - 1):
+        raise SignalError(f'positions {low:.6g} to {high:.6g} asked of samples 0 to '
+                          f'{len(samples) - 1}: stay within the samples')
+    base = np.floor(positions)
+    phase = (positions - base) * len(table)
+    row = phase.astype(np.intp)
+    weights = steps[row]
+    weights *= (phase - row)[:, None]
+    weights += table[row]
+
+    first, last = int(low) - half + 1, int(high) + half
+    window = samples[max(first, 0):last + 1]
+    if first < 0 or last >= len(samples):
+        window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
+                        mode='reflect', reflect_type='odd')
+    taps = 2 * half
+    columns = (base.astype(np.int32) - (half - 1 + first))[:, None] + np.arange(
+        taps, dtype=np.int32)
+    rows = np.arange(0, taps * len(positions) + 1, taps, dtype=np.int32)
+    operator = sparse.csr_matrix((weights.ravel(), columns.ravel(), rows),
+                                 shape=(len(positions), len(window)))
+    return np.asarray(operator @ window)

@@ -1,0 +1,313 @@
+"""
+The vibration's time line: blocks in, stretches of consecutive samples out.
+
+The sample index decides continuity. Blocks that were received before, stray or malformed are dropped,
+a gap in the index ends a stretch, a source that starts again opens a new epoch; all is counted.
+Memory is bounded by `buffer_seconds`: the oldest samples go first.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import SignalError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """
+    Consecutive samples of one source.
+
+    `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz, `index`
+    of the first sample, which counts on from block to block.
+    """
+
+    samples: FloatArray
+    start_time: float
+    sample_rate: float
+    index: int
+
+    @property
+    def end_index(self) -> int:
+        """Index of the sample after the last one."""
+        return self.index + self.samples.shape[1]
+
+
+@dataclass
+class TimelineCounts:
+    """What happened to the samples so far."""
+
+    samples_dropped: int = 0
+    gaps: int = 0
+    restarts: int = 0
+    repeats: int = 0
+    clock_deviation: int = 0
+    blocks_rejected: int = 0
+    non_finite: int = 0
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Times of a run of samples: that of the first one, and on from there by index over rate."""
+
+    time: float
+    index: int
+    rate: float
+
+    def time_of(self, index: float) -> float:
+        """Time (s) of a sample index."""
+        return self.time + (index - self.index) / self.rate
+
+
+class Stretch:
+    """
+    Consecutive finite samples on one clock; grows at the end, is trimmed at the start.
+
+    `epoch` counts how often time ran back before it; `closed` tells that no sample will follow.
+    """
+
+    def __init__(self, clock: Clock, epoch: int, index: int, samples: FloatArray) -> None:
+        self.clock, self.epoch, self.closed = clock, epoch, False
+        self._data = np.ascontiguousarray(samples.T)
+        self._begin, self._end = 0, len(self._data)
+        self._index = index
+
+    @property
+    def index(self) -> int:
+        """Index of the first sample held."""
+        return self._index + self._begin
+
+    @property
+    def end_index(self) -> int:
+        """Index after the last sample held."""
+        return self._index + self._end
+
+    @property
+    def samples(self) -> FloatArray:
+        """Samples held (sample, channel), without a copy."""
+        return self._data[self._begin:self._end]
+
+    @property
+    def start_time(self) -> float:
+        """Time of the first sample held."""
+        return self.clock.time_of(self.index)
+
+    @property
+    def end_time(self) -> float:
+        """Time of the last sample held."""
+        return self.clock.time_of(self.end_index - 1)
+
+    def position(self, times: FloatArray) -> FloatArray:
+        """Position of times in samples from the first one held."""
+        return (times - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
+
+    def append(self, samples: FloatArray) -> None:
+        """Add samples (channel, sample) behind the last one."""
+        count = samples.shape[1]
+        if self._end + count > len(self._data):
+            held = self.samples
+            size = max(2 * (len(held) + count), 1024)
+            data = np.empty((size, held.shape[1]))
+            data[:len(held)] = held
+            self._index, self._data = self.index, data
+            self._begin, self._end = 0, len(held)
+        self._data[self._end:self._end + count] = samples.T
+        self._end += count
+
+    def trim(self, index: int) -> int:
+        """Forget the samples before `index`; returns how many those were."""
+        count = min(max(index - self.index, 0), self._end - self._begin)
+        self._begin += count
+        return count
+
+
+@dataclass
+class VibrationTimeline:
+    """
+    Takes blocks in any order of arrival and keeps `stretches` of consecutive samples.
+
+    A header time more than half a sample off the clock of its run is counted, more than
+    `time_tolerance` (s) starts a new run. A block that lies wholly before the last one's start is
+    held back until the next block tells: one that continues it makes a restart of the source, any
+    other a repeated or stray block, which is dropped.
+    """
+
+    time_tolerance: float = 0.01
+    buffer_seconds: float = 5.0
+    counts: TimelineCounts = field(default_factory=TimelineCounts)
+    stretches: list[Stretch] = field(default_factory=list)
+    epoch: int = 0
+    messages: list[str] = field(default_factory=list)
+    _last: SampleBlock | None = None
+    _suspect: SampleBlock | None = None
+    _odd: tuple[int, float] | None = None
+    _clock: Clock | None = None
+
+    @property
+    def layout(self) -> tuple[int, float] | None:
+        """Number of channels and sampling rate (Hz), None before the first block."""
+        if self._last is None:
+            return None
+        return self._last.samples.shape[0], self._last.sample_rate
+
+    @property
+    def end_time(self) -> float:
+        """Time of the newest sample, minus infinity before the first."""
+        return self.stretches[-1].end_time if self.stretches else -np.inf
+
+    def add(self, block: SampleBlock) -> None:
+        """Take a block; raises `SignalError` for one that cannot be used, which is counted."""
+        try:
+            changed = self._check(block)
+        except SignalError:
+            self.counts.blocks_rejected += 1
+            self.counts.samples_dropped += block.samples.shape[-1] if block.samples.ndim else 0
+            raise
+        last = self._last
+        if last is None or self._clock is None or changed:
+            self._new_run(block, restart=last is not None)
+            return
+        suspect, self._suspect = self._suspect, None
+        if suspect is not None:
+            if block.index == suspect.end_index and abs(
+                    block.start_time - suspect.start_time
+                    - suspect.samples.shape[1] / suspect.sample_rate) <= self.time_tolerance:
+                self._new_run(suspect, restart=True)
+                last = suspect
+            else:
+                self._drop(suspect, 'is repeated or out of order')
+        if block.index < last.index and block.start_time < last.start_time:
+            self._suspect = block
+            return
+        self._continue(block)
+
+    def confirm_restart(self) -> None:
+        """Take a held-back block for a restart: the pulses have run back as well."""
+        if self._suspect is not None:
+            suspect, self._suspect = self._suspect, None
+            self._new_run(suspect, restart=True)
+
+    def release(self, epoch: int, before: float) -> None:
+        """Forget the samples before the time `before` (s) of `epoch`: they were used."""
+        for stretch in self.stretches:
+            if stretch.epoch < epoch:
+                stretch.trim(stretch.end_index)
+            elif stretch.epoch == epoch:
+                stretch.trim(stretch.index + int(np.floor(stretch.position(np.float64(before)))))
+        self._tidy()
+
+    def bound(self) -> None:
+        """Drop and count the oldest samples beyond `buffer_seconds`."""
+        for stretch in self.stretches:
+            excess = (sum(len(item.samples) for item in self.stretches)
+                      - round(self.buffer_seconds * stretch.clock.rate))
+            if excess <= 0:
+                break
+            self.counts.samples_dropped += stretch.trim(stretch.index + excess)
+        self._tidy()
+
+    def _tidy(self) -> None:
+        self.stretches = [item for item in self.stretches
+                          if len(item.samples) or not item.closed]
+
+    # --- continuity ---
+
+    def _check(self, block: SampleBlock) -> bool:
+        """Whether the source changed its layout for good; raises `SignalError` on a bad block."""
+        samples = block.samples
+        if samples.ndim != 2 or samples.size == 0:
+            raise SignalError(f'block of shape {samples.shape}: send channel x sample, at least '
+                              'one of each')
+        if not (np.isfinite(block.start_time) and np.isfinite(block.sample_rate)
+                and block.sample_rate > 0.0):
+            raise SignalError(f'block at {block.start_time} s with {block.sample_rate} Hz: send a '
+                              'finite time and a positive rate')
+        layout = samples.shape[0], block.sample_rate
+        if self.layout is None or layout == self.layout:
+            self._odd = None
+            return False
+        # One odd block is a fault; a second one in a row is a source that changed.
+        if layout == self._odd:
+            self._odd = None
+            return True
+        self._odd = layout
+        raise SignalError(
+            f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} at '
+            f'{self.layout[1]:g} Hz: keep both, or restart the source')
+
+    def _drop(self, block: SampleBlock, why: str) -> None:
+        self.counts.repeats += 1
+        self.counts.samples_dropped += block.samples.shape[1]
+        self.messages.append(f'block of samples {block.index} to {block.end_index - 1} {why}: '
+                             'dropped')
+
+    def _new_run(self, block: SampleBlock, *, restart: bool) -> None:
+        self._close()
+        if restart:
+            self.epoch += 1
+            self.counts.restarts += 1
+            self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
+                                 f'{block.index}')
+        self._clock = Clock(block.start_time, block.index, block.sample_rate)
+        self._store(block.samples, block.index)
+        self._last = block
+
+    def _continue(self, block: SampleBlock) -> None:
+        assert self._last is not None and self._clock is not None
+        expected = self._last.end_index
+        deviation = block.start_time - self._clock.time_of(block.index)
+        if abs(deviation) > self.time_tolerance:
+            self.counts.clock_deviation += 1
+            self.messages.append(
+                f'time of sample {block.index} is {deviation:+.6g} s off (limit '
+                f'{self.time_tolerance:g} s): new run')
+            back = block.start_time <= self.end_time
+            self._new_run(block, restart=back)
+            return
+        if abs(deviation) * block.sample_rate > 0.5:
+            self.counts.clock_deviation += 1
+        if block.end_index <= expected:
+            self._drop(block, 'was received before')
+            return
+        if block.index > expected:
+            self.counts.gaps += 1
+            self.messages.append(f'samples {expected} to {block.index - 1} are missing')
+            self._close()
+        # a block that overlaps what was received adds its new part only
+        start = max(expected, block.index)
+        self._store(block.samples[:, start - block.index:], start)
+        self._last = block
+
+    def _close(self) -> None:
+        if self.stretches:
+            self.stretches[-1].closed = True
+
+    def _store(self, samples: FloatArray, index: int) -> None:
+        """Keep the finite samples; a non-finite one leaves a gap."""
+        assert self._clock is not None
+        finite = np.isfinite(samples).all(axis=0)
+        if finite.all():
+            self._put(samples, index)
+            return
+        bad = int(np.count_nonzero(~finite))
+        channels = np.flatnonzero(~np.isfinite(samples).all(axis=1)).tolist()
+        self.counts.non_finite += bad
+        self.counts.samples_dropped += bad
+        self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in '
+                             f'channels {channels}: their cycles are discarded')
+        edges = np.flatnonzero(np.diff(np.concatenate(([False], finite, [False])).astype(np.int8)))
+        if not finite[0]:
+            self._close()
+        for begin, end in edges.reshape(-1, 2):
+            self._put(samples[:, begin:end], index + int(begin))
+            if end < len(finite):
+                self._close()
+
+    def _put(self, samples: FloatArray, index: int) -> None:
+        assert self._clock is not None
+        if self.stretches and not self.stretches[-1].closed:
+            self.stretches[-1].append(samples)
+        else:
+            self.stretches.append(Stretch(self._clock, self.epoch, index, samples))
