@@ -1,8 +1,8 @@
 """
 Fixtures that all tests share, and the environment they run in.
 
-The environment is set before anything imports rclpy or a message package. No test finds another ROS
-graph: discovery is off; tests of several processes give them ``process_environment``.
+The environment is set before anything imports rclpy or a message package. Discovery is off: no
+test meets another ROS graph; tests of several processes give these ``process_environment``.
 """
 
 import atexit
@@ -61,8 +61,8 @@ def executor_for(ros_context):
     """
     Return a function that puts nodes into one single-threaded executor.
 
-    ``spin = executor_for(node, other)`` returns ``spin(until, timeout=10.0)``, which serves callbacks
-    until ``until()`` is true and returns whether that came to pass before ``timeout`` seconds:
+    ``spin = executor_for(node, other)`` returns ``spin(until, timeout=10.0)``, which serves
+    callbacks until ``until()`` is true and returns whether it was so before ``timeout`` seconds:
     ``assert spin(lambda: len(received) == 3)``. The nodes are destroyed after the test.
     """
     executors = pytest.importorskip('rclpy.executors')
@@ -94,7 +94,7 @@ def executor_for(ros_context):
 
 @pytest.fixture
 def process_environment():
-    """Return the environment of processes that are to meet each other, and nobody else, over DDS."""
+    """Return the environment of processes that meet each other, and nobody else, over DDS."""
     environment = dict(os.environ, ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST')
     environment['ROS_DOMAIN_ID'] = str(_free_domain())
     return environment

@@ -1,0 +1,71 @@
+"""Install the package: into a colcon workspace or, by pip, into any Python environment."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+NAME = 'sa_jitter_ros'
+NODES = (
+    'jitter_predictor',
+    'machine_simulator',
+    'recording_player',
+    'synchronous_averager',
+    'tach_detector',
+)
+COMMANDS = ('demo', 'design')
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='On-line synchronous averaging of vibration, honest about keyphasor jitter',
+    author='sa_jitter_ros contributors',
+    maintainer='sa_jitter_ros maintainers',
+    maintainer_email='maintainers@sa-jitter-ros.example',
+    license='Apache-2.0',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/config', sorted(glob('config/*.yaml'))),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'setuptools',
+        'matplotlib>=3.6',
+        'numpy>=1.24',
+        'PyYAML>=6.0',
+        'rosbags>=0.10',
+        'scipy>=1.10',
+    ],
+    extras_require={
+        'test': [
+            'catkin_pkg',
+            'colcon-bash',
+            'colcon-ros',
+            'flake8>=7,<8',
+            'flake8-blind-except',
+            'flake8-builtins',
+            'flake8-class-newline',
+            'flake8-comprehensions',
+            'flake8-deprecated',
+            'flake8-docstrings',
+            'flake8-import-order',
+            'flake8-quotes',
+            'hypothesis>=6.60,<7',
+            'mypy==2.4.1',
+            'pytest>=7.2,<10',
+            'pytest-cov>=4,<8',
+            'pytest-timeout>=2.1,<3',
+            'pytest-xdist>=3.1,<4',
+            'ruff==0.17.6',
+        ],
+    },
+    zip_safe=True,
+    entry_points={
+        'console_scripts': [
+            *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
+            *(f'{name} = {NAME}.commands.{name}:main' for name in COMMANDS),
+        ],
+    },
+)
