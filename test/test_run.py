@@ -1,0 +1,78 @@
+"""The script `run` where it cannot work: one clear line and exit status 2, nothing made."""
+
+import os
+from pathlib import Path
+import shutil
+import subprocess
+
+import pytest
+
+RUN = Path(__file__).resolve().parents[1] / 'run'
+
+
+@pytest.fixture
+def refusal(tmp_path):
+    """Return a function that starts a copy of `run`, which must refuse, and returns its line."""
+    copy = tmp_path / 'repository' / 'run'
+    copy.parent.mkdir()
+    shutil.copy(RUN, copy)
+    tools = tmp_path / 'tools'
+    tools.mkdir()
+
+    def refuse(*arguments, tool='', script='', **environment):
+        if tool:
+            (tools / tool).write_text(f'#!/bin/sh\n{script}\n')
+            (tools / tool).chmod(0o755)
+        inherited = {
+            key: value for key, value in os.environ.items()
+            if key not in ('PYTHONPATH', 'ROS_DISTRO', 'SA_JITTER_ROS_DISTRO')
+        }
+        result = subprocess.run(
+            [copy, *arguments],
+            env={**inherited, 'PATH': f'{tools}:{inherited["PATH"]}', **environment},
+            capture_output=True, text=True, check=False)
+        assert result.returncode == 2
+        assert not result.stdout
+        assert result.stderr.startswith('run: ')
+        assert result.stderr.count('\n') == 1
+        assert [path.name for path in copy.parent.iterdir()] == ['run']
+        return result.stderr
+
+    return refuse
+
+
+@pytest.mark.parametrize('arguments', [(), ('build',), ('--help',)])
+def test_another_command(refusal, arguments):
+    assert './run demo' in refusal(*arguments)
+
+
+@pytest.mark.parametrize('variable', ['ROS_DISTRO', 'SA_JITTER_ROS_DISTRO'])
+def test_another_distribution(refusal, variable):
+    assert 'humble is not supported' in refusal('test', **{variable: 'humble'})
+
+
+def test_two_distributions(refusal):
+    line = refusal('test', ROS_DISTRO='jazzy', SA_JITTER_ROS_DISTRO='kilted')
+    assert 'SA_JITTER_ROS_DISTRO' in line
+
+
+def test_another_processor(refusal):
+    assert 'aarch64' in refusal('demo', tool='uname', script='echo aarch64')
+
+
+def test_another_python(refusal):
+    assert 'CPython 3.9.2' in refusal('demo', tool='python3', script='echo CPython 3.9.2')
+
+
+def test_python_without_its_venv_module(refusal):
+    script = 'case "$2" in *ensurepip*) exit 1 ;; esac; echo CPython 3.12.3'
+    assert 'apt install python3-venv' in refusal('demo', tool='python3', script=script)
+
+
+def test_no_python(refusal):
+    assert 'apt install python3' in refusal('test', tool='python3', script='exit 127')
+
+
+def test_distribution_that_is_named_but_not_sourced(refusal):
+    line = refusal('test', tool='python3', script='exit 1', ROS_DISTRO='kilted')
+    assert 'imports rclpy' in line
