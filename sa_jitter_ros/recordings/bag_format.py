@@ -1,0 +1,296 @@
+"""
+Recordings in rosbag2 folders, `.mcap` and `.db3` files: the package's input topics.
+
+Read through the pure-Python `rosbags` library; no ROS is needed. Topics are known by the last part
+of their name (`/rig/vibration` is a `vibration`); a channel map can name others.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import isfinite, prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.recording import (
+    FloatArray, MAX_CHANNELS, MAX_PULSES, rechunk, Recording, recording_errors)
+
+FLOAT64 = 'std_msgs/msg/Float64MultiArray'
+FLOAT32 = 'std_msgs/msg/Float32MultiArray'
+IMU = 'sensor_msgs/msg/Imu'
+TIME_REFERENCE = 'sensor_msgs/msg/TimeReference'
+SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
+PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
+INDEX_BASE = 1 << 24
+TIME_TOLERANCE = 0.01  # s; a clock that jumps by more starts a new run
+MAX_GAP = 3600.0  # s
+_IMU_AXES = ('x', 'y', 'z')
+_FILL = 65_536
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Samples of one message: `channel` x `sample`, index and time of the first."""
+
+    samples: FloatArray
+    index: int
+    time: float
+    rate: float
+
+
+@dataclass(frozen=True)
+class _Extent:
+    """What a topic holds in all."""
+
+    channels: int
+    samples: int
+    rate: float
+    start_time: float
+    imu: bool
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BagSource:
+    """The samples of one topic; lost ones are NaN, repeated ones are left out."""
+
+    path: Path
+    topic: str
+    sample_rate: float | None
+    channels: int
+    samples: int
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        run = _Run(self.topic)
+        with recording_errors(self.path), _reader(self.path) as reader:
+            messages = _blocks(reader, self.topic, self.sample_rate)
+            yield from rechunk(run.continuous(messages), samples_per_block)
+
+
+def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
+             keyphasor: str = '') -> Recording:
+    """
+    Open a bag.
+
+    Parameters
+    ----------
+    path
+        Rosbag2 folder, `.mcap` or `.db3` file.
+    channel_map
+        Entries that start with '/' name topics for `vibration` and `tach`, others
+        channels (`x`, `y`, `z` of an Imu).
+    sample_rate
+        Of messages that do not carry it (Float32MultiArray, Imu, no header), Hz.
+    keyphasor
+        `source` of the TimeReference messages to take, '' for the first seen.
+
+    Raises
+    ------
+    RecordingError
+        If `rosbags` is missing, the bag is broken, has no vibration, or its samples are not of one
+        run (index or clock jump back, rate or channels change).
+
+    """
+    topics = [entry for entry in channel_map.vibration if entry.startswith('/')]
+    waveform = channel_map.tach if channel_map.tach.startswith('/') else ''
+    channels = ChannelMap(tuple(e for e in channel_map.vibration if not e.startswith('/')),
+                          '' if waveform else channel_map.tach)
+    with recording_errors(path):
+        with _reader(path) as reader:
+            vibration = _find_topic(reader, topics[0] if topics else '', 'vibration', SAMPLE_TYPES)
+            tach = _find_topic(reader, waveform, 'tach_waveform', SAMPLE_TYPES)
+            pulses = _find_topic(reader, '', 'tach_pulse', PULSE_TYPES)
+            if not vibration:
+                raise RecordingError('no vibration topic among '
+                                     f'{", ".join(sorted(reader.topics)) or "none"}')
+            extent = _measure(reader, vibration, sample_rate)
+            tach_extent = _measure(reader, tach, sample_rate) if tach else None
+            pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
+        source = BagSource(path, vibration, sample_rate, extent.channels, extent.samples)
+        if tach_extent and abs(tach_extent.start_time - extent.start_time) > TIME_TOLERANCE:
+            raise RecordingError(
+                f'{tach} starts at {tach_extent.start_time} s and {vibration} at '
+                f'{extent.start_time} s: record both from the same moment')
+        return channels.select(Recording(
+            source, extent.rate, start_time=extent.start_time,
+            channel_names=_IMU_AXES if extent.imu else (),
+            units=('m/s^2',) if extent.imu else (),
+            tach=None if tach_extent is None else BagSource(
+                path, tach, sample_rate, tach_extent.channels, tach_extent.samples),
+            tach_rate=None if tach_extent is None else tach_extent.rate,
+            pulse_times=pulse_times,
+            remarks=(*extent.remarks, *(tach_extent.remarks if tach_extent else ()), *remarks)))
+
+
+class _Run:
+    """Makes a continuous stream of one run's blocks and counts what that took."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        self.first: _Block | None = None
+        self.received = self.repeated = self.lost = 0
+
+    def continuous(self, blocks: Iterator[_Block]) -> Iterator[FloatArray]:
+        """Iterate over the samples in order of their index, NaN where they were lost."""
+        for block in blocks:
+            first = self.first = self.first or block
+            self._check(first, block)
+            missing = block.index - first.index - self.received
+            if missing > MAX_GAP * block.rate:
+                raise RecordingError(f'{self.topic}: {missing} samples are missing before index '
+                                     f'{block.index}: more than {MAX_GAP:g} s; split the bag')
+            for start in range(0, missing, _FILL):
+                yield np.full((len(block.samples), min(_FILL, missing - start)), np.nan)
+            fresh = block.samples[:, max(-missing, 0):]
+            self.lost += max(missing, 0)
+            self.repeated += block.samples.shape[1] - fresh.shape[1]
+            self.received += max(missing, 0) + fresh.shape[1]
+            yield fresh
+
+    def remarks(self) -> tuple[str, ...]:
+        """Return what was repaired, one sentence each."""
+        counts = ((self.lost, 'lost samples are NaN'),
+                  (self.repeated, 'repeated samples left out'))
+        return tuple(f'{self.topic}: {count} {text}' for count, text in counts if count)
+
+    def _check(self, first: _Block, block: _Block) -> None:
+        expected = first.time + (block.index - first.index) / first.rate
+        if len(block.samples) != len(first.samples) or block.rate != first.rate:
+            raise RecordingError(
+                f'{self.topic}: {len(first.samples)} channels at {first.rate} Hz become '
+                f'{len(block.samples)} at {block.rate} Hz at index {block.index}; split the bag')
+        if block.index < first.index or not abs(block.time - expected) <= TIME_TOLERANCE:
+            raise RecordingError(
+                f'{self.topic}: index {block.index} has time {block.time} s, expected '
+                f'{expected} s from index {first.index} on: a second run; split the bag')
+
+
+@contextmanager
+def _reader(path: Path) -> Iterator[Any]:
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import get_typestore, Stores
+    except ImportError as error:
+        raise RecordingError(
+            "reading bags needs the Python package rosbags: 'pip install rosbags'") from error
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        yield reader
+
+
+def _find_topic(reader: Any, asked: str, role: str, types: tuple[str, ...]) -> str:
+    """Return the topic of a role, '' if there is none."""
+    found = [name for name, info in reader.topics.items() if info.msgtype in types and (
+        name == asked if asked else name.rsplit('/', 1)[-1] == role)]
+    if asked and not found:
+        raise RecordingError(f'topic {asked} is not in the bag with a type of {", ".join(types)}; '
+                             f'there are {", ".join(sorted(reader.topics))}')
+    if len(found) > 1:
+        raise RecordingError(f'several topics are called {role}: {", ".join(sorted(found))}; name '
+                             'one in the channel map or record one machine in a bag')
+    return found[0] if found else ''
+
+
+def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
+    """Read a topic through once and return what it holds."""
+    run = _Run(topic)
+    for _ in run.continuous(_blocks(reader, topic, sample_rate)):
+        pass
+    if run.first is None:
+        raise RecordingError(f'{topic}: holds no messages')
+    imu = reader.topics[topic].msgtype == IMU
+    return _Extent(len(run.first.samples), run.received, run.first.rate, run.first.time, imu,
+                   run.remarks())
+
+
+def _messages(reader: Any, topic: str) -> Iterator[Any]:
+    connections = [item for item in reader.connections if item.topic == topic]
+    for connection, _, data in reader.messages(connections=connections):
+        yield reader.deserialize(data, connection.msgtype)
+
+
+def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[_Block]:
+    """Iterate over the sample blocks of a topic as its messages hold them."""
+    kind = reader.topics[topic].msgtype
+    needs_rate = f'{topic}: its messages carry no sampling rate; give sample_rate'
+    rate = 0.0 if sample_rate is None else sample_rate
+    index, begin = 0, 0.0
+    for message in _messages(reader, topic):
+        if kind == IMU:
+            if sample_rate is None:
+                raise RecordingError(needs_rate)
+            time = _seconds(message.header.stamp)
+            begin = time if index == 0 else begin
+            # An Imu carries no index: whole sample periods that its stamp skips are losses.
+            index = max(index, round((time - begin) * rate))
+            vector = message.linear_acceleration
+            samples = np.array([[getattr(vector, axis)] for axis in _IMU_AXES])
+            yield _Block(samples, index, begin + index / rate, rate)
+            index += 1
+            continue
+        header, samples = _samples(topic, message)
+        if header.size == 3 and kind == FLOAT64:
+            time, rate, first = header.tolist()
+            if not (isfinite(time) and isfinite(rate) and rate > 0):
+                raise RecordingError(f'{topic}: header time {time} s, rate {rate} Hz')
+            yield _Block(samples, _whole(topic, first), time, rate)
+        elif sample_rate is None:
+            raise RecordingError(needs_rate)
+        elif header.size == 2 and kind == FLOAT32:
+            index = _whole(topic, header[0]) * INDEX_BASE + _whole(topic, header[1])
+            yield _Block(samples, index, index / rate, rate)
+        elif header.size == 0:
+            yield _Block(samples, index, index / rate, rate)
+            index += samples.shape[1]
+        else:
+            raise RecordingError(f'{topic}: data_offset {header.size} of a {kind}: must be '
+                                 f'{3 if kind == FLOAT64 else 2} header elements, or none')
+
+
+def _samples(topic: str, message: Any) -> tuple[FloatArray, FloatArray]:
+    """Return header elements and `channel` x `sample` array of a message."""
+    layout, data = message.layout, np.asarray(message.data, dtype=np.float64)
+    header, values = data[:layout.data_offset], data[layout.data_offset:]
+    sizes = tuple(dim.size for dim in layout.dim) or (1, values.size)
+    if header.size != layout.data_offset or len(sizes) != 2 or prod(sizes) != values.size \
+            or not 1 <= sizes[0] <= MAX_CHANNELS:
+        raise RecordingError(
+            f'{topic}: dimensions {sizes} behind {layout.data_offset} header elements do not fit '
+            f'{data.size} elements of channel x sample')
+    return header, values.reshape(sizes)
+
+
+def _whole(topic: str, value: float) -> int:
+    if not (0 <= value < 2.0**53 and value == np.floor(value)):
+        raise RecordingError(f'{topic}: sample index {value} is no whole number')
+    return int(value)
+
+
+def _seconds(stamp: Any) -> float:
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def _pulses(reader: Any, topic: str, keyphasor: str) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return the pulse times in order and what had to be left out or moved."""
+    pieces: list[FloatArray] = []
+    chosen, others, count = keyphasor, 0, 0
+    for message in _messages(reader, topic):
+        if hasattr(message, 'time_ref'):
+            chosen = chosen or message.source
+            if message.source != chosen:
+                others += 1
+                continue
+            pieces.append(np.array([_seconds(message.time_ref)]))
+        else:
+            pieces.append(np.array(message.data[message.layout.data_offset:], dtype=np.float64))
+        count += pieces[-1].size
+        if count > MAX_PULSES:
+            raise RecordingError(f'{topic}: more than {MAX_PULSES} pulses')
+    times = np.concatenate(pieces) if pieces else np.empty(0)
+    late = int(np.count_nonzero(np.diff(times) < 0))
+    counts = ((others, f'pulses of other keyphasors than {chosen!r} left out'),
+              (late, 'pulses that came late put in order'))
+    return np.sort(times), tuple(f'{topic}: {n} {text}' for n, text in counts if n)

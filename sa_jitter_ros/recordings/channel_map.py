@@ -1,0 +1,67 @@
+"""Which channels of a file are vibration and which one is the tach."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.recording import ChannelSelection, Recording
+
+
+@dataclass(frozen=True)
+class ChannelMap:
+    """
+    Roles of a file's channels, each given by name or by number from 0.
+
+    Parameters
+    ----------
+    vibration
+        Channels that are vibration; empty for all that have no other role.
+    tach
+        Channel that is the sampled keyphasor waveform; '' for none.
+    time
+        Column of a `.csv` that holds the sample times in s; '' for one named `time` or `t`.
+
+    """
+
+    vibration: tuple[str, ...] = ()
+    tach: str = ''
+    time: str = ''
+
+    def roles(self, names: Sequence[str]) -> tuple[tuple[int, ...], int | None]:
+        """Return the rows of the vibration and that of the tach among `names`."""
+        tach = find_channel(names, self.tach) if self.tach else None
+        rows = tuple(find_channel(names, entry) for entry in self.vibration)
+        if not rows:
+            rows = tuple(row for row in range(len(names)) if row != tach)
+        if not rows:
+            raise RecordingError(f'the only channel, {self.tach}, is the tach: no vibration left')
+        return rows, tach
+
+    def named(self, names: Sequence[str]) -> 'ChannelMap':
+        """Return this map with every channel given by its name among `names`."""
+        def name(entry: str) -> str:
+            return names[find_channel(names, entry)] if entry else ''
+        return ChannelMap(tuple(map(name, self.vibration)), name(self.tach), name(self.time))
+
+    def select(self, recording: Recording) -> Recording:
+        """Return the recording with its channels in their roles."""
+        rows, tach = self.roles(recording.channel_names)
+        source = recording.vibration
+        if tach is not None:
+            recording = replace(recording, tach=ChannelSelection(source, (tach,)),
+                                tach_rate=recording.sample_rate)
+        if rows == tuple(range(recording.channels)):
+            return recording
+        return replace(
+            recording, vibration=ChannelSelection(source, rows),
+            channel_names=tuple(recording.channel_names[row] for row in rows),
+            units=tuple(recording.units[row] for row in rows))
+
+
+def find_channel(names: Sequence[str], entry: str) -> int:
+    """Return the number of the channel called `entry`, or numbered so if none is called so."""
+    if entry in names:
+        return list(names).index(entry)
+    if entry.isdecimal() and int(entry) < len(names):
+        return int(entry)
+    raise RecordingError(f'no channel {entry!r}: there are {", ".join(names)}')

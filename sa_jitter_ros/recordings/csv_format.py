@@ -1,0 +1,161 @@
+"""
+Recordings in `.csv` files: one row a sample, read in blocks.
+
+Fields are separated by comma, semicolon or tab; with semicolons a comma is a decimal point. A
+first row that is not numeric names the columns, otherwise they are called 0, 1, ...
+"""
+
+from collections.abc import Iterator
+import csv
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+
+MAX_LINE = 1 << 20
+_TIME_NAMES = ('time', 't', 'time_s', 'time [s]', 'time (s)')
+
+
+@dataclass(frozen=True)
+class CsvSource:
+    """
+    The columns of a `.csv` file that are samples.
+
+    With a time column (`times`, its number) every block checks that its samples lie within half a
+    sample period of their place.
+    """
+
+    path: Path
+    delimiter: str
+    has_header: bool
+    columns: tuple[int, ...]
+    samples: int
+    times: int | None = None
+    start_time: float = 0.0
+    sample_rate: float = 1.0
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+        return len(self.columns)
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        wanted = self.columns if self.times is None else (*self.columns, self.times)
+        start = 0
+        with recording_errors(self.path), _open(self.path) as file:
+            lines = _rows(file, self.delimiter, self.has_header)
+            while start < self.samples:
+                block = _parse(islice(lines, samples_per_block), self.delimiter, wanted, start)
+                if not len(block):
+                    raise RecordingError(f'ends at row {start} of {self.samples}')
+                if self.times is not None:
+                    self._check_times(block[:, -1], start)
+                yield block[:, :self.channels].T
+                start += len(block)
+
+    def _check_times(self, times: FloatArray, start: int) -> None:
+        places = (times - self.start_time) * self.sample_rate
+        astray = np.flatnonzero(~(abs(places - start - np.arange(len(times))) < 0.5))
+        if astray.size:
+            row = int(astray[0])
+            raise RecordingError(
+                f'row {start + row}: time {times[row]} s is no sample of a steady '
+                f'{self.sample_rate:g} Hz from {self.start_time} s; split the file at its gaps')
+
+
+def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
+    """
+    Open a `.csv` file; columns that the map leaves out need not be numeric.
+
+    The sampling rate is the mean rate of the time column, or `sample_rate` without one. Raises
+    RecordingError if there is neither, or a row is not numeric.
+    """
+    with recording_errors(path):
+        with _open(path) as file:
+            first = file.readline(MAX_LINE).strip()
+        delimiter = next((mark for mark in ';\t,' if mark in first), ',')
+        names = [name.strip() for name in next(csv.reader([first], delimiter=delimiter), [])]
+        has_header = not all(_is_number(name, delimiter) for name in names)
+        if not has_header:
+            names = [str(column) for column in range(len(names))]
+        channel_map = channel_map.named(names)
+        time = channel_map.time or next((n for n in names if n.lower() in _TIME_NAMES), '')
+        wanted = ({*channel_map.vibration, channel_map.tach} if channel_map.vibration
+                  else {*names} - {time})
+        columns = tuple(k for k, name in enumerate(names) if name in wanted)
+        if not columns:
+            raise RecordingError(f'columns {", ".join(names)} hold no vibration')
+        times = names.index(time) if time else None
+        samples, start_time, end_time = _extent(path, delimiter, has_header, times)
+        rate = sample_rate
+        if times is not None and samples > 1:
+            if not end_time > start_time:
+                raise RecordingError(f'time runs from {start_time} to {end_time} s: must increase')
+            rate = (samples - 1) / (end_time - start_time)
+        if rate is None:
+            raise RecordingError(
+                f'no time column among {", ".join(names)}: name it in the channel map or give '
+                'sample_rate')
+        source = CsvSource(path, delimiter, has_header, columns, samples, times, start_time, rate)
+        return channel_map.select(Recording(
+            source, rate, start_time=start_time,
+            channel_names=tuple(names[column] for column in columns)))
+
+
+def _open(path: Path) -> TextIO:
+    return open(path, encoding='utf-8-sig', newline=None)
+
+
+def _rows(file: TextIO, delimiter: str, has_header: bool) -> Iterator[str]:
+    """Iterate over the rows that hold data, with decimal points."""
+    if has_header:
+        file.readline(MAX_LINE)
+    while line := file.readline(MAX_LINE):
+        if not line.endswith('\n') and len(line) >= MAX_LINE:
+            raise RecordingError(f'a line is longer than {MAX_LINE} characters: is it a table?')
+        if not line.isspace():
+            yield line.replace(',', '.') if delimiter == ';' else line
+
+
+def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
+           start: int) -> FloatArray:
+    """Parse rows into `row` x `column`; none left gives an empty array."""
+    held = list(lines)
+    if not held:
+        return np.empty((0, len(columns)))
+    try:
+        return np.loadtxt(held, delimiter=delimiter, usecols=columns, ndmin=2, comments=None,
+                          dtype=np.float64)
+    except ValueError as error:
+        reason = str(error).split(';')[0]
+        raise RecordingError(f'rows {start} to {start + len(held)}: {reason}') from error
+
+
+def _extent(path: Path, delimiter: str, has_header: bool,
+            times: int | None) -> tuple[int, float, float]:
+    """Return the number of rows and the first and last time (0 without a time column)."""
+    count, first, last = 0, '', ''
+    with _open(path) as file:
+        for last in _rows(file, delimiter, has_header):
+            first = first or last
+            count += 1
+    if times is None or not count:
+        return count, 0.0, 0.0
+    ends = _parse(iter([first, last]), delimiter, (times,), 0)
+    if not np.isfinite(ends).all():
+        raise RecordingError(f'time runs from {ends[0, 0]} to {ends[1, 0]} s: must be finite')
+    return count, float(ends[0, 0]), float(ends[1, 0])
+
+
+def _is_number(text: str, delimiter: str) -> bool:
+    try:
+        float(text.replace(',', '.') if delimiter == ';' else text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,159 @@
+"""The named fields that `.npz` and `.mat` recordings share, from raw arrays to a `Recording`."""
+
+from collections.abc import Callable, Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
+
+MAX_SAMPLE_BYTES = 1 << 40
+MAX_PULSE_BYTES = 8 * MAX_PULSES
+MAX_FIELD_BYTES = 1 << 20
+
+RawArray = NDArray[Any]
+SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
+PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
+FIELDS = (
+    *SAMPLE_FIELDS, *PULSE_FIELDS, 'sample_rate', 'tach_rate', 'pulses_per_revolution',
+    'pulses_per_trigger', 'ratio', 'orders', 'channel_names', 'units', 'start_time', 'description')
+
+
+def size_limit(name: str) -> int:
+    """Return the largest size in bytes that the field `name` may have in a file."""
+    if name in SAMPLE_FIELDS:
+        return MAX_SAMPLE_BYTES
+    return MAX_PULSE_BYTES if name in PULSE_FIELDS else MAX_FIELD_BYTES
+
+
+def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray], *,
+                          acquisition: int) -> Recording:
+    """
+    Build a recording from named arrays.
+
+    A two-dimensional `tach` has a row for every row of `vibration`: then each row is a separate
+    acquisition, and `acquisition` picks one. `tach_count`, a revolution counter sampled at
+    `tach_rate`, stands for pulses at the samples where it increases.
+
+    Parameters
+    ----------
+    names
+        The fields there are; unknown ones are ignored.
+    load
+        Gives the array of a name.
+    acquisition
+        Number of the acquisition, from 0.
+
+    Raises
+    ------
+    RecordingError
+        If a needed field is missing or one has the wrong type, shape or value.
+
+    """
+    if 'vibration' not in names:
+        raise RecordingError(
+            f'no vibration among {sorted(names)}: needs vibration (channel x sample)')
+    if 'sample_rate' not in names:
+        raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz')
+    vibration = _samples('vibration', load('vibration'))
+    tach = _samples('tach', load('tach')) if 'tach' in names else None
+    labels = _strings('channel_names', load('channel_names')) if 'channel_names' in names else ()
+    units = _strings('units', load('units')) if 'units' in names else ()
+    acquisitions = 1
+    if tach is not None and len(tach) > 1:
+        if len(tach) != len(vibration):
+            raise RecordingError(
+                f'tach of {len(tach)} rows for {len(vibration)} rows of vibration: a recording '
+                'has one tach, or one for every row where each row is an acquisition')
+        acquisitions = len(tach)
+    if not 0 <= acquisition < acquisitions:
+        raise RecordingError(
+            f'acquisition {acquisition}: the file holds {acquisitions}, numbered from 0')
+    if acquisitions > 1:
+        row = slice(acquisition, acquisition + 1)
+        vibration, tach = vibration[row], None if tach is None else tach[row]
+        labels = labels[row]
+        units = units[row] if len(units) > 1 else units
+
+    def number(name: str, default: float) -> float:
+        return _number(name, load(name)) if name in names else default
+
+    def count(name: str) -> int | None:
+        return _count(name, load(name)) if name in names else None
+
+    start_time = number('start_time', 0.0)
+    tach_rate = number('tach_rate', 0.0) if 'tach_rate' in names else None
+    pulse_times = {name: _vector(name, load(name)) for name in PULSE_FIELDS if name in names}
+    if 'tach_count' in names and tach is None and 'pulse_times' not in names:
+        if tach_rate is None or not tach_rate > 0:
+            raise RecordingError('tach_count without a positive tach_rate: add its rate in Hz')
+        pulse_times['pulse_times'] = start_time + _increments(load('tach_count')) / tach_rate
+    return Recording(
+        ArraySource(vibration), number('sample_rate', 0.0), channel_names=labels, units=units,
+        start_time=start_time, tach=None if tach is None else ArraySource(tach),
+        tach_rate=tach_rate, pulse_times=pulse_times.get('pulse_times'),
+        pulses_per_revolution=count('pulses_per_revolution') or 1,
+        pulses_per_trigger=count('pulses_per_trigger'), ratio=number('ratio', 1.0),
+        orders=tuple(_vector('orders', load('orders')).tolist()) if 'orders' in names else (),
+        reference_pulse_times=pulse_times.get('reference_pulse_times'),
+        description=(' '.join(_strings('description', load('description')))
+                     if 'description' in names else ''),
+        acquisitions=acquisitions)
+
+
+def _real(name: str, array: RawArray) -> RawArray:
+    if array.dtype.kind not in 'fiub':
+        raise RecordingError(f'{name} of type {array.dtype}: must be real numbers')
+    return array
+
+
+def _samples(name: str, array: RawArray) -> RawArray:
+    array = _real(name, array)
+    if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 1):
+        array = array.reshape(1, -1)
+    if array.ndim != 2:
+        raise RecordingError(f'{name} of shape {array.shape}: must be channel x sample')
+    if array.shape[0] > array.shape[1]:
+        raise RecordingError(
+            f'{name} of shape {array.shape}: more channels than samples; store channel x sample '
+            '(transpose it)')
+    return array
+
+
+def _vector(name: str, array: RawArray) -> FloatArray:
+    if array.size != max(array.shape, default=1):
+        raise RecordingError(f'{name} of shape {array.shape}: must be one row of numbers')
+    return np.array(_real(name, array), dtype=np.float64).reshape(-1)
+
+
+def _number(name: str, array: RawArray) -> float:
+    if array.size != 1:
+        raise RecordingError(f'{name} of shape {array.shape}: must be a single number')
+    return float(_real(name, array).reshape(-1)[0])
+
+
+def _count(name: str, array: RawArray) -> int:
+    value = _number(name, array)
+    if not (value == np.floor(value) and 1 <= value < 2**31):
+        raise RecordingError(f'{name} {value}: must be a whole number, at least 1')
+    return int(value)
+
+
+def _strings(name: str, array: RawArray) -> tuple[str, ...]:
+    """Return the texts of a string array, or of a MATLAB cell of strings."""
+    flat = array.reshape(-1).tolist()
+    if array.dtype.kind == 'O':
+        flat = [item.item() if getattr(item, 'size', 0) == 1 else None for item in flat]
+    elif array.dtype.kind == 'S':
+        flat = [item.decode('utf-8', 'replace') for item in flat]
+    if not all(isinstance(item, str) for item in flat):
+        raise RecordingError(f'{name} of type {array.dtype}: must be text')
+    return tuple(item.strip() for item in flat)
+
+
+def _increments(counter: RawArray) -> FloatArray:
+    values = _samples('tach_count', counter)
+    if len(values) != 1:
+        raise RecordingError(f'tach_count of shape {counter.shape}: must be one row')
+    return np.flatnonzero(values[0, 1:] > values[0, :-1]).astype(np.float64) + 1

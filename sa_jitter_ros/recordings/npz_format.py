@@ -1,0 +1,126 @@
+"""
+Recordings in `.npz` files: arrays in a zip archive, read without pickle and with bounded memory.
+
+Large members are not loaded: a stored one is mapped where it lies, a deflated one is unpacked once
+into an unnamed temporary file (in `$TMPDIR`) and mapped there.
+"""
+
+from math import prod
+import os
+from pathlib import Path
+import struct
+import tempfile
+from typing import Any, IO
+import zipfile
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import DTypeLike
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields, size_limit
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
+
+IN_MEMORY_BYTES = 64 << 20
+MAX_INFLATION = 200  # measured signals shrink a few fold; only a bomb shrinks more than this
+_COPY_BYTES = 1 << 20
+
+
+def open_npz(path: Path, *, acquisition: int = 0) -> Recording:
+    """
+    Open an `.npz` recording; fields as in `recording_from_fields`.
+
+    Raises RecordingError if the archive is broken, holds pickled objects or needs more than its
+    fields may have.
+    """
+    with recording_errors(path), zipfile.ZipFile(path) as archive:
+        names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
+        return recording_from_fields(
+            names, lambda name: _member(archive, path, name), acquisition=acquisition)
+
+
+def write_npz(path: str | os.PathLike[str], recording: Recording, *,
+              dtype: DTypeLike = np.float64) -> None:
+    """
+    Write a recording as `.npz` with bounded memory; vibration and tach are stored as `dtype`.
+
+    Samples are stored in Fortran order, all channels of a moment together, as they come in.
+    """
+    fields: dict[str, Any] = {
+        'sample_rate': recording.sample_rate, 'tach_rate': recording.tach_rate,
+        'pulse_times': recording.pulse_times, 'start_time': recording.start_time,
+        'pulses_per_revolution': recording.pulses_per_revolution,
+        'pulses_per_trigger': recording.pulses_per_trigger, 'ratio': recording.ratio,
+        'orders': np.array(recording.orders), 'channel_names': np.array(recording.channel_names),
+        'units': np.array(recording.units),
+        'reference_pulse_times': recording.reference_pulse_times,
+        'description': recording.description}
+    sources = (('vibration', recording.vibration), ('tach', recording.tach))
+    with zipfile.ZipFile(path, 'w') as archive:
+        for name, value in fields.items():
+            if value is not None:
+                with archive.open(f'{name}.npy', 'w') as stream:
+                    npy.write_array(stream, np.asanyarray(value), allow_pickle=False)
+        for name, source in sources:
+            if source is None:
+                continue
+            header = {'descr': npy.dtype_to_descr(np.dtype(dtype)), 'fortran_order': True,
+                      'shape': (source.channels, source.samples)}
+            with archive.open(f'{name}.npy', 'w', force_zip64=True) as stream:
+                npy.write_array_header_2_0(stream, header)
+                for block in source.blocks(65_536):
+                    stream.write(block.astype(dtype).tobytes(order='F'))
+
+
+def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
+    """Return the array of a member: in memory if small, else mapped from a file."""
+    info = archive.getinfo(f'{name}.npy')
+    with archive.open(info) as stream:
+        shape, fortran, dtype, start = _read_header(stream, name)
+        size = prod(shape) * dtype.itemsize
+        if start + size != info.file_size:
+            raise RecordingError(
+                f'{name}: {shape} of {dtype} needs {size} bytes, the file holds '
+                f'{info.file_size - start}: it is truncated or broken')
+        if size > size_limit(name):
+            raise RecordingError(f'{name}: {size} bytes exceed its limit of {size_limit(name)}')
+        order: Any = 'F' if fortran else 'C'
+        if size <= IN_MEMORY_BYTES:
+            data = stream.read(size)
+            stream.read(1)  # reaching the end makes zipfile compare the checksum
+            return np.frombuffer(data, dtype).reshape(shape, order=order)
+        if info.compress_type == zipfile.ZIP_STORED:
+            offset = _data_offset(path, info) + start
+            return np.memmap(path, dtype, 'r', offset, shape, order)
+        if size > MAX_INFLATION * info.compress_size:
+            raise RecordingError(
+                f'{name}: {info.compress_size} bytes inflate to {size}, more than '
+                f'{MAX_INFLATION}-fold: looks like a zip bomb; store it uncompressed')
+        with tempfile.TemporaryFile() as spool:
+            while chunk := stream.read(_COPY_BYTES):
+                spool.write(chunk)
+            spool.flush()
+            return np.memmap(spool, dtype, 'r', 0, shape, order)
+
+
+def _read_header(stream: IO[bytes],
+                 name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
+    """Return shape, whether in Fortran order, dtype and length of a `.npy` header."""
+    version = npy.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise RecordingError(f'{name}: npy version {version} is not supported; save it again')
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, fortran, dtype = read(stream)
+    if dtype.hasobject:
+        raise RecordingError(
+            f'{name}: holds pickled objects, which are never loaded; save plain numbers or text')
+    if dtype.itemsize == 0 or any(length < 0 for length in shape):
+        raise RecordingError(f'{name}: {shape} of {dtype} is no array that could be stored')
+    return shape, fortran, dtype, stream.tell()
+
+
+def _data_offset(path: Path, info: zipfile.ZipInfo) -> int:
+    """Return where a stored member's bytes begin in the archive."""
+    with open(path, 'rb') as file:
+        file.seek(info.header_offset)
+        name_length, extra_length = struct.unpack('<26x2H', file.read(30))
+    return int(info.header_offset + 30 + name_length + extra_length)

@@ -1,0 +1,285 @@
+"""What a recording is: a description of the machine and samples read block by block."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+import math
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import RecordingError
+
+FloatArray = NDArray[np.float64]
+
+MAX_CHANNELS = 4096
+MAX_PULSES = 50_000_000
+
+
+class SampleSource(Protocol):
+    """Samples of one or more channels that can be read again and again, block by block."""
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks; all but the last have the asked length."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArraySource:
+    """Samples of an array or a memory map (`channel` x `sample`, any real dtype)."""
+
+    array: NDArray[Any]
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+        return int(self.array.shape[0])
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return int(self.array.shape[1])
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks as float64."""
+        for start in range(0, self.samples, samples_per_block):
+            yield np.array(self.array[:, start:start + samples_per_block], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelSelection:
+    """Some channels of another source, in the order of `rows`."""
+
+    source: SampleSource
+    rows: tuple[int, ...]
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+        return len(self.rows)
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return self.source.samples
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        for block in self.source.blocks(samples_per_block):
+            yield block[list(self.rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """
+    One recording of a machine: vibration, its keyphasor and what is known about both.
+
+    Sample k of the vibration (and of the tach waveform) was taken at `start_time` + k/rate;
+    pulse times are seconds on the same clock. NaN samples mean that there is no data (a gap).
+
+    Parameters
+    ----------
+    vibration
+        The samples, `channel` x `sample`, read with `blocks`.
+    sample_rate
+        Of the vibration, Hz.
+    channel_names
+        One per channel; `channel 0`, ... where the file has none.
+    units
+        One per channel, '' where unknown; a single unit counts for all channels.
+    start_time
+        Of the first sample, s.
+    pulse_times
+        Keyphasor pulses, s, in order of time.
+    tach
+        The sampled keyphasor waveform (one channel), read with `tach_blocks`.
+    tach_rate
+        Sampling rate of the keyphasor, Hz; with `pulse_times` the clock of their
+        detection, where known.
+    pulses_per_revolution
+        Of the tach shaft.
+    pulses_per_trigger
+        Pulses of a trigger cycle; None where the file does not say.
+    ratio
+        Speed of the shaft of interest over the speed of the tach shaft.
+    orders
+        Orders worth looking at, multiples of the shaft of interest.
+    reference_pulse_times
+        Of a better keyphasor, s.
+    description
+        Free text.
+    acquisitions
+        How many separate acquisitions the file holds (this is one of them).
+    remarks
+        What the reader had to do to the data, one sentence each.
+
+    Raises
+    ------
+    RecordingError
+        If rates, counts or times contradict each other.
+
+    """
+
+    vibration: SampleSource
+    sample_rate: float
+    channel_names: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+    start_time: float = 0.0
+    pulse_times: FloatArray | None = None
+    tach: SampleSource | None = None
+    tach_rate: float | None = None
+    pulses_per_revolution: int = 1
+    pulses_per_trigger: int | None = None
+    ratio: float = 1.0
+    orders: tuple[float, ...] = ()
+    reference_pulse_times: FloatArray | None = None
+    description: str = ''
+    acquisitions: int = 1
+    remarks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit each other, and fill in names and units."""
+        channels = self.vibration.channels
+        if not 1 <= channels <= MAX_CHANNELS or self.vibration.samples < 1:
+            raise RecordingError(
+                f'vibration of {channels} channels x {self.vibration.samples} samples: needs 1 '
+                f'to {MAX_CHANNELS} channels and at least one sample')
+        _check_positive('sample_rate', self.sample_rate)
+        _check_positive('ratio', self.ratio)
+        if not math.isfinite(self.start_time):
+            raise RecordingError(f'start_time {self.start_time}: must be a finite time in s')
+        if self.tach is not None and self.tach_rate is None:
+            raise RecordingError('a tach waveform without tach_rate: add its rate in Hz')
+        if self.tach is not None and self.tach.channels != 1:
+            raise RecordingError(f'tach of {self.tach.channels} channels: must be one waveform')
+        if self.tach_rate is not None:
+            _check_positive('tach_rate', self.tach_rate)
+        if self.pulses_per_revolution < 1:
+            raise RecordingError(
+                f'pulses_per_revolution {self.pulses_per_revolution}: must be at least 1')
+        if self.pulses_per_trigger is not None and self.pulses_per_trigger < 1:
+            raise RecordingError(
+                f'pulses_per_trigger {self.pulses_per_trigger}: must be at least 1')
+        for order in self.orders:
+            _check_positive('orders', order)
+        for name in ('pulse_times', 'reference_pulse_times'):
+            _check_pulse_times(name, getattr(self, name))
+        names = self.channel_names or tuple(f'channel {k}' for k in range(channels))
+        units = self.units or ('',)
+        units = units * channels if len(units) == 1 else units
+        for name, labels in (('channel_names', names), ('units', units)):
+            if len(labels) != channels:
+                raise RecordingError(
+                    f'{len(labels)} {name} for {channels} channels: give one per channel')
+        object.__setattr__(self, 'channel_names', names)
+        object.__setattr__(self, 'units', units)
+
+    @property
+    def channels(self) -> int:
+        """Return the number of vibration channels."""
+        return self.vibration.channels
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each vibration channel."""
+        return self.vibration.samples
+
+    @property
+    def duration(self) -> float:
+        """Return the length of the vibration in s."""
+        return self.samples / self.sample_rate
+
+    def blocks(self, samples_per_block: int = 65_536) -> Iterator[FloatArray]:
+        """
+        Iterate over the vibration with bounded memory.
+
+        Each block is `channel` x `sample`; all but the last hold `samples_per_block` samples.
+        Raises RecordingError where the file turns out to be broken.
+        """
+        return _guarded_blocks(self.vibration, samples_per_block)
+
+    def tach_blocks(self, samples_per_block: int = 65_536) -> Iterator[FloatArray]:
+        """Iterate over the tach waveform as `blocks` does (`1` x `sample`); empty without one."""
+        return iter(()) if self.tach is None else _guarded_blocks(self.tach, samples_per_block)
+
+    def read(self) -> FloatArray:
+        """Read the whole vibration into memory, `channel` x `sample`."""
+        return np.concatenate(list(self.blocks()), axis=1)
+
+    def read_tach(self) -> FloatArray:
+        """Read the whole tach waveform into memory, one-dimensional; empty without one."""
+        blocks = [block[0] for block in self.tach_blocks()]
+        return np.concatenate(blocks) if blocks else np.empty(0)
+
+
+@contextmanager
+def recording_errors(path: Path) -> Iterator[None]:
+    """
+    Turn whatever a parser throws at a broken file into a RecordingError with one line.
+
+    Parsers of zip, MATLAB, sqlite and MCAP files document no closed set of exceptions for hostile
+    bytes, hence the broad clause.
+    """
+    try:
+        yield
+    except RecordingError as error:
+        if str(error).startswith(f'{path}: '):
+            raise
+        raise RecordingError(f'{path}: {error}') from error
+    except Exception as error:
+        reason = ' '.join(str(error).split())[:300] or 'no reason given'
+        raise RecordingError(
+            f'{path}: cannot be read ({type(error).__name__}: {reason})') from error
+
+
+def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[FloatArray]:
+    """Cut `channel` x `sample` pieces of any length into blocks of one length."""
+    held: list[FloatArray] = []
+    count = 0
+    for piece in pieces:
+        held.append(piece)
+        count += piece.shape[1]
+        if count < samples_per_block:
+            continue
+        joined = np.concatenate(held, axis=1)
+        whole = count - count % samples_per_block
+        for start in range(0, whole, samples_per_block):
+            yield joined[:, start:start + samples_per_block]
+        held, count = [joined[:, whole:]], count - whole
+    if count:
+        yield np.concatenate(held, axis=1)
+
+
+def _guarded_blocks(source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
+    if samples_per_block < 1:
+        raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
+    return source.blocks(samples_per_block)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise RecordingError(f'{name} {value}: must be positive and finite')
+
+
+def _check_pulse_times(name: str, times: FloatArray | None) -> None:
+    if times is None:
+        return
+    if times.ndim != 1 or times.size > MAX_PULSES:
+        raise RecordingError(
+            f'{name} of shape {times.shape}: needs one row of at most {MAX_PULSES} times')
+    if not np.isfinite(times).all():
+        raise RecordingError(f'{name}: holds NaN or infinity; remove those pulses')
+    backwards = np.flatnonzero(np.diff(times) < 0)
+    if backwards.size:
+        k = int(backwards[0]) + 1
+        raise RecordingError(
+            f'{name}: time runs backwards at pulse {k} ({times[k - 1]} to {times[k]} s); sort '
+            'them or split the recording')

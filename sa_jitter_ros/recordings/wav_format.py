@@ -1,0 +1,100 @@
+"""Recordings in `.wav` files: integer or float samples of any width, read in blocks."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import struct
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+
+_PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
+_WIDTHS = {_PCM: (8, 16, 24, 32), _FLOAT: (32, 64)}
+
+
+@dataclass(frozen=True)
+class WavSource:
+    """The samples of a `.wav` file; integers are scaled so that full scale is 1."""
+
+    path: Path
+    offset: int
+    channels: int
+    samples: int
+    bits: int
+    is_float: bool
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        frame = self.channels * self.bits // 8
+        with recording_errors(self.path), open(self.path, 'rb') as file:
+            file.seek(self.offset)
+            for start in range(0, self.samples, samples_per_block):
+                count = min(samples_per_block, self.samples - start)
+                data = file.read(count * frame)
+                if len(data) != count * frame:
+                    raise RecordingError(f'ends inside sample {start + len(data) // frame}')
+                yield self._decode(data).reshape(count, self.channels).T
+
+    def _decode(self, data: bytes) -> FloatArray:
+        if self.is_float:
+            return np.frombuffer(data, f'<f{self.bits // 8}').astype(np.float64)
+        if self.bits == 8:
+            return (np.frombuffer(data, np.uint8) - 128.0) / 128
+        if self.bits == 24:  # put each sample into the upper three bytes of a 32-bit integer
+            wide = np.zeros((len(data) // 3, 4), np.uint8)
+            wide[:, 1:] = np.frombuffer(data, np.uint8).reshape(-1, 3)
+            return wide.view('<i4')[:, 0] / 2.0**31
+        return np.frombuffer(data, f'<i{self.bits // 8}') / 2.0**(self.bits - 1)
+
+
+def open_wav(path: Path) -> Recording:
+    """
+    Open a `.wav` file as vibration of all its channels.
+
+    Units are '1' (of full scale) for integers and unknown for floats. A data chunk cut short, as
+    by a recorder that was switched off, is read up to its end and remarked. Raises RecordingError
+    if the file is broken or its coding is unknown.
+    """
+    with recording_errors(path), open(path, 'rb') as file:
+        form, _, kind = struct.unpack('<4sI4s', file.read(12))
+        if form != b'RIFF' or kind != b'WAVE':
+            raise RecordingError('is no RIFF/WAVE file; convert it to .wav or .npz')
+        layout: tuple[int, int, int, int] | None = None
+        while len(head := file.read(8)) == 8:
+            chunk, size = struct.unpack('<4sI', head)
+            if chunk == b'fmt ':
+                layout = _read_format(file.read(min(size, 64)))
+                file.seek(max(size - 64, 0) + size % 2, 1)
+            elif chunk == b'data':
+                break
+            else:
+                file.seek(size + size % 2, 1)
+        else:
+            raise RecordingError('has no data chunk')
+        if layout is None:
+            raise RecordingError('has no fmt chunk before its data')
+        coding, channels, rate, bits = layout
+        offset = file.tell()
+        available = min(size, os.fstat(file.fileno()).st_size - offset)
+        samples = available // (channels * bits // 8)
+        source = WavSource(path, offset, channels, samples, bits, coding == _FLOAT)
+        remarks = () if available == size else (
+            f'the data chunk should hold {size} bytes and holds {available}: read to its end',)
+        return Recording(source, float(rate), units=('' if coding == _FLOAT else '1',),
+                         remarks=remarks)
+
+
+def _read_format(data: bytes) -> tuple[int, int, int, int]:
+    """Return coding, channels, sampling rate and bits per sample of a `fmt ` chunk."""
+    coding, channels, rate, _, block, bits = struct.unpack('<HHIIHH', data[:16])
+    if coding == _EXTENSIBLE:
+        coding = struct.unpack('<H', data[24:26])[0]
+    if bits not in _WIDTHS.get(coding, ()):
+        raise RecordingError(
+            f'coding {coding} with {bits} bits is not read: use integers of 8 to 32 or floats of '
+            '32 or 64 bits')
+    if channels == 0 or block != channels * bits // 8:
+        raise RecordingError(f'{channels} channels of {bits} bits do not make {block} bytes')
+    return coding, channels, rate, bits

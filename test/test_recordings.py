@@ -1,0 +1,571 @@
+"""Recordings: every format gives back what was written, in blocks, and refuses what is wrong."""
+
+from dataclasses import replace
+import io
+import struct
+import tracemalloc
+import wave
+import zipfile
+
+import numpy as np
+import pytest
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings import (
+    ArraySource, ChannelMap, open_recording, Recording, write_bag, write_npz)
+from sa_jitter_ros.recordings import npz_format
+import scipy.io
+import scipy.io.wavfile
+
+RATE = 2000.0
+
+
+@pytest.fixture
+def recording(rng):
+    """Return a small recording with everything in it."""
+    return Recording(
+        ArraySource(rng.standard_normal((3, 5000))), RATE, channel_names=('a', 'b', 'c'),
+        units=('m/s^2', 'm/s^2', 'Pa'), start_time=12.5,
+        pulse_times=12.5 + np.cumsum(rng.uniform(0.02, 0.03, 90)),
+        tach=ArraySource(rng.standard_normal((1, 10_000))), tach_rate=2 * RATE,
+        pulses_per_revolution=6, pulses_per_trigger=3, ratio=2.40789, orders=(19.0, 38.0),
+        reference_pulse_times=np.linspace(12.5, 15.0, 60), description='a rig')
+
+
+def assert_same(got, wanted):
+    """Compare all that two recordings hold."""
+    np.testing.assert_array_equal(got.read(), wanted.read())
+    np.testing.assert_array_equal(got.read_tach(), wanted.read_tach())
+    for name in ('sample_rate', 'channel_names', 'units', 'start_time', 'tach_rate', 'ratio',
+                 'pulses_per_revolution', 'pulses_per_trigger', 'orders', 'description'):
+        assert getattr(got, name) == getattr(wanted, name), name
+    for name in ('pulse_times', 'reference_pulse_times'):
+        np.testing.assert_array_equal(getattr(got, name), getattr(wanted, name))
+
+
+# --- blocks -------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('count', [1, 7, 999, 5000, 10**6])
+def test_blocks_have_the_asked_length_and_make_the_whole(recording, count):
+    blocks = list(recording.blocks(count))
+    assert all(block.shape == (3, min(count, 5000)) for block in blocks[:-1])
+    assert all(block.dtype == np.float64 for block in blocks)
+    np.testing.assert_array_equal(np.concatenate(blocks, axis=1), recording.vibration.array)
+    assert recording.duration == 2.5
+
+
+def test_blocks_without_samples_are_refused(recording):
+    with pytest.raises(RecordingError, match='samples_per_block 0'):
+        recording.blocks(0)
+
+
+@pytest.mark.parametrize(('change', 'message'), [
+    ({'sample_rate': 0.0}, 'sample_rate 0.0'),
+    ({'sample_rate': np.nan}, 'sample_rate nan'),
+    ({'ratio': -1.0}, 'ratio -1.0'),
+    ({'orders': (1.0, np.inf)}, 'orders inf'),
+    ({'start_time': np.inf}, 'start_time inf'),
+    ({'tach_rate': None}, 'without tach_rate'),
+    ({'pulses_per_revolution': 0}, 'pulses_per_revolution 0'),
+    ({'pulses_per_trigger': 0}, 'pulses_per_trigger 0'),
+    ({'pulse_times': np.array([1.0, 2.0, 1.5])}, 'backwards at pulse 2'),
+    ({'pulse_times': np.array([1.0, np.nan])}, 'NaN'),
+    ({'reference_pulse_times': np.ones((2, 2))}, 'one row'),
+    ({'channel_names': ('a', 'b')}, '2 channel_names for 3 channels'),
+    ({'units': ('g', 'g')}, '2 units for 3 channels'),
+    ({'tach': ArraySource(np.ones((2, 10)))}, 'tach of 2 channels'),
+    ({'vibration': ArraySource(np.ones((1, 0)))}, 'at least one sample'),
+])
+def test_contradictions_are_refused(recording, change, message):
+    with pytest.raises(RecordingError, match=message):
+        replace(recording, **change)
+
+
+# --- npz ----------------------------------------------------------------------------------------
+
+def test_npz_round_trip(recording, tmp_path):
+    write_npz(tmp_path / 'rig.npz', recording)
+    assert_same(open_recording(tmp_path / 'rig.npz'), recording)
+
+
+def save(path, *, compress=False, **fields):
+    """Write an npz as a user does."""
+    (np.savez_compressed if compress else np.savez)(path, **fields)
+    return path
+
+
+@pytest.mark.parametrize('compress', [False, True])
+@pytest.mark.parametrize('order', ['C', 'F'])
+@pytest.mark.parametrize('limit', [0, 1 << 30])
+def test_npz_of_any_layout_in_memory_or_mapped(rng, tmp_path, monkeypatch, compress, order, limit):
+    monkeypatch.setattr(npz_format, 'IN_MEMORY_BYTES', limit)
+    vibration = np.asarray(rng.standard_normal((4, 1000)).astype(np.float32), order=order)
+    path = save(tmp_path / 'rig.npz', compress=compress, vibration=vibration, sample_rate=RATE)
+    opened = open_recording(path)
+    assert isinstance(opened.vibration.array, np.memmap) == (limit == 0)
+    np.testing.assert_array_equal(opened.read(), vibration)
+
+
+def test_large_npz_is_written_and_read_with_bounded_memory(tmp_path):
+    class Ramp:
+        channels, samples = 4, 3_000_000
+
+        def blocks(self, count):
+            for start in range(0, self.samples, count):
+                yield np.arange(start, min(start + count, self.samples)) * np.ones((4, 1))
+
+    path = tmp_path / 'long.npz'
+    tracemalloc.start()
+    write_npz(path, Recording(Ramp(), RATE))
+    last = None
+    for block in open_recording(path).blocks(10_000):
+        last = block
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert path.stat().st_size > 96_000_000
+    assert peak < 12_000_000
+    np.testing.assert_array_equal(last[:, -1], 2_999_999)
+
+
+def test_npz_minimum_gets_the_documented_defaults(tmp_path):
+    opened = open_recording(
+        save(tmp_path / 'rig.npz', vibration=np.ones(10, np.int16), sample_rate=100))
+    assert (opened.channels, opened.channel_names, opened.units) == (1, ('channel 0',), ('',))
+    assert (opened.pulses_per_revolution, opened.pulses_per_trigger, opened.ratio) == (1, None, 1)
+    assert opened.pulse_times is None
+    assert opened.description == 'rig.npz'
+
+
+def test_rows_with_a_tach_each_are_acquisitions(rng, tmp_path):
+    vibration, tach = rng.standard_normal((2, 5, 100))
+    path = save(tmp_path / 'rows.npz', vibration=vibration, tach=tach, sample_rate=RATE,
+                tach_rate=RATE, channel_names=list('abcde'), units='g')
+    opened = open_recording(path, acquisition=3)
+    assert (opened.acquisitions, opened.channel_names, opened.units) == (5, ('d',), ('g',))
+    np.testing.assert_array_equal(opened.read()[0], vibration[3])
+    np.testing.assert_array_equal(opened.read_tach(), tach[3])
+    with pytest.raises(RecordingError, match='acquisition 5: the file holds 5'):
+        open_recording(path, acquisition=5)
+
+
+def test_a_revolution_counter_becomes_pulses(tmp_path):
+    path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE, start_time=2.0,
+                tach_count=np.array([7, 7, 8, 8, 8, 10, 10]), tach_rate=10.0)
+    np.testing.assert_allclose(open_recording(path).pulse_times, [2.2, 2.5])
+
+
+@pytest.mark.parametrize(('fields', 'message'), [
+    ({'sample_rate': 1.0}, 'no vibration'),
+    ({'vibration': np.ones(3)}, 'no sample_rate'),
+    ({'vibration': np.ones((3, 2)), 'sample_rate': 1.0}, 'transpose'),
+    ({'vibration': np.ones((1, 2, 3)), 'sample_rate': 1.0}, 'channel x sample'),
+    ({'vibration': np.ones(3, complex), 'sample_rate': 1.0}, 'real numbers'),
+    ({'vibration': np.array(['a']), 'sample_rate': 1.0}, 'real numbers'),
+    ({'vibration': np.ones(3), 'sample_rate': [1.0, 2.0]}, 'single number'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'ratio': 'x'}, 'ratio of type'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'pulses_per_revolution': 1.5}, 'whole number'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'channel_names': 5}, 'must be text'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach': np.ones(3)}, 'tach_rate'),
+    ({'vibration': np.ones((2, 9)), 'sample_rate': 1.0, 'tach': np.ones((3, 9)),
+      'tach_rate': 1.0}, 'tach of 3 rows for 2'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'tach_count': [1, 2]}, 'tach_rate'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'pulse_times': np.ones((2, 2))}, 'one row'),
+    ({'vibration': np.ones(3), 'sample_rate': 1.0, 'description': 'x' * 300_000}, 'exceed'),
+])
+def test_npz_with_wrong_fields(tmp_path, fields, message):
+    path = save(tmp_path / 'bad.npz', **fields)
+    with pytest.raises(RecordingError, match=message) as caught:
+        open_recording(path)
+    assert str(caught.value).startswith(str(path))
+    assert '\n' not in str(caught.value)
+
+
+def test_pickled_arrays_are_never_loaded(tmp_path):
+    path = tmp_path / 'evil.npz'
+    np.savez(path, vibration=np.array([{'a': 1}], dtype=object), sample_rate=1.0)
+    with pytest.raises(RecordingError, match='pickled objects, which are never loaded'):
+        open_recording(path)
+
+
+def npy_header(shape, descr='<f8'):
+    """Return the header of an array file."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        stream, {'descr': descr, 'fortran_order': False, 'shape': shape})
+    return stream.getvalue()
+
+
+def test_a_shape_beyond_the_data_is_refused_before_allocation(tmp_path):
+    path = tmp_path / 'short.npz'
+    with zipfile.ZipFile(path, 'w') as archive:
+        archive.writestr('vibration.npy', npy_header((1 << 20, 1 << 20)) + bytes(800))
+        archive.writestr('sample_rate.npy', npy_header(()) + struct.pack('<d', 1.0))
+    with pytest.raises(RecordingError, match='the file holds 800'):
+        open_recording(path)
+
+
+def test_zip_bomb_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(npz_format, 'IN_MEMORY_BYTES', 1 << 20)
+    path = save(tmp_path / 'bomb.npz', compress=True, vibration=np.zeros(1 << 20),
+                sample_rate=1.0)
+    with pytest.raises(RecordingError, match='zip bomb'):
+        open_recording(path)
+
+
+def test_flipped_bits_in_samples_are_found(tmp_path):
+    path = save(tmp_path / 'flip.npz', vibration=np.ones(1000), sample_rate=1.0)
+    data = bytearray(path.read_bytes())
+    data[4000] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match='CRC'):
+        open_recording(path)
+
+
+# --- mat ----------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('compress', [False, True])
+def test_mat_round_trip(recording, tmp_path, compress):
+    path = tmp_path / 'rig.mat'
+    names = np.array(['a', 'b', 'c'], dtype=object)  # a cell of strings
+    scipy.io.savemat(path, {
+        'vibration': recording.read(), 'tach': recording.read_tach()[:, None],
+        'sample_rate': RATE, 'tach_rate': 2 * RATE, 'pulse_times': recording.pulse_times,
+        'reference_pulse_times': recording.reference_pulse_times[:, None], 'start_time': 12.5,
+        'pulses_per_revolution': 6, 'pulses_per_trigger': 3.0, 'ratio': 2.40789,
+        'orders': [19, 38], 'channel_names': names, 'units': ['m/s^2', 'm/s^2', 'Pa   '],
+        'description': 'a rig', 'not_ours': {'a': 1}}, do_compression=compress)
+    assert_same(open_recording(path), recording)
+
+
+def test_mat_version_73_gets_a_clear_line(tmp_path):
+    path = tmp_path / 'new.mat'
+    path.write_bytes(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(512, b' '))
+    with pytest.raises(RecordingError, match="save it with '-v7'"):
+        open_recording(path)
+
+
+def test_mat_with_a_struct_for_vibration(tmp_path):
+    scipy.io.savemat(tmp_path / 'bad.mat', {'vibration': {'x': 1.0}, 'sample_rate': 1.0})
+    with pytest.raises(RecordingError, match='vibration is a struct'):
+        open_recording(tmp_path / 'bad.mat')
+
+
+def test_mat_bomb_is_refused(tmp_path):
+    path = tmp_path / 'bomb.mat'
+    scipy.io.savemat(path, {'vibration': np.zeros((1, 1 << 24)), 'sample_rate': 1.0},
+                     do_compression=True)
+    with pytest.raises(RecordingError, match='zip bomb'):
+        open_recording(path)
+
+
+# --- wav ----------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('dtype', [np.uint8, np.int16, np.int32, np.float32, np.float64])
+def test_wav_with_one_channel_as_tach(rng, tmp_path, dtype):
+    if np.dtype(dtype).kind == 'f':
+        stored, scale, zero = rng.standard_normal((500, 3)).astype(dtype), 1.0, 0.0
+    else:
+        limits = np.iinfo(dtype)
+        stored = rng.integers(limits.min, limits.max, (500, 3), dtype, endpoint=True)
+        scale, zero = 2.0 ** (limits.bits - 1), 128.0 if dtype == np.uint8 else 0.0
+    scipy.io.wavfile.write(tmp_path / 'rig.wav', 8000, stored)
+    opened = open_recording(tmp_path / 'rig.wav', channel_map=ChannelMap(tach='1'))
+    assert (opened.sample_rate, opened.tach_rate) == (8000, 8000)
+    assert opened.channel_names == ('channel 0', 'channel 2')
+    wanted = ((stored.astype(np.float64) - zero) / scale).T
+    np.testing.assert_array_equal(opened.read(), wanted[[0, 2]])
+    tach = np.concatenate(list(opened.tach_blocks(77)), axis=1)
+    np.testing.assert_array_equal(tach, wanted[1:2])
+
+
+def test_wav_of_24_bits(tmp_path):
+    values = [0, 1, -1, 2**23 - 1, -2**23]
+    with wave.open(str(tmp_path / 'rig.wav'), 'wb') as file:
+        file.setparams((1, 3, 4000, 0, 'NONE', ''))
+        file.writeframes(b''.join(value.to_bytes(3, 'little', signed=True) for value in values))
+    np.testing.assert_array_equal(open_recording(tmp_path / 'rig.wav').read()[0],
+                                  np.array(values) / 2.0**23)
+
+
+def test_wav_cut_short_is_read_to_its_end(tmp_path):
+    path = tmp_path / 'rig.wav'
+    scipy.io.wavfile.write(path, 8000, np.arange(1000, dtype=np.int16))
+    path.write_bytes(path.read_bytes()[:-501])
+    opened = open_recording(path)
+    assert opened.samples == 749
+    assert 'read to its end' in opened.remarks[0]
+
+
+@pytest.mark.parametrize(('data', 'message'), [
+    (b'RIFX\0\0\0\0WAVE', 'no RIFF'),
+    (b'RIFF\0\0\0\0WAVE', 'no data chunk'),
+    (b'RIFF\0\0\0\0WAVEdata\0\0\0\0', 'no fmt'),
+    (b'RIFF\0\0\0\0WAVEfmt \x10\0\0\0' + struct.pack('<HHIIHH', 2, 1, 8000, 8000, 1, 4), 'coding'),
+    (b'RIFF\0\0\0\0WAVEfmt \x10\0\0\0' + struct.pack('<HHIIHH', 1, 0, 8000, 0, 0, 8), '0 channel'),
+    (b'RIFF', 'cannot be read'),
+])
+def test_broken_wav(tmp_path, data, message):
+    (tmp_path / 'bad.wav').write_bytes(data)
+    with pytest.raises(RecordingError, match=message):
+        open_recording(tmp_path / 'bad.wav')
+
+
+def test_unknown_channel_names_those_there_are(tmp_path):
+    scipy.io.wavfile.write(tmp_path / 'rig.wav', 8000, np.zeros((10, 2), np.int16))
+    with pytest.raises(RecordingError, match="no channel '2': there are channel 0, channel 1"):
+        open_recording(tmp_path / 'rig.wav', channel_map=ChannelMap(tach='2'))
+    scipy.io.wavfile.write(tmp_path / 'mono.wav', 8000, np.zeros(10, np.int16))
+    with pytest.raises(RecordingError, match='no vibration left'):
+        open_recording(tmp_path / 'mono.wav', channel_map=ChannelMap(tach='0'))
+
+
+# --- csv ----------------------------------------------------------------------------------------
+
+def table(path, columns, *, header='', delimiter=',', decimal='.'):
+    """Write columns as text."""
+    rows = '\n'.join(delimiter.join(f'{item:.12g}' for item in row) for row in zip(*columns))
+    path.write_text(f'{header}\n{rows}\n'.lstrip('\n').replace('.', decimal))
+    return path
+
+
+def test_csv_with_times_and_a_tach(rng, tmp_path):
+    a, b, key = rng.standard_normal((3, 1234)).round(6)
+    times = 3.0 + np.arange(1234) / RATE
+    path = table(tmp_path / 'rig.csv', (times, a, key, b), header='time,acc a,key,acc b')
+    opened = open_recording(path, channel_map=ChannelMap(tach='key'))
+    assert opened.sample_rate == pytest.approx(RATE, rel=1e-9)
+    assert (opened.start_time, opened.tach_rate) == (3.0, opened.sample_rate)
+    assert opened.channel_names == ('acc a', 'acc b')
+    np.testing.assert_array_equal(opened.read(), [a, b])
+    np.testing.assert_array_equal(np.concatenate(list(opened.blocks(100)), axis=1), [a, b])
+    np.testing.assert_array_equal(opened.read_tach(), key)
+    by_number = open_recording(path, channel_map=ChannelMap(vibration=('3',), time='0'))
+    np.testing.assert_array_equal(by_number.read(), [b])
+
+
+def test_csv_of_a_german_spreadsheet(rng, tmp_path):
+    a, b = rng.standard_normal((2, 50)).round(6)
+    path = table(tmp_path / 'rig.csv', (a, b), header='a;b', delimiter=';', decimal=',')
+    np.testing.assert_array_equal(open_recording(path, sample_rate=RATE).read(), [a, b])
+
+
+def test_csv_without_header_and_with_a_text_column(tmp_path):
+    path = tmp_path / 'rig.csv'
+    path.write_text('1,2\n\n3,4\n')
+    opened = open_recording(path, sample_rate=10)
+    assert opened.channel_names == ('0', '1')
+    np.testing.assert_array_equal(opened.read(), [[1, 3], [2, 4]])
+    path.write_text('a,state\n1,ok\n2,ok\n')
+    opened = open_recording(path, sample_rate=10, channel_map=ChannelMap(vibration=('a',)))
+    np.testing.assert_array_equal(opened.read(), [[1, 2]])
+
+
+@pytest.mark.parametrize(('text', 'options', 'message'), [
+    ('a,b\n1,2\n', {}, 'no time column among a, b'),
+    ('time,a\n0,1\n0,2\n', {}, 'must increase'),
+    ('time,a\n0,1\n1,2\n5,3\n6,4\n', {}, 'split the file at its gaps'),
+    ('time,a\nx,1\n', {}, 'could not convert'),
+    ('a,b\n1,2\n3\n', {'sample_rate': 1.0}, 'rows 0 to 2'),
+    ('a,b\n1,2\n3,x\n', {'sample_rate': 1.0}, 'rows 0 to 2'),
+    ('a,b\n', {'sample_rate': 1.0}, 'at least one sample'),
+    ('', {'sample_rate': 1.0}, 'no vibration'),
+    ('time\n1\n2\n', {}, 'no vibration'),
+    ('x' * (1 << 21), {'sample_rate': 1.0}, 'larger than field limit'),
+    ('a\n' + '1' * (1 << 21), {'sample_rate': 1.0}, 'longer than'),
+])
+def test_broken_csv(tmp_path, text, options, message):
+    (tmp_path / 'bad.csv').write_text(text)
+    with pytest.raises(RecordingError, match=message):
+        open_recording(tmp_path / 'bad.csv', **options).read()
+
+
+def test_a_rate_that_contradicts_the_file_is_refused(recording, tmp_path):
+    write_npz(tmp_path / 'rig.npz', recording)
+    with pytest.raises(RecordingError, match='500 Hz given, but the file says 2000'):
+        open_recording(tmp_path / 'rig.npz', sample_rate=500)
+
+
+def test_channel_map_applies_to_arrays_too(recording, tmp_path):
+    write_npz(tmp_path / 'rig.npz', recording)
+    opened = open_recording(tmp_path / 'rig.npz', channel_map=ChannelMap(('c', 'a'), tach='b'))
+    assert (opened.channel_names, opened.units) == (('c', 'a'), ('Pa', 'm/s^2'))
+    np.testing.assert_array_equal(opened.read(), recording.read()[[2, 0]])
+    np.testing.assert_array_equal(opened.read_tach(), recording.read()[1])
+    assert opened.tach_rate == RATE
+
+
+@pytest.mark.parametrize('name', ['rig', 'rig.flac', 'nowhere.npz'])
+def test_what_is_no_recording(tmp_path, name):
+    if name != 'nowhere.npz':
+        (tmp_path / name).write_bytes(b'')
+    with pytest.raises(RecordingError, match=r'no such file|is not one of \.npz'):
+        open_recording(tmp_path / name)
+
+
+# --- bags ---------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('tach_type', ['sensor_msgs/msg/TimeReference',
+                                       'std_msgs/msg/Float64MultiArray'])
+def test_bag_round_trip(recording, tmp_path, storage, tach_type):
+    pytest.importorskip('rosbags')
+    write_bag(tmp_path / 'bag', recording, storage=storage, tach_type=tach_type,
+              samples_per_block=300, namespace='/rig')
+    suffix = {'mcap': '.mcap', 'sqlite3': '.db3'}[storage]
+    for path in (tmp_path / 'bag', next((tmp_path / 'bag').glob(f'*{suffix}'))):
+        opened = open_recording(path)
+        np.testing.assert_array_equal(opened.read(), recording.read())
+        np.testing.assert_array_equal(opened.read_tach(), recording.read_tach())
+        np.testing.assert_allclose(opened.pulse_times, recording.pulse_times, rtol=0, atol=0.6e-9)
+        assert (opened.start_time, opened.sample_rate, opened.tach_rate) == (12.5, RATE, 2 * RATE)
+        assert opened.remarks == ()
+
+
+def test_bag_of_float32_needs_a_rate(recording, tmp_path):
+    pytest.importorskip('rosbags')
+    write_bag(tmp_path / 'bag', replace(recording, tach=None, start_time=0.0),
+              vibration_type='std_msgs/msg/Float32MultiArray')
+    with pytest.raises(RecordingError, match='give sample_rate'):
+        open_recording(tmp_path / 'bag')
+    opened = open_recording(tmp_path / 'bag', sample_rate=RATE)
+    np.testing.assert_array_equal(opened.read(), recording.read().astype(np.float32))
+
+
+def test_lost_samples_in_a_bag_are_nan(recording, tmp_path):
+    pytest.importorskip('rosbags')
+    vibration = recording.read()
+    vibration[:, 1000:1400] = np.nan
+    gappy = replace(recording, vibration=ArraySource(vibration))
+    write_bag(tmp_path / 'bag', gappy, samples_per_block=100)
+    opened = open_recording(tmp_path / 'bag')
+    np.testing.assert_array_equal(opened.read(), vibration)
+    assert opened.remarks == ('/vibration: 400 lost samples are NaN',)
+
+
+def write_messages(path, kind, messages, topic='vibration'):
+    """Write messages of one topic; each is a function of the types."""
+    rosbag2, typesys = (pytest.importorskip(f'rosbags.{name}') for name in ('rosbag2', 'typesys'))
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    with rosbag2.Writer(path, version=9) as bag:
+        connection = bag.add_connection(f'/{topic}', kind, typestore=store)
+        for k, message in enumerate(messages):
+            bag.write(connection, k, store.serialize_cdr(message(store.types), kind))
+    return path
+
+
+def float64_block(index, *, time=None, rate=RATE, shape=(2, 100), sizes=None, offset=3):
+    """Return the maker of a vibration message."""
+    time = index / RATE if time is None else time
+    samples = np.broadcast_to(index + np.arange(shape[1], dtype=np.float64), shape)
+
+    def make(types):
+        dims = [types['std_msgs/msg/MultiArrayDimension'](label, size, 0)
+                for label, size in zip(('channel', 'sample'), sizes or shape)]
+        data = np.concatenate([np.array([time, rate, index], np.float64)[:offset],
+                               samples.ravel()])
+        layout = types['std_msgs/msg/MultiArrayLayout'](dims, offset)
+        return types['std_msgs/msg/Float64MultiArray'](layout, data)
+    return make
+
+
+def test_repeats_in_a_bag_are_left_out(tmp_path):
+    path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
+                          [float64_block(index) for index in (500, 600, 600, 550, 650, 800)])
+    opened = open_recording(path)
+    wanted = np.arange(500.0, 900.0)
+    wanted[250:300] = np.nan
+    np.testing.assert_array_equal(opened.read(), [wanted, wanted])
+    assert opened.start_time == 500 / RATE
+    assert opened.remarks == ('/vibration: 50 lost samples are NaN',
+                              '/vibration: 250 repeated samples left out')
+
+
+def test_a_bag_block_without_header_is_counted(tmp_path):
+    path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
+                          [float64_block(index, offset=0) for index in (0, 100)])
+    np.testing.assert_array_equal(open_recording(path, sample_rate=RATE).read()[1], np.arange(200))
+
+
+@pytest.mark.parametrize(('second', 'message'), [
+    (float64_block(100, rate=RATE + 1), 'become 2 at 2001'),
+    (float64_block(100, shape=(3, 100)), 'become 3'),
+    (float64_block(100, time=9.0), 'a second run; split the bag'),
+    (float64_block(10**9), 'more than 3600 s'),
+    (float64_block(100.5), 'index 100.5 is no whole number'),
+    (float64_block(-100), 'index -100.0 is no whole number'),
+    (float64_block(100, time=np.nan), 'time nan'),
+    (float64_block(100, rate=0.0), 'rate 0.0'),
+    (float64_block(100, sizes=(2, 101)), 'do not fit'),
+    (float64_block(100, sizes=(200,)), 'do not fit'),
+    (float64_block(100, offset=2), 'data_offset|do not fit'),
+])
+def test_bags_that_do_not_go_on(tmp_path, second, message):
+    path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
+                          [float64_block(0), second])
+    with pytest.raises(RecordingError, match=message):
+        open_recording(path, sample_rate=RATE if 'offset' in message else None)
+
+
+def test_imu_bag_with_a_lost_message(tmp_path):
+    def imu(k):
+        def make(types):
+            vector, numbers = types['geometry_msgs/msg/Vector3'], np.zeros(9)
+            stamp = types['builtin_interfaces/msg/Time'](*divmod(k * 10**7 + 5 * 10**9, 10**9))
+            return types['sensor_msgs/msg/Imu'](
+                types['std_msgs/msg/Header'](stamp, ''),
+                types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), numbers,
+                vector(0.0, 0.0, 0.0), numbers, vector(1.0 * k, 2.0 * k, 9.81), numbers)
+        return make
+
+    path = write_messages(tmp_path / 'bag', 'sensor_msgs/msg/Imu',
+                          [imu(k) for k in (0, 1, 2, 4, 5)], topic='imu/data')
+    topic = ('/imu/data',)
+    opened = open_recording(path, sample_rate=100, channel_map=ChannelMap(vibration=topic))
+    assert (opened.channel_names, opened.units[0]) == (('x', 'y', 'z'), 'm/s^2')
+    assert opened.start_time == 5.0
+    np.testing.assert_array_equal(opened.read()[:2], [[0, 1, 2, np.nan, 4, 5],
+                                                      [0, 2, 4, np.nan, 8, 10]])
+    one = open_recording(path, sample_rate=100, channel_map=ChannelMap(vibration=(*topic, 'z')))
+    assert one.channel_names == ('z',)
+    with pytest.raises(RecordingError, match='no vibration topic among /imu/data'):
+        open_recording(path, sample_rate=100)
+
+
+def test_errors_of_the_bag_writer(recording, tmp_path):
+    pytest.importorskip('rosbags')
+    with pytest.raises(RecordingError, match='not one of those'):
+        write_bag(tmp_path / 'bag', recording, storage='cassette')
+    write_bag(tmp_path / 'bag', recording)
+    with pytest.raises(RecordingError, match='exists'):
+        write_bag(tmp_path / 'bag', recording)
+    with pytest.raises(RecordingError, match='topic /nowhere is not in the bag'):
+        open_recording(tmp_path / 'bag', channel_map=ChannelMap(vibration=('/nowhere',)))
+
+
+# --- measured -----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('name', 'channels', 'samples', 'pulses', 'acquisitions'), [
+    ('gear0_gearbox', 6, 282_624, None, 1),
+    ('gfds_b30hz0', 4, 88_320, None, 1),
+    ('gfds_b30hz50', 4, 94_208, None, 1),
+    ('gfds_h30hz0', 4, 88_832, None, 1),
+    ('gfds_h30hz50', 4, 110_848, None, 1),
+    ('motor_10V_100kHz', 1, 100_000, None, 1),
+    ('motor_30V_100kHz', 1, 100_000, None, 1),
+    ('motor_runup_20V_40kHz', 1, 120_000, None, 1),
+    ('rotorbalancer_weight', 1, 952, None, 10),
+    ('rotorbalancer_weight_5', 1, 952, None, 10),
+    ('rotorbalancer_without_weight', 1, 952, None, 10),
+    ('uia_bearing_rig_1', 1, 1_228_800, 102, 1),
+])
+def test_measured_recordings(shared_data, name, channels, samples, pulses, acquisitions):
+    opened = open_recording(shared_data / f'{name}.npz', acquisition=acquisitions - 1)
+    assert (opened.channels, opened.samples, opened.acquisitions) == (
+        channels, samples, acquisitions)
+    assert (opened.pulse_times is None) == (pulses is None)
+    assert pulses is None or opened.pulse_times.size == pulses
+    assert sum(block.shape[1] for block in opened.blocks(10_000)) == samples
+
+
+def test_trigger_edges_are_no_recording(shared_data):
+    with pytest.raises(RecordingError, match='no vibration'):
+        open_recording(shared_data / 'engine_edges_civic_K20_cranking.npz')
