@@ -1,0 +1,172 @@
+"""
+Condition indicators of a synchronous average: one number for each way a gear shows damage.
+
+``x`` is the average, ``d`` its difference and ``r`` its residual signal (`residual`), ``s(.)`` a
+standard deviation over one revolution (divisor n), ``mk(.)`` a central moment over one revolution
+and ``A`` peak amplitudes of lines. In the order of `INDICATORS`:
+
+    rms, peak, crest_factor   sqrt(mean x^2); max |x|; peak / rms. An offset of x counts.
+    kurtosis                  m4(x) / s(x)^4; 3 for Gaussian noise. Dyer and Stewart (1978)
+    fm0                       (max x - min x) / sum of A over all mesh harmonics. Stewart (1977)
+    fm4                       m4(d) / s(d)^4; 3 for Gaussian noise. Stewart (1977)
+    m6a, m8a                  m6(d) / s(d)^6, m8(d) / s(d)^8; 15 and 105 for Gaussian noise.
+                              Martin (1989)
+    na4                       m4(r) / (mean of s(r)^2 over all averages so far)^2: grows on with
+                              the damage. Zakrajsek, Townsend, Decker (1993)
+    energy_ratio              s(d) / s(regular signal). Swansson (1980)
+    sideband_ratio            sum of A over the sidebands of the mesh orders / sum of A over the
+                              mesh orders. Hanna, Hatch, Kalb, Weiss, Luo (2011), with as many
+                              pairs as `GearSettings.sidebands` says (they take 6)
+    sideband_level_factor     sum of A over the first sidebands of the mesh orders / s(x).
+                              Vecer, Kreidl, Smid (2005)
+
+Overviews: Lebold et al. (2000), named in `residual`; Vecer, Kreidl, Smid, "Condition indicators
+for gearbox condition monitoring systems", Acta Polytechnica 45 (2005). Where a denominator is 0 to
+rounding (constant signal, nothing left) the value is NaN; without mesh orders everything from fm0
+on is.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sa_jitter_ros.averaging.residual import GearSettings, separate
+from sa_jitter_ros.errors import SignalError
+
+Array = NDArray[Any]
+
+INDICATORS: tuple[str, ...] = (
+    'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',
+    'energy_ratio', 'sideband_ratio', 'sideband_level_factor')
+
+# What is this small beside the average's peak is the rounding of its Fourier transform.
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class ConditionIndicators:
+    """
+    Indicators in the fixed order of `names`: `values` is (..., indicator), NaN where undefined.
+
+    The leading dimensions are the average's: (channel, indicator) or (average, channel,
+    indicator). `averages` is the number of averages that na4 knows.
+    """
+
+    values: Array
+    averages: int
+    names: tuple[str, ...] = INDICATORS
+
+    def __getitem__(self, name: str) -> Array:
+        """Return one indicator of all channels by its name."""
+        return np.asarray(self.values[..., self.names.index(name)])
+
+
+class RunningIndicators:
+    """
+    Condition indicators of average after average; na4 remembers the residual's mean variance.
+
+    The result after every update is that of `condition_indicators` on all averages so far.
+    """
+
+    def __init__(self, settings: GearSettings | None = None) -> None:
+        """Start without history."""
+        self._settings = settings or GearSettings()
+        self._variance_sum: Array = np.zeros(0)
+        self._latest = ConditionIndicators(np.zeros((0, len(INDICATORS))), 0)
+
+    def update(self, average: ArrayLike) -> None:
+        """
+        Take the next average, (channels, n).
+
+        Raises SignalError and ParameterError as `condition_indicators` does, and SignalError when
+        the number of channels changes; a refused average leaves the history as it was.
+        """
+        samples = np.asarray(average, float)
+        count = self._latest.averages
+        if samples.ndim != 2 or (count > 0 and samples.shape[0] != self._variance_sum.size):
+            expected = self._variance_sum.size if count else 'any number of'
+            raise SignalError(f'average of shape {samples.shape}: expected {expected} channels x '
+                              'points; start anew when the channels change')
+        values, self._variance_sum = _indicators(
+            samples[None], self._settings, count, self._variance_sum if count else np.zeros(()))
+        self._latest = ConditionIndicators(values[0], count + 1)
+
+    def get(self) -> ConditionIndicators:
+        """Return the indicators of the latest average; none, of no channel, before the first."""
+        return self._latest
+
+
+def condition_indicators(
+    average: ArrayLike, settings: GearSettings | None = None,
+) -> ConditionIndicators:
+    """
+    Return the condition indicators of one average or of a whole history of averages.
+
+    `average` is (channels, n), or (averages, channels, n) from the oldest to the latest; na4 of an
+    average knows it and those before it, so that of a single one is the kurtosis of its residual.
+    Raises SignalError on another shape or on samples that are not finite, ParameterError on a mesh
+    order at or above the Nyquist order n/2.
+    """
+    samples = np.asarray(average, float)
+    if samples.ndim not in (2, 3):
+        raise SignalError(f'average of shape {samples.shape}: expected channels x points, or '
+                          'averages x channels x points')
+    history = samples if samples.ndim == 3 else samples[None]
+    values, _ = _indicators(history, settings or GearSettings(), 0, np.zeros(()))
+    return ConditionIndicators(values if samples.ndim == 3 else values[0], len(history))
+
+
+def _indicators(
+    history: Array, settings: GearSettings, count: int, variance_sum: Array,
+) -> tuple[Array, Array]:
+    """
+    Return the values of (averages, channels, n), and the new sum of residual variances.
+
+    `variance_sum` is that of the `count` averages before these.
+    """
+    signals = separate(history, settings)
+    lines = signals.lines
+    peak = np.abs(history).max(axis=-1)
+
+    def defined(denominator: Array) -> Array:
+        return np.where(denominator > _ROUNDING * peak, denominator, np.nan)
+
+    def squares(signal: Array, deviation: Array) -> Array:
+        centred = signal - signal.mean(axis=-1, keepdims=True)
+        return np.asarray(np.square(centred / defined(deviation)[..., None]))
+
+    def mean_product(a: Array, b: Array) -> Array:
+        return np.asarray(np.einsum('...i,...i->...', a, b) / a.shape[-1])
+
+    def amplitude_sum(mask: Array) -> Array:
+        return np.asarray(signals.amplitudes[..., mask].sum(axis=-1) if mask.any()
+                          else np.full(peak.shape, np.nan))
+
+    rms = np.sqrt(mean_product(history, history))
+    deviation = history.std(axis=-1)
+    square = squares(history, deviation)
+    difference_deviation = signals.difference.std(axis=-1)
+    difference_square = squares(signals.difference, difference_deviation)
+    difference_fourth = np.square(difference_square)
+    variance_sums = variance_sum + np.cumsum(signals.residual.var(axis=-1), axis=0)
+    counts = np.arange(count + 1, count + 1 + len(history))[:, None]
+    residual_square = squares(signals.residual, np.sqrt(variance_sums / counts))
+    values = np.stack([
+        rms,
+        peak,
+        peak / defined(rms),
+        mean_product(square, square),
+        np.ptp(history, axis=-1) / defined(amplitude_sum(lines.mesh)),
+        difference_fourth.mean(axis=-1),
+        mean_product(difference_fourth, difference_square),
+        mean_product(difference_fourth, difference_fourth),
+        mean_product(residual_square, residual_square),
+        difference_deviation / defined(signals.regular.std(axis=-1)),
+        amplitude_sum(lines.fundamental_sidebands) / defined(amplitude_sum(lines.fundamentals)),
+        amplitude_sum(lines.first_sidebands) / defined(deviation),
+    ], axis=-1)
+    if not settings.mesh_orders:
+        values[..., INDICATORS.index('fm0'):] = np.nan
+    return values, variance_sums[-1]
