@@ -131,7 +131,8 @@ class VibrationTimeline:
     A header time more than half a sample off the clock of its run is counted, more than
     `time_tolerance` (s) starts a new run. A block that lies wholly before the last one's start is
     held back until the next block tells: one that continues it makes a restart of the source, any
-    other a repeated or stray block, which is dropped.
+    other a repeated or stray block, which is dropped. `epoch` counts the times that time ran back;
+    `previous_end` is where (s) it last did.
     """
 
     time_tolerance: float = 0.01
@@ -139,6 +140,7 @@ class VibrationTimeline:
     counts: TimelineCounts = field(default_factory=TimelineCounts)
     stretches: list[Stretch] = field(default_factory=list)
     epoch: int = 0
+    previous_end: float = -np.inf
     messages: list[str] = field(default_factory=list)
     _last: SampleBlock | None = None
     _suspect: SampleBlock | None = None
@@ -194,7 +196,7 @@ class VibrationTimeline:
         for stretch in self.stretches:
             if stretch.epoch < epoch:
                 stretch.trim(stretch.end_index)
-            elif stretch.epoch == epoch:
+            elif stretch.epoch == epoch and np.isfinite(before):
                 stretch.trim(stretch.index + int(np.floor(stretch.position(np.float64(before)))))
         self._tidy()
 
@@ -246,6 +248,7 @@ class VibrationTimeline:
     def _new_run(self, block: SampleBlock, *, restart: bool) -> None:
         self._close()
         if restart:
+            self.previous_end = self.end_time
             self.epoch += 1
             self.counts.restarts += 1
             self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '

@@ -29,7 +29,15 @@ PREDICTION_FIELDS = (
     'order', 'mean_attenuation', 'variance', 'standard_deviation',
     'quantile_05', 'quantile_50', 'quantile_95')
 RESIDUAL_FIELDS = ('order', 'observed', 'predicted', 'residual', 'standard_error', 'z')
-IMU_AXES = ('x', 'y', 'z')
+SAMPLE_TYPES: dict[str, type] = {
+    'std_msgs/Float64MultiArray': Float64MultiArray,
+    'std_msgs/Float32MultiArray': Float32MultiArray,
+    'sensor_msgs/Imu': Imu,
+}
+PULSE_TYPES: dict[str, type] = {
+    'sensor_msgs/TimeReference': TimeReference,
+    'std_msgs/Float64MultiArray': Float64MultiArray,
+}
 INDEX_BASE = 1 << 24  # largest power of two below which every integer is a float32
 
 
@@ -167,14 +175,14 @@ class SampleDecoder:
     """
     Decode `vibration` or `tach_waveform` messages of one type into `SampleBlock`s.
 
-    `kind` is 'float64', 'float32' or 'imu'; `sample_rate` (Hz) and `start_time` (s) serve where the
+    `kind` is a key of `SAMPLE_TYPES`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz) and `start_time` (s) serve where the
     message does not carry them. Messages without header are counted from `start_time`; `counted`
     tells that this happened. Raises `MessageError` on a malformed message.
     """
 
     def __init__(self, kind: str, *, sample_rate: float, start_time: float = 0.0,
                  imu_axis: str = 'z') -> None:
-        self._decode = {'float64': self._float64, 'float32': self._float32, 'imu': self._imu}[kind]
+        self._decode = dict(zip(SAMPLE_TYPES, (self._float64, self._float32, self._imu)))[kind]
         self._rate, self._start_time = sample_rate, start_time
         self._axes = tuple(imu_axis)
         self._next_index = 0

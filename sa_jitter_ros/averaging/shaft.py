@@ -1,0 +1,262 @@
+"""
+The synchronous average of one shaft, cycle by cycle.
+
+Feed it the samples of consecutive trigger cycles; it returns an average whenever one is due. What it
+holds is bounded by the settings, and its result depends on the cycles alone.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.laws import angle_law, LAWS
+from sa_jitter_ros.angle.resampling import METHODS
+from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleSamples,
+                                           first_point, grid_points, needed_margin, on_grid,
+                                           project, waveform_cutoff)
+from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, RunningMean, SlidingMean
+from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.errors import ParameterError, SignalError
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+AVERAGING = ('block', 'sliding', 'exponential')
+
+
+@dataclass(frozen=True)
+class AverageSettings:
+    """
+    How the trigger cycles of one shaft are averaged.
+
+    `cycles` is r, the fundamental cycles in a trigger cycle; `trigger_cycles` is N_t; `orders` are
+    multiples of the shaft; `samples_per_revolution` 0 chooses the waveform's grid. Raises
+    `ParameterError` for values that cannot be used.
+    """
+
+    cycles: float = 1.0
+    trigger_cycles: int = 40
+    orders: tuple[float, ...] = (1.0, 2.0, 3.0)
+    samples_per_revolution: int = 0
+    averaging: str = 'block'
+    law: str = 'linear'
+    interpolation: str = 'band_limited'
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        if not (math.isfinite(self.cycles) and self.cycles > 0.0):
+            raise ParameterError(f'a trigger cycle is {self.cycles} fundamental cycles long: give '
+                                 'a positive ratio')
+        if self.trigger_cycles < 1:
+            raise ParameterError(f'trigger_cycles is {self.trigger_cycles}: give at least 1')
+        if not self.orders or not all(math.isfinite(g) and g > 0.0 for g in self.orders):
+            raise ParameterError(f'orders are {list(self.orders)}: give positive numbers')
+        if self.samples_per_revolution < 0 or 0 < self.samples_per_revolution < 4:
+            raise ParameterError(f'samples_per_revolution is {self.samples_per_revolution}: give '
+                                 'at least 4, or 0 to choose it')
+        for name, value, known in (('averaging', self.averaging, AVERAGING),
+                                   ('angle_law', self.law, LAWS),
+                                   ('interpolation', self.interpolation, METHODS)):
+            if value not in known:
+                raise ParameterError(f'{name} is {value!r}: give one of {", ".join(known)}')
+
+
+@dataclass(frozen=True)
+class SynchronousAverage:
+    """
+    An average over consecutive trigger cycles.
+
+    Times in s, speed of the tach shaft in Hz. `waveform` and its `standard_error` are (channel,
+    angle) over whole fundamental cycles, NaN where none is whole; `amplitudes` (channel, order) are
+    complex peak amplitudes over whole trigger cycles, cos having phase 0 where the angle is 0 (NaN
+    from the Nyquist frequency on), `noise` (channel, order) their standard deviation along the
+    radius. `angle` is that of the first pulse (fundamental cycles), `pulses` (N_t + 1,) in s.
+    """
+
+    start_time: float
+    end_time: float
+    sequence: int
+    trigger_cycles: int
+    fundamental_cycles: int
+    waveform: FloatArray
+    standard_error: FloatArray
+    orders: FloatArray
+    amplitudes: ComplexArray
+    noise: FloatArray
+    angle: float
+    pulses: FloatArray
+
+
+class ShaftAverager:
+    """Averages the trigger cycles of one shaft: `update` per cycle, `reset` where they break off."""
+
+    def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
+        self.settings = settings
+        self._law = angle_law(settings.law)
+        self._cycle = first_cycle
+        self._sequence = 0
+        self._points = settings.samples_per_revolution
+        self._start()
+
+    def reset(self) -> bool:
+        """Begin again at angle 0; returns whether an unfinished average was lost."""
+        lost = self.settings.averaging == 'block' and self._counted > 0
+        self._cycle = 0
+        self._start()
+        return lost
+
+    def change(self, settings: AverageSettings) -> bool:
+        """Go on with other settings and the same angle; returns whether an average was lost."""
+        lost = self.settings.averaging == 'block' and self._counted > 0
+        if settings.cycles != self.settings.cycles:
+            self._cycle = 0
+        self.settings, self._law = settings, angle_law(settings.law)
+        self._points = settings.samples_per_revolution
+        self._start()
+        return lost
+
+    def margin(self, period: float, rate: float) -> int:
+        """Samples that a cycle of `period` s at `rate` Hz needs on either side."""
+        points = self._points or self._chosen(period, rate)
+        return needed_margin(self.settings.interpolation,
+                             waveform_cutoff(points, self.settings.cycles, period, rate))
+
+    def update(self, cycle: CycleSamples) -> SynchronousAverage | None:
+        """
+        Take the next trigger cycle; returns an average when one is due.
+
+        Raises `SignalError` when the shaft itself turns faster than the samples can follow.
+        """
+        settings = self.settings
+        if settings.cycles / cycle.period >= cycle.rate / 2.0:
+            raise SignalError(
+                f'shaft frequency {settings.cycles / cycle.period:.6g} Hz is not below half the '
+                f'sampling rate of {cycle.rate:.6g} Hz: check ratio and pulses_per_revolution')
+        if not self._counted:
+            self._choose_grid(cycle)
+        angle = settings.cycles * self._cycle
+        grid, first, points = self._resample(cycle, angle)
+        amplitudes = project(grid, settings.cycles, settings.orders, angle)
+        amplitudes[:, self.beyond_nyquist(cycle.period, cycle.rate)] = np.nan
+        if not self._counted:
+            self._expect_from(angle)
+        self._add_points(first, points)
+        self._amplitude_mean.update(amplitudes)
+        self._amplitudes.append(amplitudes)
+        self._pulses.append(float(cycle.pulses[cycle.first + 1]))
+        if not self._counted:
+            self._pulses.appendleft(float(cycle.pulses[cycle.first]))
+        self._counted += 1
+        self._cycle += 1
+        if self._counted < settings.trigger_cycles:
+            return None
+        self._slide()
+        average = self._result()
+        if settings.averaging == 'block':
+            self._start()
+        return average
+
+    def beyond_nyquist(self, period: float, rate: float) -> NDArray[np.bool_]:
+        """Which orders are at or above half the sampling rate."""
+        return np.asarray(np.array(self.settings.orders) * self.settings.cycles / period
+                          >= rate / 2.0)
+
+    # --- the grid ---
+
+    def _chosen(self, period: float, rate: float) -> int:
+        return choose_samples_per_revolution(self.settings.cycles, period, rate)
+
+    def _choose_grid(self, cycle: CycleSamples) -> None:
+        if self.settings.samples_per_revolution:
+            return
+        # A waveform keeps its length as long as it is neither coarser than the samples nor twice
+        # as fine: subscribers like one shape.
+        needed = cycle.period * cycle.rate / self.settings.cycles
+        if not needed <= self._points <= 2.2 * needed:
+            self._points = self._chosen(cycle.period, cycle.rate)
+
+    def _resample(self, cycle: CycleSamples, angle: float
+                  ) -> tuple[FloatArray, int, FloatArray]:
+        """Grid of the trigger cycle, both ends included; first waveform point, and the points."""
+        r, n, method = self.settings.cycles, self._points, self.settings.interpolation
+        cutoff = waveform_cutoff(n, r, cycle.period, cycle.rate)
+        if on_grid(n, r) and cutoff == 1.0:
+            count = round(n * r)
+            grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
+            return grid, round(angle * n), grid[:-1]
+        count = grid_points(cycle.period, cycle.rate)
+        grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
+        first, end = first_point(angle, n), first_point(angle + r, n)
+        u = np.clip((np.arange(first, end) / n - angle) / r, 0.0, 1.0)
+        return grid, first, cycle.at(self._law, u, method=method, cutoff=cutoff)
+
+    # --- the average in progress ---
+
+    def _start(self) -> None:
+        settings = self.settings
+        self._counted = 0
+        self._amplitude_mean = self._new_mean(settings.trigger_cycles)
+        self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycles, 1.0))
+        self._amplitudes: deque[ComplexArray] = deque(maxlen=settings.trigger_cycles)
+        self._pulses: deque[float] = deque(maxlen=settings.trigger_cycles + 1)
+        self._wave: FloatArray = np.empty((0, 0))
+        self._next_point = 0
+        self._first_whole = 0
+
+    def _new_mean(self, cycles: float) -> RunningMean:
+        if self.settings.averaging == 'exponential':
+            return ExponentialMean(cycles)
+        return SlidingMean() if self.settings.averaging == 'sliding' else BlockMean()
+
+    def _expect_from(self, angle: float) -> None:
+        """Begin with the first fundamental cycle that is whole from this angle on."""
+        self._first_whole = math.ceil(angle - 1e-9)
+        self._next_point = self._first_whole * self._points
+
+    def _add_points(self, first: int, points: FloatArray) -> None:
+        """Put points into their fundamental cycle; a whole one goes into the mean."""
+        if len(self._wave) != self._points:
+            self._wave = np.full((self._points, points.shape[1]), np.nan)
+        points = points[max(self._next_point - first, 0):]
+        while len(points):
+            at = self._next_point % self._points
+            count = min(len(points), self._points - at)
+            self._wave[at:at + count] = points[:count]
+            points = points[count:]
+            self._next_point += count
+            if at + count == self._points:
+                self._wave_mean.update(self._wave)
+                if self.settings.averaging == 'sliding':  # keeps what it is given
+                    self._wave = np.empty_like(self._wave)
+
+    def _slide(self) -> None:
+        """Forget what has left a sliding window."""
+        if not isinstance(self._wave_mean, SlidingMean):
+            return
+        assert isinstance(self._amplitude_mean, SlidingMean)
+        self._amplitude_mean.forget(self._amplitude_mean.count - self.settings.trigger_cycles)
+        start = self.settings.cycles * (self._cycle - self.settings.trigger_cycles)
+        whole = math.ceil(start - 1e-9)
+        self._wave_mean.forget(whole - self._first_whole)
+        self._first_whole = max(whole, self._first_whole)
+
+    def _result(self) -> SynchronousAverage:
+        settings = self.settings
+        shape = self._wave.shape
+        count = self._wave_mean.count
+        waveform, error = np.full(shape, np.nan), np.full(shape, np.nan)
+        if count:
+            waveform, error = self._wave_mean.mean, self._wave_mean.standard_error
+        if settings.averaging == 'exponential':
+            count = min(count, int(settings.trigger_cycles * settings.cycles))
+        average = SynchronousAverage(
+            start_time=self._pulses[0], end_time=self._pulses[-1], sequence=self._sequence,
+            trigger_cycles=settings.trigger_cycles, fundamental_cycles=count,
+            waveform=waveform.T, standard_error=error.T, orders=np.array(settings.orders),
+            amplitudes=self._amplitude_mean.mean, noise=radial_noise(np.array(self._amplitudes)),
+            angle=settings.cycles * (self._cycle - settings.trigger_cycles),
+            pulses=np.array(self._pulses))
+        self._sequence += 1
+        return average

@@ -1,0 +1,259 @@
+"""
+The on-line average: samples and trigger pulses in, in any cut and order of arrival, averages out.
+
+A trigger cycle is handed to the shafts as soon as both its pulses, the pulses that the angle law reads
+and the samples around it are there. The result depends on the data alone: not on how they were cut
+into messages, nor on whether pulses arrive before or after their samples. A cycle that cannot be had
+is discarded and counted; the unfinished averages end with it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.laws import angle_law
+from sa_jitter_ros.angle.pulses import PulseValidator, TriggerPulses
+from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, SynchronousAverage
+from sa_jitter_ros.averaging.timeline import SampleBlock, Stretch, VibrationTimeline
+from sa_jitter_ros.errors import ParameterError, SignalError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Trigger:
+    """
+    A trigger pulse at `time` (s).
+
+    `starts_run` tells that no trigger cycle ends here, `epoch` how often time ran back before.
+    """
+
+    time: float
+    starts_run: bool
+    epoch: int
+
+
+@dataclass
+class StreamCounts:
+    """What the stream discarded so far, beside what samples and pulses were themselves."""
+
+    cycles: int = 0
+    cycles_dropped: int = 0
+    pulses_dropped: int = 0
+    averages_dropped: int = 0
+
+
+class StreamingAverager:
+    """
+    Synchronous averages of several shafts from one keyphasor.
+
+    `add_samples` and `add_pulses` return the averages that became due, as (shaft, average) pairs;
+    `messages` collects one clear line for everything that was wrong, to be taken with
+    `take_messages`. Samples or pulses that wait for their counterpart are kept for
+    `timeline.buffer_seconds`.
+    """
+
+    def __init__(self, shafts: dict[str, AverageSettings], *, validator: PulseValidator,
+                 timeline: VibrationTimeline) -> None:
+        if not shafts:
+            raise ParameterError('no shaft to average: name at least one')
+        self.timeline, self.validator = timeline, validator
+        self.counts = StreamCounts()
+        self.shafts = {name: ShaftAverager(settings) for name, settings in shafts.items()}
+        self._law = angle_law(next(iter(shafts.values())).law)
+        self._triggers: list[Trigger] = []  # of which the next cycle begins at _next
+        self._next = 0
+        self._run = 0  # where the run of the next cycle begins
+        self._pulse_epoch = 0
+        self._lead = np.inf  # s of samples before a cycle that its interpolation reads
+        self._speed = 0, 0.0  # cycles and seconds since the last take_speed
+        self._messages: list[str] = []
+
+    def take_messages(self) -> list[str]:
+        """Lines about what was wrong since the last call."""
+        lines = self._messages + self.timeline.messages
+        self._messages, self.timeline.messages = [], []
+        return lines
+
+    def add_samples(self, block: SampleBlock) -> list[tuple[str, SynchronousAverage]]:
+        """Take a block; raises `SignalError` for one that cannot be used (it is counted)."""
+        self.timeline.add(block)
+        averages = self._process()
+        self.timeline.bound()
+        return averages
+
+    def add_pulses(self, times: FloatArray) -> list[tuple[str, SynchronousAverage]]:
+        """Take pulse times (s), in order of arrival."""
+        triggers = self.validator.update(times)
+        self._queue(triggers)
+        averages = self._process()
+        self._bound_pulses()
+        return averages
+
+    def change(self, shafts: dict[str, AverageSettings]) -> None:
+        """Go on with other settings of the same shafts; unfinished averages are lost and counted."""
+        lost = [self.shafts[name].change(settings) for name, settings in shafts.items()]
+        self.counts.averages_dropped += sum(lost)
+        self._law = angle_law(next(iter(shafts.values())).law)
+
+    def take_speed(self) -> float:
+        """Mean number of trigger cycles per second since the last call; NaN if there was none."""
+        cycles, seconds = self._speed
+        self._speed = 0, 0.0
+        return cycles / seconds if cycles else float('nan')
+
+    # --- pulses ---
+
+    def _queue(self, triggers: TriggerPulses) -> None:
+        for time, starts, restarted in zip(triggers.times.tolist(), triggers.starts_run.tolist(),
+                                           triggers.restarted.tolist()):
+            newest = self.timeline.epoch
+            if restarted:
+                # held until its vibration comes, unless that restarted before
+                self._pulse_epoch = max(self._pulse_epoch + 1, newest)
+            elif self._pulse_epoch < newest and time > self.timeline.previous_end:
+                # the vibration restarted and the pulses had not run ahead of it
+                self._pulse_epoch, starts = newest, True
+            self._triggers.append(Trigger(time, starts or not self._triggers, self._pulse_epoch))
+
+    def _bound_pulses(self) -> None:
+        """Drop and count the oldest pulses that wait longer than the buffer for their vibration."""
+        limit = self.timeline.buffer_seconds
+        waiting = self._triggers[self._next:]
+        if not waiting or waiting[-1].time - waiting[0].time <= limit:
+            return
+        if waiting[0].epoch > self.timeline.epoch:
+            # the vibration does not run back: these pulses belong to what there is
+            self._pulse_epoch = self.timeline.epoch
+            self._triggers[self._next:] = [
+                replace(item, epoch=self._pulse_epoch) for item in waiting]
+        keep = next(i for i, item in enumerate(waiting) if waiting[-1].time - item.time <= limit)
+        if keep:
+            self.counts.pulses_dropped += keep
+            self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
+                          f'{limit:g} s (raise it for a slower shaft)')
+        self._forget_used()
+
+    # --- cycles ---
+
+    def _process(self) -> list[tuple[str, SynchronousAverage]]:
+        if self._pulse_epoch > self.timeline.epoch:
+            self.timeline.confirm_restart()
+        averages: list[tuple[str, SynchronousAverage]] = []
+        while len(self._triggers) - self._next >= 2:
+            start, end = self._triggers[self._next:self._next + 2]
+            if end.starts_run or end.epoch != start.epoch:
+                self._break_run()
+                continue
+            after, closed = self._pulses_after()
+            first = self._next == self._run
+            if not closed and after < (self._law.after_first if first else self._law.after):
+                break
+            stretch = self._locate(start, end)
+            if stretch is None:
+                break
+            if isinstance(stretch, str):
+                self._discard(1, stretch)
+                continue
+            try:
+                averages += self._hand_over(stretch)
+            except SignalError as error:
+                self._discard(1, str(error))
+                continue
+            self._next += 1
+        self._forget_used()
+        return averages
+
+    def _pulses_after(self) -> tuple[int, bool]:
+        """Pulses of this run behind the next cycle, up to as many as a law reads; run closed."""
+        count = 0
+        for item in self._triggers[self._next + 2:self._next + 2 + self._law.after_first]:
+            if item.starts_run:
+                return count, True
+            count += 1
+        return count, False
+
+    def _locate(self, start: Trigger, end: Trigger) -> Stretch | str | None:
+        """Stretch that covers a cycle; None to wait for it, or why it will not come."""
+        timeline = self.timeline
+        if start.epoch > timeline.epoch:
+            return None
+        ahead = True
+        for stretch in timeline.stretches:
+            if stretch.epoch != start.epoch or not len(stretch.samples):
+                continue
+            low, high = stretch.position(np.array([start.time, end.time]))
+            last = len(stretch.samples) - 1
+            ahead = low > last
+            if low < -1e-6 or ahead:
+                continue
+            margin = max(item.margin(end.time - start.time, stretch.clock.rate)
+                         for item in self.shafts.values())
+            if last >= high + margin or (stretch.closed and last >= high - 1e-6):
+                return stretch
+            if not stretch.closed:
+                return None
+            break
+        if ahead and start.epoch == timeline.epoch:
+            return None
+        return (f'no gapless vibration for the trigger cycle from {start.time:.6g} s to '
+                f'{end.time:.6g} s')
+
+    def _hand_over(self, stretch: Stretch) -> list[tuple[str, SynchronousAverage]]:
+        """Give the next cycle to every shaft."""
+        begin = max(self._run, self._next - self._law.before)
+        stop = self._next + 2
+        for item in self._triggers[stop:stop + self._law.after_first]:
+            if item.starts_run:
+                break
+            stop += 1
+        pulses = np.array([item.time for item in self._triggers[begin:stop]])
+        first = self._next - begin
+        low, high = stretch.position(pulses[first:first + 2])
+        averages = []
+        self._lead = 0.0
+        for name, shaft in self.shafts.items():
+            margin = shaft.margin(float(pulses[first + 1] - pulses[first]), stretch.clock.rate)
+            self._lead = max(self._lead, 1.5 * margin / stretch.clock.rate)
+            offset = max(int(np.floor(low)) - margin, 0)
+            cycle = CycleSamples(
+                stretch.samples[offset:int(np.ceil(high)) + margin + 1],
+                stretch.clock.time_of(stretch.index + offset), stretch.clock.rate, pulses, first)
+            average = shaft.update(cycle)
+            if average is not None:
+                averages.append((name, average))
+        self.counts.cycles += 1
+        self._speed = (self._speed[0] + 1,
+                       self._speed[1] + float(pulses[first + 1] - pulses[first]))
+        return averages
+
+    def _discard(self, count: int, why: str) -> None:
+        """Discard the next `count` cycles; the angle starts anew behind them."""
+        self.counts.cycles_dropped += count
+        self._messages.append(f'{why}: {count} trigger cycle{"s" if count > 1 else ""} discarded')
+        self._next += count
+        if self._next < len(self._triggers):
+            self._triggers[self._next] = replace(self._triggers[self._next], starts_run=True)
+        self._begin_run()
+
+    def _break_run(self) -> None:
+        """No trigger cycle ends at the next pulse: its run begins there."""
+        self._next += 1
+        self._begin_run()
+
+    def _begin_run(self) -> None:
+        self._run = self._next
+        lost = [shaft.reset() for shaft in self.shafts.values()]
+        self.counts.averages_dropped += sum(lost)
+
+    def _forget_used(self) -> None:
+        """Forget samples before the next cycle and pulses that no law reads any more."""
+        if not self._triggers:
+            return
+        head = self._triggers[min(self._next, len(self._triggers) - 1)]
+        self.timeline.release(head.epoch, head.time - self._lead)
+        keep = max(self._run, self._next - self._law.before)
+        del self._triggers[:keep]
+        self._next -= keep
+        self._run -= keep

@@ -1,0 +1,146 @@
+"""What every node shares: parameters, diagnostics at 1 Hz, throttled warnings, quality of service, main."""
+
+from collections.abc import Callable, Sequence
+import sys
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.exceptions import InvalidParameterValueException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import (DurabilityPolicy, HistoryPolicy, qos_policy_name_from_kind, QoSProfile,
+                       ReliabilityPolicy)
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from sa_jitter_ros.errors import MessageError, SaJitterError
+from sa_jitter_ros.nodes.parameters import Parameter, ParameterSet
+
+DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
+                   'clock_deviation', 'messages_rejected')
+WARNING_PERIOD = 5.0  # s between log lines of the same kind
+
+
+def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, durability=durability,
+                      reliability=ReliabilityPolicy.RELIABLE)
+
+
+INPUT_QOS = _reliable(200, DurabilityPolicy.VOLATILE)
+RESULT_QOS = _reliable(10, DurabilityPolicy.VOLATILE)
+LATCHED_QOS = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class MonitoringNode(Node):
+    """
+    A node of this package: described parameters, diagnostics, and no message that can kill it.
+
+    `counts` are cumulative; a subclass updates them (in `update_counts`, called before they are
+    published) and says in `summary` what it is doing. A count that grew makes the status WARN, an
+    entry of `faults` makes it ERROR.
+    """
+
+    def __init__(self, name: str, parameters: Sequence[Parameter], **node_kwargs: Any) -> None:
+        super().__init__(name, **node_kwargs)
+        self.parameters = ParameterSet(self, parameters)
+        self.counts: dict[str, int] = dict.fromkeys(DIAGNOSTIC_KEYS, 0)
+        self.faults: dict[str, str] = {}
+        self._reported = dict(self.counts)
+        self._last_warning = ''
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self.create_steady_timer(1.0, self.publish_diagnostics)
+
+    # --- building blocks ---
+
+    def create_steady_timer(self, period: float, callback: Callable[[], None]) -> Timer:
+        """Timer on the steady clock: `use_sim_time` does not stop it."""
+        return self.create_timer(period, callback, clock=self._steady)
+
+    def create_input(self, kind: type, topic: str, callback: Callable[[Any], None],
+                     qos: QoSProfile = INPUT_QOS) -> Subscription:
+        """Subscribe; a bad message is counted and reported, never raised."""
+        def guarded(message: Any) -> None:
+            try:
+                callback(message)
+            except MessageError as error:
+                self.counts['messages_rejected'] += 1
+                self.warn(f'{topic}: {error}')
+            except SaJitterError as error:
+                self.warn(f'{topic}: {error}')
+
+        def incompatible(info: Any) -> None:
+            policy = qos_policy_name_from_kind(info.last_policy_kind).lower()
+            name = self.resolve_topic_name(topic)
+            self.faults[topic] = (
+                f'a publisher of {name} offers an incompatible {policy}: match it with the '
+                f'parameter qos_overrides.{name}.subscription.{policy}')
+            self.get_logger().error(self.faults[topic], throttle_duration_sec=WARNING_PERIOD)
+
+        return self.create_subscription(
+            kind, topic, guarded, qos,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
+        """Publisher of a result."""
+        return self.create_publisher(
+            kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+
+    # --- telling the user ---
+
+    def warn(self, text: str) -> None:
+        """Log a warning, throttled, and show it in the next diagnostics."""
+        self._last_warning = text
+        self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
+
+    def update_counts(self) -> None:
+        """Bring `counts` up to date before they are published."""
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """One line on what the node is doing, and values to show beside the counts."""
+        return 'running', {}
+
+    def publish_diagnostics(self) -> None:
+        """Publish the node's status."""
+        self.update_counts()
+        text, values = self.summary()
+        status = DiagnosticStatus(level=DiagnosticStatus.OK, message=text, hardware_id='',
+                                  name=self.get_fully_qualified_name().lstrip('/'))
+        grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
+        if self.faults:
+            status.level, status.message = DiagnosticStatus.ERROR, '; '.join(self.faults.values())
+        elif grown or self._last_warning:
+            status.level = DiagnosticStatus.WARN
+            status.message = self._last_warning or f'{", ".join(grown)} grew'
+        self._reported, self._last_warning = dict(self.counts), ''
+        shown = {**{key: str(count) for key, count in self.counts.items()}, **values}
+        status.values = [KeyValue(key=key, value=value) for key, value in shown.items()]
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+
+def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+    """Spin one node until SIGINT or SIGTERM; 0, or 2 with one line on unusable parameters."""
+    rclpy.init(args=args)
+    node = None
+    try:
+        node = node_class()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (SaJitterError, InvalidParameterValueException) as error:
+        print(f'error: {error}', file=sys.stderr)
+        return 2
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
