@@ -1,0 +1,152 @@
+"""
+Random errors of the angle law, described so that any of them combine.
+
+The linear law reads cycle ``k`` of a component at a wrong angle ``e_k(u)`` (fundamental cycles;
+``u`` in [0, 1) is the position in the trigger cycle). Whatever an average does to order ``g``
+follows from the joint characteristic functions of that error,
+
+    E exp(j 2 pi sum_i c_i e_{k_i}(u_i)),    c_i = +g, or -g for a conjugate,
+
+and those of independent errors MULTIPLY. So an effect is one class with one method, and the
+moments of any combination are integrals of a product (`moments`). A random gain ``a_k(u)`` fits
+too: it contributes E prod_i a_{k_i}(u_i).
+"""
+
+from dataclasses import dataclass
+from typing import Any, Callable, Protocol, Sequence, Tuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.statistics.distributions import PulseErrorDistribution
+
+Array = NDArray[Any]
+
+
+class AngleErrorProcess(Protocol):
+    """A zero-mean random angle error that is stationary from trigger cycle to trigger cycle."""
+
+    @property
+    def correlation_length(self) -> int:
+        """Largest distance in cycles at which two cycles still depend on each other."""
+
+    def characteristic(
+        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+        cycles: Sequence[int],
+    ) -> Array:
+        """
+        Return E exp(j 2 pi sum_i c_i e_{k_i}(u_i)).
+
+        The three sequences have one entry per point: `coefficients` c_i (orders, arrays),
+        `positions` u_i (arrays) and `cycles` k_i (integers); all arrays broadcast together.
+        """
+
+
+@dataclass(frozen=True)
+class IndependentPulseJitter:
+    """
+    Independent pulse errors seen through the linear law: e_k(u) = (1-u) eps_k + u eps_{k+1}.
+
+    `frequency` is the fundamental frequency in Hz, which turns s into fundamental cycles (1 where
+    the law is given in cycles). Neighbouring cycles share a pulse. Eq. 16 of Camerini et al. 2019.
+    """
+
+    distribution: PulseErrorDistribution
+    frequency: float = 1.0
+
+    @property
+    def correlation_length(self) -> int:
+        """Neighbouring cycles share a pulse; others nothing."""
+        return 1
+
+    def characteristic(
+        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+        cycles: Sequence[int],
+    ) -> Array:
+        """Return the product, over the pulses touched, of the law's characteristic function."""
+        product: Array = np.ones(())
+        for pulse in sorted({k + end for k in cycles for end in (0, 1)}):
+            weight: Array = np.zeros(())
+            for c, u, k in zip(coefficients, positions, cycles):
+                if pulse == k:
+                    weight = weight + self.frequency * np.asarray(c) * (1.0 - np.asarray(u))
+                elif pulse == k + 1:
+                    weight = weight + self.frequency * np.asarray(c) * np.asarray(u)
+            product = product * self.distribution.characteristic_function(weight)
+        return product
+
+
+@dataclass(frozen=True)
+class GaussianAngleError:
+    """
+    A Gaussian angle error with ``covariance(u, v, lag)`` = Cov[e_k(u), e_{k+lag}(v)], lag >= 0.
+
+    The covariance is in fundamental cycles squared, vectorised over u and v, and 0 beyond
+    `correlation_length` cycles.
+    """
+
+    covariance: Callable[[Array, Array, int], Array]
+    correlation_length: int
+
+    def characteristic(
+        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+        cycles: Sequence[int],
+    ) -> Array:
+        """Return exp(-2 pi^2 variance of the weighted sum)."""
+        points = [(np.asarray(c), np.asarray(u), k)
+                  for c, u, k in zip(coefficients, positions, cycles)]
+        variance: Array = np.zeros(())
+        for i, (c, u, k) in enumerate(points):
+            variance = variance + c**2 * self.covariance(u, u, 0)
+            for d, v, m in points[i + 1:]:
+                if abs(m - k) <= self.correlation_length:
+                    pair = (self.covariance(u, v, m - k) if m >= k
+                            else self.covariance(v, u, k - m))
+                    variance = variance + 2.0 * c * d * pair
+        return np.asarray(np.exp(-2.0 * np.pi**2 * variance))
+
+
+def gaussian_pulse_jitter(autocovariance: Sequence[float]) -> GaussianAngleError:
+    """
+    Return correlated normal pulse errors seen through the linear law.
+
+    `autocovariance[i]` = Cov[eps_k, eps_{k+i}] in fundamental cycles squared, 0 beyond the list.
+    Raises ModelError when no stationary sequence has it.
+    """
+    table = np.asarray(autocovariance, float)
+    if table.ndim != 1 or table.size == 0 or not np.all(np.isfinite(table)):
+        raise ModelError('autocovariance must be a list of finite numbers, lag 0 first; '
+                         f'it has the shape {table.shape}')
+    grid = np.arange(0, 4 * table.size + 1) / (8.0 * table.size)
+    spectrum = table[0] + 2.0 * np.cos(
+        2.0 * np.pi * np.outer(grid, np.arange(1, table.size))) @ table[1:]
+    if spectrum.min() < -1e-9 * abs(table[0]):
+        raise ModelError(f'autocovariance has the spectrum {spectrum.min():.3g} at some frequency: '
+                         'no random sequence has a negative one; lower the correlations')
+
+    def at(lag: int) -> float:
+        return float(table[abs(lag)]) if abs(lag) < table.size else 0.0
+
+    def covariance(u: Array, v: Array, lag: int) -> Array:
+        return np.asarray(((1.0 - u) * (1.0 - v) + u * v) * at(lag)
+                          + (1.0 - u) * v * at(lag + 1) + u * (1.0 - v) * at(lag - 1))
+
+    return GaussianAngleError(covariance, table.size)
+
+
+def joint_characteristic(
+    processes: Sequence[AngleErrorProcess], coefficients: Sequence[ArrayLike],
+    positions: Sequence[ArrayLike], cycles: Sequence[int],
+) -> Array:
+    """Return the joint characteristic function of the sum of independent processes."""
+    product: Array = np.ones(())
+    for process in processes:
+        product = product * process.characteristic(coefficients, positions, cycles)
+    return product
+
+
+def unit_nodes(count: int) -> Tuple[Array, Array]:
+    """Return the nodes and weights of the Gauss-Legendre rule on [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(count)
+    return 0.5 * (x + 1.0), 0.5 * w

@@ -1,0 +1,305 @@
+"""
+Exact moments of the amplitude of one order in a synchronous average.
+
+The average of a unit component of order ``g`` over ``N_t`` whole trigger cycles is
+
+    X(g) = (1/N_t) sum_k G_k,    G_k = int_0^1 exp(j 2 pi g e_k(u)) du
+
+for any ratio of the shafts. Its moments are integrals of joint characteristic functions of the
+angle error, done here by a Gauss-Legendre rule for all orders at once. Neighbouring cycles share a
+pulse, so lag 1 belongs in every variance.
+"""
+
+from collections import Counter
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Any, Callable, Optional, Sequence, Tuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import erf, sici
+
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.statistics.angle_error import (
+    AngleErrorProcess,
+    joint_characteristic,
+    unit_nodes,
+)
+
+Array = NDArray[Any]
+#: Deterministic angle errors d_k(u) in fundamental cycles: u of shape (m,) to (trigger cycles, m).
+AngleOffset = Callable[[Array], Array]
+
+NODES = 64
+_CUMULANT_NODES = 6
+
+
+@dataclass(frozen=True)
+class AverageMoments:
+    """
+    Mean and second central moments of a complex amplitude, one entry per order.
+
+    `variance` = E|X - m|^2 and `pseudo_variance` = E(X - m)^2, which together hold the covariance
+    of real and imaginary part.
+    """
+
+    mean: Array
+    variance: Array
+    pseudo_variance: Array
+
+    @property
+    def mean_square(self) -> Array:
+        """Return E|X|^2."""
+        return np.asarray(np.abs(self.mean) ** 2 + self.variance)
+
+    @property
+    def real_variance(self) -> Array:
+        """Return Var Re X."""
+        return np.asarray(0.5 * (self.variance + np.real(self.pseudo_variance)))
+
+    @property
+    def imag_variance(self) -> Array:
+        """Return Var Im X."""
+        return np.asarray(0.5 * (self.variance - np.real(self.pseudo_variance)))
+
+    @property
+    def covariance(self) -> Array:
+        """Return Cov(Re X, Im X)."""
+        return np.asarray(0.5 * np.imag(self.pseudo_variance))
+
+    def scaled(self, gain: ArrayLike) -> 'AverageMoments':
+        """Return the moments of gain * X."""
+        g = np.asarray(gain)
+        return AverageMoments(self.mean * g, self.variance * np.abs(g) ** 2,
+                              self.pseudo_variance * g**2)
+
+    def with_noise(self, variance: ArrayLike) -> 'AverageMoments':
+        """Return the moments of X + n with circular noise of variance E|n|^2."""
+        return AverageMoments(self.mean, self.variance + np.asarray(variance),
+                              self.pseudo_variance)
+
+
+@dataclass(frozen=True)
+class CycleMoments:
+    """
+    Moments of the amplitude G_k of single trigger cycles.
+
+    `mean` has shape (orders,); `variance[l]` = E G_k conj(G_{k+l}) - |m|^2 and
+    `pseudo_variance[l]` = E G_k G_{k+l} - m^2 have shape (1 + correlation length, orders). Both
+    are exact; lags beyond are 0.
+    """
+
+    mean: Array
+    variance: Array
+    pseudo_variance: Array
+
+    def lag(self, lag: int) -> AverageMoments:
+        """Return the moments at one lag, whose variances are covariances between two cycles."""
+        return AverageMoments(self.mean, np.real(self.variance[lag]), self.pseudo_variance[lag])
+
+    def averaged(self, trigger_cycles: int) -> AverageMoments:
+        """Return the moments of the mean of `trigger_cycles` consecutive cycles."""
+        require_cycles(trigger_cycles)
+        lags = np.arange(min(len(self.variance), trigger_cycles))
+        weight = (trigger_cycles - lags) * np.where(lags == 0, 1.0, 2.0) / trigger_cycles**2
+        return AverageMoments(self.mean, weight @ np.real(self.variance[lags]),
+                              weight @ self.pseudo_variance[lags])
+
+
+def cycle_moments(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
+) -> CycleMoments:
+    """
+    Return the exact moments of single trigger cycles for orders of shape (n,).
+
+    With 64 nodes they are good to 1e-12 as long as the angle errors stay within a cycle of the
+    order. Section 2 of the theory; Eqs. 30-37 of Camerini et al. 2019 as special cases.
+    """
+    g = require_orders(orders)
+    u, w = unit_nodes(nodes)
+    plane = g[:, None, None]
+    first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
+    mean = first @ w
+    variance, pseudo = [], []
+    for lag in range(correlation_length(processes) + 1):
+        points = ([u[:, None], u], [0, lag])
+        variance.append(joint_characteristic(processes, [plane, -plane], *points) @ w @ w
+                        - np.abs(mean) ** 2)
+        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - mean**2)
+    return CycleMoments(mean, np.array(variance), np.array(pseudo))
+
+
+def offset_moments(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    offset: AngleOffset, *, nodes: int = NODES,
+) -> AverageMoments:
+    """
+    Return the exact moments of the average with deterministic angle errors on top of random ones.
+
+    `offset(u)` returns d_k(u) in fundamental cycles, shape (trigger_cycles, u.size): clock skew,
+    target geometry, a known speed profile.
+    """
+    g = require_orders(orders)
+    require_cycles(trigger_cycles)
+    u, w = unit_nodes(nodes)
+    phasor = np.exp(2j * np.pi * g[:, None, None] * offset(u)) * w
+    plane = g[:, None, None]
+    first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
+    mean = np.sum(phasor.mean(axis=1) * first, axis=1)
+    variance = np.zeros(g.size)
+    pseudo = np.zeros(g.size, complex)
+    for lag in range(min(correlation_length(processes) + 1, trigger_cycles)):
+        early = phasor[:, :trigger_cycles - lag].transpose(0, 2, 1)
+        late = phasor[:, lag:]
+        scale = (1.0 if lag == 0 else 2.0) / trigger_cycles**2
+        points = ([u[:, None], u], [0, lag])
+        joint = (joint_characteristic(processes, [plane, -plane], *points)
+                 - first[:, :, None] * first[:, None, :].conj())
+        variance += scale * np.real(np.sum((early @ late.conj()) * joint, axis=(1, 2)))
+        joint = (joint_characteristic(processes, [plane, plane], *points)
+                 - first[:, :, None] * first[:, None, :])
+        pseudo += scale * np.sum((early @ late) * joint, axis=(1, 2))
+    return AverageMoments(mean, variance, pseudo)
+
+
+def multi_harmonic_moments(
+    orders: ArrayLike, source_orders: ArrayLike, amplitudes: ArrayLike,
+    processes: Sequence[AngleErrorProcess], trigger_cycles: int, cycle_length: float, *,
+    nodes: int = NODES,
+) -> AverageMoments:
+    """
+    Return the moments of the analysed orders of a signal of several components, leakage included.
+
+    The signal is sum_s a_s exp(j 2 pi g_s theta) with `source_orders` g_s and complex `amplitudes`
+    a_s; a trigger cycle is `cycle_length` (r) fundamental cycles long. An integer r lets a source
+    leak coherently into its neighbours, a bias that no number of cycles removes (Fig. 7).
+    """
+    g = require_orders(orders)
+    sources = require_orders(source_orders)
+    a = np.broadcast_to(np.asarray(amplitudes, complex), sources.shape)
+    require_cycles(trigger_cycles)
+    if not cycle_length > 0.0:
+        raise ModelError(f'cycle_length is {cycle_length}: a trigger cycle lasts more than 0 '
+                         'fundamental cycles')
+    u, w = unit_nodes(nodes)
+    shift = 2.0 * np.pi * cycle_length * (sources[:, None] - g)  # per cycle, (source, order)
+    weight = a[:, None, None] * np.exp(1j * shift[:, :, None] * u) * w
+    steps = np.exp(1j * shift[:, :, None] * np.arange(trigger_cycles))
+    first = [joint_characteristic(processes, [s], [u], [0]) * np.ones(u.size) for s in sources]
+    means = np.array([steps[s].mean(axis=-1) * (weight[s] @ first[s])
+                      for s in range(sources.size)])
+    variance = np.zeros(g.size)
+    pseudo = np.zeros(g.size, complex)
+    for lag in range(min(correlation_length(processes) + 1, trigger_cycles)):
+        scale = (1.0 if lag == 0 else 2.0) / trigger_cycles**2
+        points = ([u[:, None], u], [0, lag])
+        for s, early in enumerate(sources):
+            for t, late in enumerate(sources):
+                joint = (joint_characteristic(processes, [early, -late], *points)
+                         - np.multiply.outer(first[s], first[t].conj()))
+                turns = np.sum(steps[s][:, :trigger_cycles - lag]
+                               * steps[t][:, lag:].conj(), axis=-1)
+                variance += scale * np.real(
+                    turns * np.sum((weight[s] @ joint) * weight[t].conj(), axis=-1))
+                joint = (joint_characteristic(processes, [early, late], *points)
+                         - np.multiply.outer(first[s], first[t]))
+                turns = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
+                pseudo += scale * turns * np.sum((weight[s] @ joint) * weight[t], axis=-1)
+    return AverageMoments(means.sum(axis=0), variance, pseudo)
+
+
+def third_cumulants(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments, *, nodes: int = _CUMULANT_NODES,
+) -> Tuple[Array, Array]:
+    """
+    Return the joint cumulants k(X, X, X) and k(X, X, conj X) of the average, shape (orders,) each.
+
+    They are what the normal law of the central limit theorem lacks at order 1/sqrt(N_t). `cycles`
+    are the `cycle_moments` of the same processes.
+    """
+    g = require_orders(orders)
+    require_cycles(trigger_cycles)
+    u, w = unit_nodes(nodes)
+    length = correlation_length(processes)
+    axes = (u[:, None, None], u[:, None], u)
+    box = g[:, None, None, None]
+    m = cycles.mean
+    plain = np.zeros(g.size, complex)
+    mixed = np.zeros(g.size, complex)
+
+    def pair(i: int, j: int) -> Array:
+        return (cycles.pseudo_variance[abs(i - j)] if abs(i - j) <= length else 0.0) + m**2
+
+    def pair_conj(i: int, j: int) -> Array:
+        if abs(i - j) > length:
+            return np.abs(m) ** 2
+        moment: Array = cycles.variance[abs(i - j)] + np.abs(m) ** 2
+        return moment if j >= i else np.conj(moment)
+
+    for p in range(length + 1):
+        for q in range(length + 1):
+            triple = (0, p, p + q)
+            places = (trigger_cycles - p - q) / trigger_cycles**3
+            if places <= 0.0:
+                continue
+            arrangements = set(permutations(triple))
+            raw = joint_characteristic(processes, [box] * 3, axes, triple) @ w @ w @ w
+            lower = pair(0, p) + pair(0, p + q) + pair(p, p + q)
+            plain += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
+            for (a, b, c), count in Counter(
+                    (*sorted(order[:2]), order[2]) for order in arrangements).items():
+                raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c)) @ w @ w @ w
+                lower = (m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b))
+                mixed += places * count * (raw - lower + 2.0 * m * np.abs(m) ** 2)
+    return plain, mixed
+
+
+def uniform_mean(spread: ArrayLike) -> Array:
+    """
+    Return the mean amplitude for uniform jitter, closed form (Eq. 38).
+
+    `spread` is the width in cycles of the order, g D > 0.
+    """
+    x = np.pi * np.asarray(spread, float)
+    si, ci = sici(2.0 * x)
+    return np.asarray((np.cos(x) * (ci - np.euler_gamma - np.log(2.0 * x)) + np.sin(x) * si)
+                      / x**2)
+
+
+def normal_mean(spread: ArrayLike) -> Array:
+    """Return the mean amplitude for normal jitter; `spread` = g sigma > 0 in cycles."""
+    s = 2.0 * np.pi * np.asarray(spread, float)
+    return np.asarray(np.exp(-0.25 * s**2) * np.sqrt(np.pi) * erf(0.5 * s) / s)
+
+
+def noise_line_variance(noise_std: float, sample_rate: float, duration: float) -> float:
+    """
+    Return E|n|^2 of white noise in the PEAK amplitude of one order of an average of `duration` s.
+
+    `noise_std` is per sample at `sample_rate` Hz: 4 noise_std^2 / (sample_rate duration), half of
+    it on each of real and imaginary part (what Eqs. 49 and 50 become in sampled data).
+    """
+    return 4.0 * noise_std**2 / (sample_rate * duration)
+
+
+def correlation_length(processes: Sequence[AngleErrorProcess]) -> int:
+    """Return the largest correlation length of the processes in cycles."""
+    return max((process.correlation_length for process in processes), default=0)
+
+
+def require_orders(orders: ArrayLike) -> Array:
+    """Return the orders as floats of shape (n,); raise ModelError unless finite and positive."""
+    g = np.atleast_1d(np.asarray(orders, float))
+    bad = ~(np.isfinite(g) & (g > 0.0))
+    if g.ndim != 1 or g.size == 0 or np.any(bad):
+        what = f'orders hold {g[bad][0]}' if np.any(bad) else f'orders have the shape {g.shape}'
+        raise ModelError(f'{what}: give a list of finite orders above 0')
+    return g
+
+
+def require_cycles(trigger_cycles: int) -> None:
+    """Raise ModelError unless an average holds at least one trigger cycle."""
+    if not (trigger_cycles >= 1 and int(trigger_cycles) == trigger_cycles):
+        raise ModelError(f'trigger_cycles is {trigger_cycles}: an average holds a whole number of '
+                         'at least 1')

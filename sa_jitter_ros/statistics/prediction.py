@@ -1,0 +1,245 @@
+"""
+The prediction: what a declared keyphasor does to the amplitudes of a synchronous average.
+
+`predict` turns a `DeclaredModel` into mean, variance and quantiles of the amplitude of a unit
+component for every order. Effects that the declared model lacks enter through the keyword
+arguments of `predict` and know nothing of this module.
+"""
+
+from dataclasses import dataclass, field
+import math
+from typing import Any, Optional, Protocol, Sequence, Tuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.statistics.amplitude_law import curved_law, normal_law
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.statistics.distributions import (
+    Empirical,
+    Normal,
+    PulseErrorDistribution,
+    Triangular,
+    Uniform,
+)
+from sa_jitter_ros.statistics.moments import (
+    AngleOffset,
+    AverageMoments,
+    correlation_length,
+    cycle_moments,
+    noise_line_variance,
+    offset_moments,
+    require_cycles,
+    require_orders,
+    third_cumulants,
+)
+from sa_jitter_ros.statistics.sampled_law import sampled_law
+
+Array = NDArray[Any]
+
+QUANTILES = (0.05, 0.50, 0.95)
+DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
+
+_FEW_CYCLES = 9  # up to here the law is sampled: the curved law is 0.015 off in its CDF at 10
+_CURVED_REACH = 3  # correlation in cycles up to which third cumulants are worth their time
+
+
+class AmplitudeDistribution(Protocol):
+    """The law of |X|, one entry per order."""
+
+    @property
+    def mean(self) -> Array:
+        """E|X|."""
+
+    @property
+    def variance(self) -> Array:
+        """Var|X|."""
+
+    def cdf(self, amplitude: ArrayLike) -> Array:
+        """Return P(|X| <= amplitude), shape (orders, k)."""
+
+    def ppf(self, probability: ArrayLike) -> Array:
+        """Return quantiles, shape (orders, k)."""
+
+
+@dataclass(frozen=True)
+class DeclaredModel:
+    """
+    What is declared about keyphasor, machine and average; the parameters of `jitter_predictor`.
+
+    Rates and speeds are in Hz, times in s, orders in multiples of the shaft of interest.
+    `pulses_per_trigger` 0 means all pulses of a revolution, `jitter_std` 0 the standard deviation
+    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown. Raises ModelError for values that make no
+    sense, alone or together.
+    """
+
+    keyphasor_rate: float
+    trigger_speed: float
+    trigger_cycles: int
+    orders: Tuple[float, ...]
+    ratio: float = 1.0
+    pulses_per_revolution: int = 1
+    pulses_per_trigger: int = 0
+    jitter_distribution: str = 'uniform'
+    jitter_std: float = 0.0
+    jitter_table: Tuple[float, ...] = ()
+    noise_std: float = 0.0
+    sample_rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check every value and every combination."""
+        for name in ('keyphasor_rate', 'trigger_speed', 'ratio'):
+            _require(name, getattr(self, name), getattr(self, name) > 0.0, 'above 0')
+        for name in ('jitter_std', 'noise_std', 'sample_rate'):
+            _require(name, getattr(self, name), getattr(self, name) >= 0.0, '0 (unset) or above')
+        _require('pulses_per_revolution', self.pulses_per_revolution,
+                 self.pulses_per_revolution >= 1, 'at least 1')
+        _require('pulses_per_trigger', self.pulses_per_trigger,
+                 self.pulses_per_trigger >= 0, '0 (all of a revolution) or above')
+        require_cycles(self.trigger_cycles)
+        object.__setattr__(self, 'orders', tuple(float(g) for g in require_orders(self.orders)))
+        if self.jitter_distribution not in DISTRIBUTIONS:
+            raise ModelError(f'jitter_distribution is {self.jitter_distribution!r}: choose one of '
+                             f'{", ".join(DISTRIBUTIONS)}')
+        if self.jitter_std > 0.0 and self.jitter_distribution not in ('normal', 'triangular'):
+            raise ModelError(
+                f'jitter_std is {self.jitter_std} s but jitter_distribution is '
+                f'{self.jitter_distribution!r}, which has its own width: leave it 0, or choose '
+                'normal or triangular')
+        if len(self.jitter_table) and self.jitter_distribution != 'table':
+            raise ModelError(
+                f'jitter_table holds {len(self.jitter_table)} errors but jitter_distribution is '
+                f'{self.jitter_distribution!r}: empty it, or choose table')
+        if self.noise_std > 0.0 and self.sample_rate == 0.0:
+            raise ModelError(f'noise_std is {self.noise_std} without sample_rate: how much noise '
+                             'one line of the average holds depends on it; set sample_rate (Hz)')
+        highest = max(self.orders)
+        if 0.0 < self.sample_rate < 2.0 * highest * self.fundamental_frequency:
+            limit = 0.5 * self.sample_rate / self.fundamental_frequency
+            raise ModelError(
+                f'order {highest:g} is above the Nyquist order {limit:g} of vibration sampled at '
+                f'{self.sample_rate:g} Hz: drop it, or raise sample_rate')
+        width = self.distribution.width
+        if not width < self.trigger_period:
+            raise ModelError(
+                f'pulse errors spread over {width:.3g} s but a trigger cycle lasts '
+                f'{self.trigger_period:.3g} s, so pulses could swap: raise keyphasor_rate or '
+                'pulses_per_trigger, or lower jitter_std or trigger_speed')
+
+    @property
+    def distribution(self) -> PulseErrorDistribution:
+        """Return the law of one pulse error in s."""
+        if self.jitter_distribution == 'uniform':
+            return Uniform(1.0 / self.keyphasor_rate)
+        if self.jitter_distribution == 'table':
+            return Empirical(np.asarray(self.jitter_table))
+        std = self.jitter_std or 1.0 / (math.sqrt(12.0) * self.keyphasor_rate)
+        return Normal(std) if self.jitter_distribution == 'normal' else Triangular(std)
+
+    @property
+    def fundamental_frequency(self) -> float:
+        """Return the speed of the shaft of interest in Hz."""
+        return self.ratio * self.trigger_speed
+
+    @property
+    def trigger_revolutions(self) -> float:
+        """Return the length of a trigger cycle in revolutions of the tach shaft."""
+        pulses = self.pulses_per_trigger or self.pulses_per_revolution
+        return pulses / self.pulses_per_revolution
+
+    @property
+    def trigger_period(self) -> float:
+        """Return the length of a trigger cycle in s."""
+        return self.trigger_revolutions / self.trigger_speed
+
+    @property
+    def cycle_length(self) -> float:
+        """Return r, the length of a trigger cycle in fundamental cycles."""
+        return self.ratio * self.trigger_revolutions
+
+    @property
+    def duration(self) -> float:
+        """Return the length of an average in s."""
+        return self.trigger_cycles * self.trigger_period
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """
+    The predicted law of the amplitude of a unit component, one entry per order.
+
+    `mean_attenuation` = E|X| and `variance` = Var|X|, so mean^2 + variance = E|X|^2, which is
+    exact. `moments` hold the complex amplitude itself, `law` its distribution function.
+    """
+
+    model: DeclaredModel
+    order: Array
+    mean_attenuation: Array
+    variance: Array
+    standard_deviation: Array
+    quantile_05: Array
+    quantile_50: Array
+    quantile_95: Array
+    moments: AverageMoments = field(repr=False)
+    law: AmplitudeDistribution = field(repr=False)
+
+    @property
+    def header(self) -> Tuple[float, float, float, float, float, float]:
+        """Return the header elements of the `prediction` topic."""
+        model = self.model
+        return (model.trigger_speed, model.keyphasor_rate, float(model.trigger_cycles),
+                model.ratio, math.sqrt(model.distribution.variance), model.noise_std)
+
+
+def predict(
+    model: DeclaredModel, *, processes: Sequence[AngleErrorProcess] = (),
+    offset: Optional[AngleOffset] = None, gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0,
+) -> Prediction:
+    """
+    Return the law of the amplitudes that an average shows of unit components.
+
+    Effects beyond the declared jitter: random `processes` and a deterministic `offset` of the
+    angle (fundamental cycles), a `gain` per order (complex or real) that acts on the component
+    alone, and `line_variance`, E|n|^2 of what is added incoherently to each peak amplitude.
+    Mean square and complex moments are exact for any of them. The law itself is sampled for up
+    to 9 trigger cycles of plain jitter (fixed seed), curved for more, and normal where an effect
+    has an offset or a long memory.
+    """
+    orders = np.asarray(model.orders)
+    frequency = model.fundamental_frequency
+    jitter = model.distribution
+    everything = (IndependentPulseJitter(jitter, frequency), *processes)
+    spread = float(orders.max()) * frequency * math.sqrt(jitter.variance)
+    nodes = int(np.clip(16.0 + 16.0 * spread, 32 if processes or offset else 16, 80))
+    noise = np.asarray(line_variance) + (
+        noise_line_variance(model.noise_std, model.sample_rate, model.duration)
+        if model.noise_std else 0.0)
+    law: AmplitudeDistribution
+    if offset is not None:
+        moments = offset_moments(orders, everything, model.trigger_cycles, offset, nodes=nodes)
+        moments = moments.scaled(gain).with_noise(noise)
+        law = normal_law(moments)
+    else:
+        cycles = cycle_moments(orders, everything, nodes=nodes)
+        moments = cycles.averaged(model.trigger_cycles).scaled(gain).with_noise(noise)
+        if not processes and model.trigger_cycles <= _FEW_CYCLES:
+            law = sampled_law(orders * frequency, jitter, model.trigger_cycles, moments,
+                              gain=gain, line_variance=noise)
+        elif correlation_length(everything) <= _CURVED_REACH:
+            plain, mixed = third_cumulants(orders, everything, model.trigger_cycles, cycles)
+            g = np.asarray(gain)
+            law = curved_law(moments, plain * g**3, mixed * g * np.abs(g) ** 2)
+        else:
+            law = normal_law(moments)
+    quantiles = law.ppf(QUANTILES)
+    variance = law.variance
+    return Prediction(
+        model=model, order=orders, mean_attenuation=law.mean, variance=variance,
+        standard_deviation=np.sqrt(variance), quantile_05=quantiles[:, 0],
+        quantile_50=quantiles[:, 1], quantile_95=quantiles[:, 2], moments=moments, law=law)
+
+
+def _require(name: str, value: float, holds: bool, limit: str) -> None:
+    if not (holds and math.isfinite(value)):
+        raise ModelError(f'{name} is {value}: it must be finite and {limit}')
