@@ -156,7 +156,7 @@ class TestValues:
         # The burst's spectrum, of standard deviation 10 orders, barely touches 60 and 120.
         assert found['fm4'][0] == pytest.approx(1.5, rel=1e-6)
         assert found['fm4'][1] == pytest.approx(1.5 * np.sqrt(2.0 * np.pi) / width, rel=0.02)
-        for name in ('m6a', 'm8a', 'na4', 'energy_ratio', 'kurtosis', 'crest_factor'):
+        for name in ('m6a', 'm8a', 'na4', 'energy_ratio'):
             assert found[name][1] > found[name][0], name
 
     def test_scale_invariance_and_independent_channels(self, rng):
