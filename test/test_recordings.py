@@ -12,7 +12,7 @@ import pytest
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings import (
     ArraySource, ChannelMap, open_recording, Recording, write_bag, write_npz)
-from sa_jitter_ros.recordings import npz_format
+from sa_jitter_ros.recordings import mat_format, npz_format
 import scipy.io
 import scipy.io.wavfile
 
@@ -243,9 +243,24 @@ def test_mat_version_73_gets_a_clear_line(tmp_path):
         open_recording(path)
 
 
+def test_old_mat_gets_a_clear_line(tmp_path):
+    scipy.io.savemat(tmp_path / 'old.mat', {'vibration': np.ones((2, 90))}, format='4')
+    with pytest.raises(RecordingError, match='no MATLAB file of version 5 to 7'):
+        open_recording(tmp_path / 'old.mat')
+
+
+@pytest.mark.parametrize('dtype', ['f4', 'f8', 'i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'i8', 'u8'])
+def test_large_mat_of_any_number_type_is_mapped(rng, tmp_path, monkeypatch, dtype):
+    monkeypatch.setattr(mat_format, 'IN_MEMORY_BYTES', 1000)
+    vibration = rng.integers(0, 100, (3, 40_000)).astype(dtype)
+    scipy.io.savemat(tmp_path / 'rig.mat', {'vibration': vibration, 'sample_rate': 1.0},
+                     do_compression=True)
+    np.testing.assert_array_equal(open_recording(tmp_path / 'rig.mat').read(), vibration)
+
+
 def test_mat_with_a_struct_for_vibration(tmp_path):
     scipy.io.savemat(tmp_path / 'bad.mat', {'vibration': {'x': 1.0}, 'sample_rate': 1.0})
-    with pytest.raises(RecordingError, match='vibration is a struct'):
+    with pytest.raises(RecordingError, match='vibration: must be real numbers or text'):
         open_recording(tmp_path / 'bad.mat')
 
 

@@ -141,15 +141,11 @@ def _count(name: str, array: RawArray) -> int:
 
 
 def _strings(name: str, array: RawArray) -> tuple[str, ...]:
-    """Return the texts of a string array, or of a MATLAB cell of strings."""
-    flat = array.reshape(-1).tolist()
-    if array.dtype.kind == 'O':
-        flat = [item.item() if getattr(item, 'size', 0) == 1 else None for item in flat]
-    elif array.dtype.kind == 'S':
-        flat = [item.decode('utf-8', 'replace') for item in flat]
-    if not all(isinstance(item, str) for item in flat):
+    if array.dtype.kind == 'S':
+        array = np.char.decode(array, 'utf-8', 'replace')
+    if array.dtype.kind != 'U':
         raise RecordingError(f'{name} of type {array.dtype}: must be text')
-    return tuple(item.strip() for item in flat)
+    return tuple(item.strip() for item in array.reshape(-1).tolist())
 
 
 def _increments(counter: RawArray) -> FloatArray:

@@ -1,7 +1,18 @@
-"""Recordings in MATLAB `.mat` files up to version 7, whose variables are at most 2 GB each."""
+"""
+Recordings in MATLAB `.mat` files of version 5 to 7, read with bounded memory.
 
+Only what a recording can hold is parsed (numbers, text, cells of text), from a map of the file; a
+compressed variable is unpacked once into an unnamed temporary file. Format: MathWorks, MAT-File
+Format, chapter 1. (scipy.io.loadmat reads more, but a broken file can end the process.)
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import prod
+import mmap
 from pathlib import Path
 import struct
+import tempfile
 import zlib
 
 import numpy as np
@@ -9,69 +20,182 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import FIELDS, RawArray, recording_from_fields, size_limit
 from sa_jitter_ros.recordings.npz_format import IN_MEMORY_BYTES, MAX_INFLATION
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
-import scipy.io
 
-_REFUSED = {'struct', 'object', 'function', 'opaque', 'sparse', 'unknown'}
-_STEP = 1 << 20
+Buffer = bytes | mmap.mmap
+
+_MATRIX, _COMPRESSED = 14, 15
+_CELL, _CHAR, _NUMERIC = 1, 4, range(6, 16)
+_COMPLEX = 0x0800
+_NUMBERS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 9: 'f8', 12: 'i8',
+            13: 'u8'}
+_TEXTS = {1: 'latin-1', 2: 'latin-1', 4: 'utf-16', 16: 'utf-8', 17: 'utf-16', 18: 'utf-32'}
+_HEAD, _STEP = 4096, 1 << 20
+
+
+@dataclass(frozen=True)
+class _Element:
+    """A tagged piece of the file: its type and where its bytes lie."""
+
+    kind: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class _Matrix:
+    """The head of a variable and where its content starts."""
+
+    name: str
+    kind: int
+    shape: tuple[int, ...]
+    content: int
+    stop: int
 
 
 def open_mat(path: Path, *, acquisition: int = 0) -> Recording:
     """
-    Open a `.mat` recording (version 4 to 7); fields as in `recording_from_fields`.
+    Open a `.mat` recording; fields as in `recording_from_fields`.
 
-    The variables of a recording are read into memory, others are not touched. Raises
-    RecordingError if the file is broken, of version 7.3, or a variable has the wrong class.
+    Raises RecordingError if the file is broken, of version 4 or 7.3, or a variable of a recording
+    has the wrong class.
     """
     with recording_errors(path):
-        _check_version(path)
-        _check_inflation(path)
-        found = {name: (shape, kind) for name, shape, kind in scipy.io.whosmat(str(path))}
-        names = sorted(set(found).intersection(FIELDS))
-        for name in names:
-            shape, kind = found[name]
-            if kind in _REFUSED or (kind == 'cell' and name not in ('channel_names', 'units')):
-                raise RecordingError(f'{name} is a {kind}: must be numbers or text')
-            if min(shape) < 0 or 8 * np.prod(shape, dtype=np.float64) > size_limit(name):
-                raise RecordingError(f'{name} of shape {shape}: exceeds its limit of '
-                                     f'{size_limit(name)} bytes')
-        variables = scipy.io.loadmat(str(path), variable_names=names) if names else {}
-
-        def load(name: str) -> RawArray:
-            return np.asarray(variables[name])
-
-        return recording_from_fields(
-            [name for name in names if name in variables], load, acquisition=acquisition)
+        with open(path, 'rb') as file:
+            order = _byte_order(file.read(128))
+            whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        variables = dict(_Reader(order).variables(whole))
+        return recording_from_fields(variables, variables.__getitem__, acquisition=acquisition)
 
 
-def _check_version(path: Path) -> None:
-    with open(path, 'rb') as file:
-        head = file.read(128)
+def _byte_order(head: bytes) -> str:
     if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
-        raise RecordingError("MATLAB version 7.3 (HDF5) is not read; save it with '-v7', or with "
-                             'savez as .npz if a variable is larger than 2 GB')
-    if len(head) < 20:
-        raise RecordingError(f'{len(head)} bytes are no MATLAB file')
+        raise RecordingError("MATLAB version 7.3 (HDF5) is not read; save it with '-v7', or as "
+                             '.npz if a variable is larger than 2 GB')
+    if len(head) < 128 or head[126:128] not in (b'IM', b'MI'):
+        raise RecordingError("is no MATLAB file of version 5 to 7; save it with '-v7'")
+    return '<' if head[126:128] == b'IM' else '>'
 
 
-def _check_inflation(path: Path) -> None:
-    """Refuse a compressed element that inflates like a zip bomb, before scipy inflates it."""
-    with open(path, 'rb') as file:
-        head = file.read(128)
-        if head[126:128] not in (b'IM', b'MI'):
-            return  # version 4 knows no compression
-        order = '<' if head[126:128] == b'IM' else '>'
-        while len(tag := file.read(8)) == 8:
-            kind, size = struct.unpack(f'{order}2I', tag)
-            if kind != 15:
-                file.seek(size, 1)
-                continue
-            inflated, left, inflate = 0, size, zlib.decompressobj()
-            while left > 0 and (packed := file.read(min(left, _STEP))):
-                left -= len(packed)
-                while packed:
-                    inflated += len(inflate.decompress(packed, _STEP))
-                    packed = inflate.unconsumed_tail
-                if inflated > max(IN_MEMORY_BYTES, MAX_INFLATION * size):
-                    raise RecordingError(
-                        f'a variable of {size} bytes inflates more than {MAX_INFLATION}-fold: '
-                        "looks like a zip bomb; save it with '-v6', which does not compress")
+class _Reader:
+    """Reads the elements of a file of one byte order."""
+
+    def __init__(self, order: str) -> None:
+        self._order = order
+
+    def variables(self, whole: Buffer) -> Iterator[tuple[str, RawArray]]:
+        """Iterate over the names and arrays of those variables that belong to a recording."""
+        start = 128
+        while start + 8 <= len(whole):
+            element = self._element(whole, start, len(whole))
+            start = element.stop
+            if element.kind == _MATRIX:
+                matrix = self._matrix(whole, element)
+                if matrix.name in FIELDS:
+                    yield matrix.name, self._array(whole, matrix)
+            elif element.kind == _COMPRESSED:
+                packed = whole[element.start:min(element.start + _HEAD, element.stop)]
+                head = zlib.decompressobj().decompress(packed, _HEAD)
+                tag = self._element(head, 0, None)
+                matrix = self._matrix(head, tag)
+                if matrix.name in FIELDS:
+                    data = _inflate(whole, element, 8 + tag.stop - tag.start)
+                    yield matrix.name, self._array(
+                        data, self._matrix(data, self._element(data, 0, len(data))))
+
+    def _element(self, data: Buffer, start: int, limit: int | None) -> _Element:
+        """Read the tag at `start`, of an element that ends at `limit` or before."""
+        kind, size = struct.unpack_from(f'{self._order}2I', data, start)
+        if kind >> 16:  # the small format: four bytes of data within the tag
+            kind, size, begin = kind & 0xFFFF, kind >> 16, start + 4
+        else:
+            begin = start + 8
+        if limit is not None and (begin + size > limit or (begin == start + 4 and size > 4)):
+            raise RecordingError(f'an element of {size} bytes at byte {start} does not end inside '
+                                 'the file: it is truncated or broken')
+        return _Element(kind, begin, begin + size)
+
+    def _after(self, element: _Element, start: int) -> int:
+        """Return where the element after one at `start` begins, 8 bytes aligned."""
+        return max(start + 8, element.stop + (start - element.stop) % 8)
+
+    def _matrix(self, data: Buffer, element: _Element) -> _Matrix:
+        limit = min(element.stop, len(data))
+        places, at = [], element.start
+        for _ in range(3):
+            places.append(self._element(data, at, limit))
+            at = self._after(places[-1], at)
+        flags, dims, name = places
+        flag = struct.unpack_from(f'{self._order}I', data, flags.start)[0]
+        kind = 0 if flag & _COMPLEX else flag & 0xFF
+        shape = np.frombuffer(data[dims.start:dims.stop], f'{self._order}i4')
+        return _Matrix(data[name.start:name.stop].decode('ascii', 'replace'), kind,
+                       tuple(shape.tolist()), at, element.stop)
+
+    def _array(self, data: Buffer, matrix: _Matrix) -> RawArray:
+        limit = size_limit(matrix.name)
+        if not matrix.shape or min(matrix.shape) < 0 or 8 * prod(matrix.shape) > limit:
+            raise RecordingError(f'{matrix.name} of shape {matrix.shape}: exceeds its limit of '
+                                 f'{limit} bytes')
+        if matrix.kind == _CELL:
+            return np.array(list(self._cells(data, matrix)))
+        if matrix.kind == _CHAR:
+            return self._text(data, matrix)
+        if matrix.kind not in _NUMERIC:
+            raise RecordingError(f'{matrix.name}: must be real numbers or text (class '
+                                 f'{matrix.kind} is neither)')
+        part = self._element(data, matrix.content, matrix.stop)
+        dtype = np.dtype(self._order + _NUMBERS[part.kind])
+        count = prod(matrix.shape)
+        if count * dtype.itemsize != part.stop - part.start:
+            raise RecordingError(f'{matrix.name} of shape {matrix.shape} does not fit '
+                                 f'{part.stop - part.start} bytes of {dtype}')
+        array = np.frombuffer(data, dtype, count, part.start) if count else np.empty(0)
+        return array.reshape(matrix.shape, order='F')
+
+    def _cells(self, data: Buffer, matrix: _Matrix) -> Iterator[str]:
+        """Iterate over the texts of a cell array."""
+        at = matrix.content
+        for _ in range(prod(matrix.shape)):
+            element = self._element(data, at, matrix.stop)
+            cell = self._matrix(data, element)
+            if cell.kind != _CHAR:
+                raise RecordingError(f'{matrix.name}: a cell of it is no text')
+            yield ''.join(self._text(data, cell).tolist())
+            at = self._after(element, at)
+
+    def _text(self, data: Buffer, matrix: _Matrix) -> RawArray:
+        """Return the rows of a character matrix."""
+        part = self._element(data, matrix.content, matrix.stop)
+        coding = _TEXTS[part.kind] + (
+            {'<': '-le', '>': '-be'}[self._order] if part.kind in (4, 17, 18) else '')
+        text = data[part.start:part.stop].decode(coding, 'replace')
+        rows = matrix.shape[0]
+        if len(text) != prod(matrix.shape) or rows <= 1:
+            return np.array([text])
+        return np.array([text[row::rows] for row in range(rows)])
+
+
+def _inflate(whole: Buffer, element: _Element, size: int) -> Buffer:
+    """Unpack a compressed variable of `size` bytes, into a mapped file if it is large."""
+    packed = element.stop - element.start
+    if size > max(IN_MEMORY_BYTES, MAX_INFLATION * packed):
+        raise RecordingError(
+            f'a variable of {packed} bytes inflates to {size}, more than {MAX_INFLATION}-fold: '
+            "looks like a zip bomb; save it with '-v6', which does not compress")
+    unpack, at, left = zlib.decompressobj(), element.start, size
+    with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as spool:
+        while left > 0 and (at < element.stop or unpack.unconsumed_tail):
+            piece = unpack.unconsumed_tail
+            if not piece:
+                piece = whole[at:min(at + _STEP, element.stop)]
+                at += len(piece)
+            data = unpack.decompress(piece, min(left, _STEP))
+            left -= len(data)
+            spool.write(data)
+        if left > 0:
+            raise RecordingError(f'a compressed variable lacks {left} of {size} bytes')
+        if size > IN_MEMORY_BYTES:
+            spool.flush()
+            return mmap.mmap(spool.fileno(), 0, access=mmap.ACCESS_READ)
+        spool.seek(0)
+        return spool.read()
