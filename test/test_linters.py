@@ -29,6 +29,8 @@ def test_flake8():
     check('flake8', '.')
 
 
-@pytest.mark.skipif(np.__version__ < '2', reason='the types are checked with those of numpy 2')
+@pytest.mark.skipif(
+    tuple(map(int, np.__version__.split('.')[:2])) < (2, 3),
+    reason='types are checked against those of numpy 2.3 or later')
 def test_mypy():
     check('mypy')
