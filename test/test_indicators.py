@@ -261,7 +261,7 @@ class TestBadInput:
         with pytest.raises(ParameterError, match='Nyquist order 32'):
             condition_indicators(np.ones((1, 64)), GearSettings([order]))
 
-    @pytest.mark.parametrize('shape', [(), (64,), (2, 1), (2, 0), (1, 2, 3, 4)])
+    @pytest.mark.parametrize('shape', [(), (64,), (2, 1), (2, 0), (0, 2, 64), (1, 2, 3, 4)])
     def test_wrong_shapes_are_refused(self, shape):
         with pytest.raises(SignalError, match='shape'):
             condition_indicators(np.ones(shape))

@@ -129,13 +129,13 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     """
     Take a synchronous average over one revolution, (..., n), apart into its gear signals.
 
-    Raises SignalError on samples that are not finite and on an average without points,
-    ParameterError on a mesh order at or above the Nyquist order n/2.
+    Raises SignalError on samples that are not finite and on an average that is empty or has one
+    point, ParameterError on a mesh order at or above the Nyquist order n/2.
     """
     samples = np.asarray(average, float)
-    if samples.ndim == 0 or samples.shape[-1] < 2:
+    if samples.size == 0 or samples.ndim == 0 or samples.shape[-1] < 2:
         raise SignalError(f'average of shape {samples.shape}: its last dimension is the angle and '
-                          'needs 2 points or more')
+                          'needs 2 points or more, the others 1 or more')
     if not np.all(np.abs(samples) < _LARGEST_SAMPLE):
         raise SignalError(f'average with samples that are not finite or not below '
                           f'{_LARGEST_SAMPLE:g}: leave such averages out')
