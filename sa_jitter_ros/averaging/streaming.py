@@ -97,6 +97,13 @@ class StreamingAverager:
         self.counts.averages_dropped += sum(lost)
         self._law = angle_law(next(iter(shafts.values())).law)
 
+    def change_pulses(self, validator: PulseValidator) -> None:
+        """Go on with another validator: pulses so far are forgotten, the angle starts anew."""
+        self.validator = validator
+        self._triggers.clear()
+        self._next = 0
+        self._begin_run()
+
     def take_speed(self) -> float:
         """Mean number of trigger cycles per second since the last call; NaN if there was none."""
         cycles, seconds = self._speed

@@ -200,6 +200,16 @@ class VibrationTimeline:
                 stretch.trim(stretch.index + int(np.floor(stretch.position(np.float64(before)))))
         self._tidy()
 
+    def take(self) -> list[tuple[int, SampleBlock]]:
+        """Take all samples out: their epoch, and stretch by stretch what was held."""
+        taken = [(item.epoch, SampleBlock(item.samples.T, item.start_time, item.clock.rate,
+                                          item.index))
+                 for item in self.stretches if len(item.samples)]
+        for item in self.stretches:
+            item.trim(item.end_index)
+        self._tidy()
+        return taken
+
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
         for stretch in self.stretches:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.timeline import SampleBlock
-from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.errors import MessageError, ParameterError
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
@@ -90,6 +90,14 @@ class ResidualMessage:
     chi2_per_dof: float
     p_value: float
     rms: float
+
+
+def known_type(parameter: str, name: str, types: dict[str, type]) -> str:
+    """Key of `types` for a message type as users write it; raises `ParameterError`."""
+    key = name.replace('/msg/', '/')
+    if key not in types:
+        raise ParameterError(f'{parameter} is {name!r}: give one of {", ".join(types)}')
+    return key
 
 
 # --- arrays ---------------------------------------------------------------------------------------
@@ -294,6 +302,8 @@ def encode_pulse_array(times: FloatArray) -> Float64MultiArray:
 
 _AVERAGE_LABELS = {
     'synchronous_average': ('channel', 'angle'),
+    'standard_error': ('channel', 'angle'),
+    'corrected_average': ('channel', 'angle'),
     'order_amplitude': ('channel', 'order', 'field'),
     'pulse_error': ('pulse', 'field'),
     'condition_indicator': ('channel', 'indicator'),

@@ -1,0 +1,134 @@
+"""Node `tach_detector`: the sampled keyphasor signal in, tach pulses out."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference, known_type,
+                                          PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
+from sa_jitter_ros.nodes.parameters import Parameter, Values
+from sensor_msgs.msg import TimeReference
+
+FloatArray = NDArray[np.float64]
+
+PARAMETERS = (
+    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of tach_waveform',
+              read_only=True),
+    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
+              'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
+    Parameter('sample_rate', 0.0, 'sampling rate where messages carry none, 0 if they do',
+              unit='Hz', minimum=0.0, read_only=True),
+    Parameter('start_time', 0.0, 'time of sample 0 where messages carry none', unit='s',
+              read_only=True),
+    Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
+              unit='s', above=0.0, read_only=True),
+    Parameter('imu_axis', 'z', 'axis of linear acceleration taken as the waveform',
+              choices=('x', 'y', 'z'), read_only=True),
+    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses'),
+    Parameter('automatic_threshold', True, 'learn the threshold from the state levels'),
+    Parameter('threshold', 0.0, 'threshold where it is not automatic [unit of the waveform]'),
+    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
+              'difference of the state levels', minimum=0.0, maximum=0.99),
+    Parameter('polarity', 'positive', 'negative where the pulse goes down',
+              choices=('positive', 'negative')),
+    Parameter('edge', 'rising', 'edge of the pulse that gives its time',
+              choices=('rising', 'falling', 'centre')),
+    Parameter('interpolate', True, 'time between samples; false gives the first sample past the '
+              'threshold'),
+    Parameter('minimum_interval', 0.0, 'pulses closer than this are double', unit='s',
+              minimum=0.0),
+    Parameter('learning_time', 0.5, 'length of the windows in which the state levels are learnt',
+              unit='s', above=0.0, maximum=60.0),
+    Parameter('minimum_difference', 0.0, 'state levels closer than this are noise [unit of the '
+              'waveform]', minimum=0.0),
+)
+
+
+def detector_of(values: Values) -> KeyphasorDetector:
+    """Detector with these parameters; raises `ParameterError`."""
+    return KeyphasorDetector(
+        threshold=None if values['automatic_threshold'] else values['threshold'],
+        hysteresis=values['hysteresis'], polarity=values['polarity'], edge=values['edge'],
+        interpolate=values['interpolate'], minimum_interval=values['minimum_interval'],
+        learning_time=values['learning_time'], minimum_difference=values['minimum_difference'])
+
+
+class TachDetector(MonitoringNode):
+    """Finds the pulses in `tach_waveform` and publishes them as `tach_pulse`."""
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('tach_detector', PARAMETERS, **node_kwargs)
+        values = self.parameters.values()
+        waveform_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
+        self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
+        self._keyphasor = values['keyphasor']
+        self._decoder = SampleDecoder(waveform_type, sample_rate=values['sample_rate'],
+                                      start_time=values['start_time'],
+                                      imu_axis=values['imu_axis'])
+        self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
+        self._detector = detector_of(values)
+        self._epoch = 0
+        self._pulses = 0
+        self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
+        self.create_input(SAMPLE_TYPES[waveform_type], 'tach_waveform', self._on_waveform)
+        self.parameters.watch(check=detector_of, apply=self._apply)
+
+    def _apply(self, values: Values) -> None:
+        self._keyphasor, self._detector = values['keyphasor'], detector_of(values)
+
+    def _on_waveform(self, message: Any) -> None:
+        block = self._decoder.decode(message)
+        try:
+            if block.samples.shape[0] != 1:
+                raise SignalError(f'{block.samples.shape[0]} channels: send the one channel of '
+                                  'the keyphasor')
+            self._timeline.add(block)
+        except SignalError:
+            self.counts['messages_rejected'] += 1
+            raise
+        for epoch, samples in self._timeline.take():
+            if epoch != self._epoch:  # time ran back: what was learnt is of another run
+                self._detector, self._epoch = detector_of(self.parameters.values()), epoch
+            self._publish(self._detector.update(
+                samples.samples[0], samples.start_time, samples.sample_rate))
+        for line in self._timeline.messages:
+            self.warn(line)
+        self._timeline.messages.clear()
+
+    def _publish(self, times: FloatArray) -> None:
+        self._pulses += len(times)
+        if self._pulse_type is not TimeReference:
+            if len(times):
+                self._pulse.publish(encode_pulse_array(times))
+            return
+        for time in times.tolist():
+            self._pulse.publish(encode_pulse_reference(time, self._keyphasor))
+
+    def update_counts(self) -> None:
+        """Gather the counts of the core."""
+        samples, state = self._timeline.counts, self._detector.state
+        self.counts.update(
+            samples_dropped=samples.samples_dropped, pulses_dropped=state.too_close,
+            gaps=samples.gaps, restarts=samples.restarts,
+            clock_deviation=samples.clock_deviation, repeats=samples.repeats)
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Say how many pulses were found and at which threshold."""
+        state = self._detector.state
+        values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
+        values['pulses'] = str(self._pulses)
+        if self._timeline.layout is None:
+            return 'no waveform received yet', values
+        if np.isnan(state.threshold):
+            return 'learning the state levels', values
+        return f'{self._pulses} pulses at threshold {state.threshold:.6g}', values
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(TachDetector, args)
