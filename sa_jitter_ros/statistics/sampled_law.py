@@ -6,7 +6,7 @@ of its model. The mean square is not sampled: it is exact.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Tuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +40,7 @@ class SampledLaw:
         return np.asarray(np.sqrt(np.maximum(self.mean_square - self.variance, 0.0)))
 
     def cdf(self, amplitude: ArrayLike) -> Array:
-        """Return P(|X| <= amplitude), shape (orders, k) for amplitudes of shape (k,) or the same."""
+        """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
         y = np.atleast_2d(np.asarray(amplitude, float))
         y = np.broadcast_to(y, (self.draws.shape[0], y.shape[-1]))
         counts = [np.searchsorted(row, at, side='right') for row, at in zip(self.draws, y)]
@@ -86,7 +86,7 @@ def sampled_law(
     return SampledLaw(draws, moments.mean_square)
 
 
-def cycle_amplitudes(errors: Array) -> Tuple[Array, Array]:
+def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
     """
     Return real and imaginary part of int_0^1 exp(j 2 pi [(1-u) eps_k + u eps_{k+1}]) du.
 
