@@ -220,7 +220,7 @@ def test_counter():
 
 
 @pytest.mark.parametrize(('name', 'speed', 'jitter'), [
-    ('motor_10V_100kHz', 19.6, 15e-6), ('motor_30V_100kHz', 94.4, 1e-6)])
+    ('motor_10V_100kHz', 19.6, 6e-6), ('motor_30V_100kHz', 94.4, 0.25e-6)])
 def test_motor_tacho(shared_data, name, speed, jitter):
     with np.load(shared_data / f'{name}.npz') as data:
         tach, rate = data['tach'], float(data['tach_rate'])
