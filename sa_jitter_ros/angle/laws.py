@@ -1,11 +1,11 @@
 """
 Angle laws: when, inside a trigger cycle, the shaft stands at a given angle.
 
-A law reads the pulse times around a trigger cycle and returns times for fractions `u` of the cycle.
-The piecewise-linear law (Camerini et al. 2019, Eq. 5) needs the two pulses of the cycle only, so a
-cycle is usable as soon as it ends, and attenuates least under pulse jitter. The quadratic law follows
-a constant acceleration (Potter 1990; Fyfe and Munck 1997), the spline a smooth speed (Villa 2008);
-both pay for it by passing on more of the pulse jitter.
+A law reads the pulse times around a trigger cycle and returns times for fractions `u` of the
+cycle. The piecewise-linear law (Camerini et al. 2019, Eq. 5) needs the two pulses of the cycle
+only, so a cycle is usable as soon as it ends, and attenuates least under pulse jitter. The
+quadratic law follows a constant acceleration (Potter 1990; Fyfe and Munck 1997), the spline a
+smooth speed (Villa 2008); both pay for it by passing on more of the pulse jitter.
 """
 
 from collections.abc import Callable
@@ -43,7 +43,7 @@ def _linear(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
 
 
 def _quadratic(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
-    """Constant acceleration over the cycle and the one before (the one after, at a run's start)."""
+    """Constant acceleration over the cycle and the one before; a first cycle, the one after."""
     if len(pulses) < 3:
         return _linear(pulses, cycle, u)
     first = cycle - 1 if cycle > 0 else cycle
@@ -54,7 +54,7 @@ def _quadratic(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     theta = u + (cycle - first)
     # the root that stays finite as the curvature vanishes
     root = speed * speed + 4.0 * curve * theta
-    if np.any(root <= 0.0):  # the parabola turns round: intervals differ by more than it can follow
+    if np.any(root <= 0.0):  # the parabola turns round: the intervals differ too much for it
         return _linear(pulses, cycle, u)
     return np.asarray(pulses[first] + 2.0 * theta / (speed + np.sqrt(root)))
 

@@ -1,16 +1,17 @@
 """
 Resampling: values of a sampled signal between its samples.
 
-One operator serves all channels: the value at a position is a weighted sum of the samples around it,
-so that the positions of a trigger cycle make a sparse matrix, applied to samples x channels at once.
-The weights come from a table of the kernel over `PHASES` fractions of a sample, interpolated linearly
-(error below 2e-6). Positions that are further apart than the samples need an anti-alias filter: the
-kernel is stretched, which moves its cut-off from half the sampling rate to `cutoff` times that; the
-band-limited kernel is made longer then, flat to 0.8 and closed from 1.0 of the cut-off on.
+One operator serves all channels: the value at a position is a weighted sum of the samples around
+it, so that the positions of a trigger cycle make a sparse matrix, applied to samples x channels at
+once. The weights come from a table of the kernel over `PHASES` fractions of a sample, interpolated
+linearly (error below 2e-6). Positions that are further apart than the samples need an anti-alias
+filter: the kernel is stretched, which moves its cut-off from half the sampling rate to `cutoff`
+times that; the band-limited kernel is made longer then, flat to 0.8 and closed from 1.0 of the
+cut-off on.
 
-What an interpolator costs is its gain at the frequency f (`gain`): none to speak of for the default
-(Kaiser-windowed sinc, below 0.001 dB to 0.32 fs), but sinc^2(f/fs) for linear interpolation, which at
-f_kp = fs costs three times what the pulse jitter costs.
+What an interpolator costs is its gain at the frequency f (`gain`): none to speak of for the
+default (Kaiser-windowed sinc, below 0.001 dB to 0.32 fs), but sinc^2(f/fs) for linear
+interpolation, which at f_kp = fs costs three times what the pulse jitter costs.
 """
 
 from functools import lru_cache
@@ -90,8 +91,8 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
     """
     Gain of an interpolator at `frequency` in units of the sampling rate.
 
-    It is the Fourier transform of the kernel: sinc^2 for linear, 3 sinc^4 / (2 + cos 2 pi f) for the
-    cubic spline.
+    It is the Fourier transform of the kernel: sinc^2 for linear, 3 sinc^4 / (2 + cos 2 pi f) for
+    the cubic spline.
     """
     half = _HALF_WIDTH[_known(method)]
     x, step = np.linspace(-half, half, 2 * half * PHASES + 1, retstep=True)
@@ -106,13 +107,13 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
 
     Positions must lie within [0, n - 1]; towards either end the signal is continued by point
     reflection. `cutoff` in (0, 1] is the band that survives, as a fraction of half the sampling
-    rate. Returns (m, channels). Raises `SignalError` for positions outside the samples or the wrong
-    number of dimensions, `ParameterError` for an unknown method or cut-off.
+    rate. Returns (m, channels). Raises `SignalError` for positions outside the samples or the
+    wrong number of dimensions, `ParameterError` for an unknown method or cut-off.
     """
     if not 0.0 < cutoff <= 1.0:
         raise ParameterError(f'cutoff is {cutoff}: give more than 0 and at most 1')
     if samples.ndim != 2 or positions.ndim != 1:
-        raise SignalError(f'samples have {samples.ndim} and positions {positions.ndim} dimensions: '
+        raise SignalError(f'samples have {samples.ndim} dimensions, positions {positions.ndim}: '
                           'give (sample, channel) and (position,)')
     table, steps, half = _table(method, cutoff)
     if positions.size == 0:

@@ -2,9 +2,9 @@
 One trigger cycle in angle: order amplitudes of the cycle and its points of the waveform.
 
 The cycle is `r` fundamental cycles long. Its order amplitudes are integrals over the whole trigger
-cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), taken on a grid of the trigger cycle that is
-never coarser than the samples. The waveform has points at k/n of a fundamental cycle, wherever those
-fall between the pulses: a fundamental cycle that straddles a pulse is exact.
+cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), taken on a grid of the trigger cycle
+that is never coarser than the samples. The waveform has points at k/n of a fundamental cycle,
+wherever those fall between the pulses: a fundamental cycle that straddles a pulse is exact.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ def grid_points(period: float, rate: float) -> int:
     On a ladder of about 6 % steps, so that cycles of nearly one length share a grid.
     """
     needed = max(period * rate, 8.0)
-    return math.ceil(2.0 ** (math.ceil(12.0 * math.log2(needed)) / 12.0))
+    return math.ceil(math.pow(2.0, math.ceil(12.0 * math.log2(needed)) / 12.0))
 
 
 def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> int:

@@ -1,8 +1,8 @@
 """
 Running means of arrays: block, sliding and exponential.
 
-Each takes one array per cycle with `update` and gives `mean` and `standard_error`; memory does not grow
-with the number of cycles (a sliding mean keeps its window). Undefined values are NaN.
+Each takes one array per cycle with `update` and gives `mean` and `standard_error`; memory does not
+grow with the number of cycles (a sliding mean keeps its window). Undefined values are NaN.
 
 >>> mean = BlockMean()
 >>> for value in (1.0, 2.0, 6.0):
@@ -24,7 +24,9 @@ FloatArray = NDArray[np.float64]
 class RunningMean(Protocol):
     """What the three have in common."""
 
-    count: int
+    @property
+    def count(self) -> int:
+        """Number of arrays that make the mean."""
 
     def update(self, values: Array) -> None:
         """Take the array of one more cycle."""

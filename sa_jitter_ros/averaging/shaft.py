@@ -1,13 +1,14 @@
 """
 The synchronous average of one shaft, cycle by cycle.
 
-Feed it the samples of consecutive trigger cycles; it returns an average whenever one is due. What it
-holds is bounded by the settings, and its result depends on the cycles alone.
+Feed it the samples of consecutive trigger cycles; it returns an average whenever one is due. What
+it holds is bounded by the settings, and its result depends on the cycles alone.
 """
 
 from collections import deque
 from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleS
 from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, RunningMean, SlidingMean
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.errors import ParameterError, SignalError
+
+if TYPE_CHECKING:
+    from sa_jitter_ros.averaging.correction import Correction
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -32,8 +36,10 @@ class AverageSettings:
     How the trigger cycles of one shaft are averaged.
 
     `cycles` is r, the fundamental cycles in a trigger cycle; `trigger_cycles` is N_t; `orders` are
-    multiples of the shaft; `samples_per_revolution` 0 chooses the waveform's grid. Raises
-    `ParameterError` for values that cannot be used.
+    multiples of the shaft; `samples_per_revolution` 0 chooses the waveform's grid. With
+    `correct_jitter` the pulse errors are recovered from the vibration (block averages only);
+    `keyphasor_rate` (Hz) declares how large they may be, 0 for a keyphasor sampled with the
+    vibration. Raises `ParameterError` for values that cannot be used.
     """
 
     cycles: float = 1.0
@@ -43,6 +49,8 @@ class AverageSettings:
     averaging: str = 'block'
     law: str = 'linear'
     interpolation: str = 'band_limited'
+    correct_jitter: bool = False
+    keyphasor_rate: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -56,6 +64,15 @@ class AverageSettings:
         if self.samples_per_revolution < 0 or 0 < self.samples_per_revolution < 4:
             raise ParameterError(f'samples_per_revolution is {self.samples_per_revolution}: give '
                                  'at least 4, or 0 to choose it')
+        if self.correct_jitter and self.averaging != 'block':
+            raise ParameterError(f'correct_jitter with averaging {self.averaging!r}: pulse errors '
+                                 'are recovered per block; set averaging to block')
+        if not (math.isfinite(self.keyphasor_rate) and self.keyphasor_rate >= 0.0):
+            raise ParameterError(f'keyphasor_rate is {self.keyphasor_rate} Hz: give a positive '
+                                 "rate, or 0 for the vibration's")
+        if self.correct_jitter and self.trigger_cycles < 2:
+            raise ParameterError('correct_jitter with trigger_cycles 1: one cycle cannot be '
+                                 'compared with itself; give at least 2')
         for name, value, known in (('averaging', self.averaging, AVERAGING),
                                    ('angle_law', self.law, LAWS),
                                    ('interpolation', self.interpolation, METHODS)):
@@ -69,10 +86,11 @@ class SynchronousAverage:
     An average over consecutive trigger cycles.
 
     Times in s, speed of the tach shaft in Hz. `waveform` and its `standard_error` are (channel,
-    angle) over whole fundamental cycles, NaN where none is whole; `amplitudes` (channel, order) are
-    complex peak amplitudes over whole trigger cycles, cos having phase 0 where the angle is 0 (NaN
-    from the Nyquist frequency on), `noise` (channel, order) their standard deviation along the
-    radius. `angle` is that of the first pulse (fundamental cycles), `pulses` (N_t + 1,) in s.
+    angle) over whole fundamental cycles, NaN where none is whole; `amplitudes` (channel, order)
+    are complex peak amplitudes over whole trigger cycles, cos having phase 0 where the angle is 0
+    (NaN from the Nyquist frequency on), `noise` (channel, order) their standard deviation along
+    the radius. `angle` is that of the first pulse (fundamental cycles), `pulses` (N_t + 1,) in s;
+    `correction` is there where it was asked for.
     """
 
     start_time: float
@@ -87,10 +105,11 @@ class SynchronousAverage:
     noise: FloatArray
     angle: float
     pulses: FloatArray
+    correction: 'Correction | None' = None
 
 
 class ShaftAverager:
-    """Averages the trigger cycles of one shaft: `update` per cycle, `reset` where they break off."""
+    """Averages trigger cycles of one shaft: `update` per cycle, `reset` where they break off."""
 
     def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
         self.settings = settings
@@ -208,7 +227,9 @@ class ShaftAverager:
     def _new_mean(self, cycles: float) -> RunningMean:
         if self.settings.averaging == 'exponential':
             return ExponentialMean(cycles)
-        return SlidingMean() if self.settings.averaging == 'sliding' else BlockMean()
+        if self.settings.averaging == 'sliding':
+            return SlidingMean()
+        return BlockMean()
 
     def _expect_from(self, angle: float) -> None:
         """Begin with the first fundamental cycle that is whole from this angle on."""

@@ -1,12 +1,13 @@
 """
 The vibration's time line: blocks in, stretches of consecutive samples out.
 
-The sample index decides continuity. Blocks that were received before, stray or malformed are dropped,
-a gap in the index ends a stretch, a source that starts again opens a new epoch; all is counted.
-Memory is bounded by `buffer_seconds`: the oldest samples go first.
+The sample index decides continuity. Blocks that were received before, stray or malformed are
+dropped, a gap in the index ends a stretch, a source that starts again opens a new epoch; all is
+counted. Memory is bounded by `buffer_seconds`: the oldest samples go first.
 """
 
 from dataclasses import dataclass, field
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ class SampleBlock:
     """
     Consecutive samples of one source.
 
-    `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz, `index`
-    of the first sample, which counts on from block to block.
+    `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz,
+    `index` of the first sample, which counts on from block to block.
     """
 
     samples: FloatArray
@@ -32,7 +33,7 @@ class SampleBlock:
     @property
     def end_index(self) -> int:
         """Index of the sample after the last one."""
-        return self.index + self.samples.shape[1]
+        return self.index + int(self.samples.shape[1])
 
 
 @dataclass
@@ -99,9 +100,9 @@ class Stretch:
         """Time of the last sample held."""
         return self.clock.time_of(self.end_index - 1)
 
-    def position(self, times: FloatArray) -> FloatArray:
-        """Position of times in samples from the first one held."""
-        return (times - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
+    def position(self, time: float) -> float:
+        """Position of a time (s) in samples from the first one held."""
+        return (time - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
 
     def append(self, samples: FloatArray) -> None:
         """Add samples (channel, sample) behind the last one."""
@@ -197,7 +198,7 @@ class VibrationTimeline:
             if stretch.epoch < epoch:
                 stretch.trim(stretch.end_index)
             elif stretch.epoch == epoch and np.isfinite(before):
-                stretch.trim(stretch.index + int(np.floor(stretch.position(np.float64(before)))))
+                stretch.trim(stretch.index + math.floor(stretch.position(before)))
         self._tidy()
 
     def take(self) -> list[tuple[int, SampleBlock]]:
@@ -246,8 +247,8 @@ class VibrationTimeline:
             return True
         self._odd = layout
         raise SignalError(
-            f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} at '
-            f'{self.layout[1]:g} Hz: keep both, or restart the source')
+            f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} '
+            f'at {self.layout[1]:g} Hz: keep both, or restart the source')
 
     def _drop(self, block: SampleBlock, why: str) -> None:
         self.counts.repeats += 1
@@ -268,7 +269,8 @@ class VibrationTimeline:
         self._last = block
 
     def _continue(self, block: SampleBlock) -> None:
-        assert self._last is not None and self._clock is not None
+        assert self._last is not None
+        assert self._clock is not None
         expected = self._last.end_index
         deviation = block.start_time - self._clock.time_of(block.index)
         if abs(deviation) > self.time_tolerance:
@@ -300,7 +302,7 @@ class VibrationTimeline:
     def _store(self, samples: FloatArray, index: int) -> None:
         """Keep the finite samples; a non-finite one leaves a gap."""
         assert self._clock is not None
-        finite = np.isfinite(samples).all(axis=0)
+        finite = np.asarray(np.isfinite(samples).all(axis=0))
         if finite.all():
             self._put(samples, index)
             return

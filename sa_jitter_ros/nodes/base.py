@@ -1,4 +1,4 @@
-"""What every node shares: parameters, diagnostics at 1 Hz, throttled warnings, quality of service, main."""
+"""What every node shares: parameters, diagnostics at 1 Hz, throttled warnings, QoS, main."""
 
 from collections.abc import Callable, Sequence
 import sys

@@ -1,9 +1,10 @@
 """
 Messages to arrays and back: the only module that knows message layouts.
 
-Inputs decode to `SampleBlock` and pulse times, results are frozen dataclasses with an `encode_*` and
-a `decode_*` function each; other Python nodes can import them. A message that does not follow the
-layout raises `MessageError`. Arrays are in C order; infinities are never published (NaN instead).
+Inputs decode to `SampleBlock` and pulse times, results are frozen dataclasses with an `encode_*`
+and a `decode_*` function each; other Python nodes can import them. A message that does not follow
+the layout raises `MessageError`. Arrays are in C order; infinities are never published (NaN
+instead).
 """
 
 import array
@@ -100,7 +101,7 @@ def known_type(parameter: str, name: str, types: dict[str, type]) -> str:
     return key
 
 
-# --- arrays ---------------------------------------------------------------------------------------
+# --- arrays --------------------------------------------------------------------------------------
 
 def _build(message: ArrayMessage, typecode: str, values: NDArray[np.floating[Any]],
            labels: tuple[str, ...], header: tuple[float, ...]) -> ArrayMessage:
@@ -128,7 +129,8 @@ def encode_array(values: FloatArray, labels: tuple[str, ...],
 def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[str, ...],
                  header_size: int) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """
-    Decode an array: header elements, values shaped as the layout says, names of the last dimension.
+    Decode an array: header elements, values shaped as the layout says, names of the last
+    dimension.
 
     Raises `MessageError` where label, number of dimensions, size or offset do not fit.
     """
@@ -152,7 +154,7 @@ def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[s
     return data[:header_size].astype(np.float64), data[header_size:].reshape(shape), names
 
 
-# --- samples --------------------------------------------------------------------------------------
+# --- samples -------------------------------------------------------------------------------------
 
 def _block_samples(message: Float64MultiArray | Float32MultiArray,
                    header_size: int) -> tuple[FloatArray, FloatArray]:
@@ -183,9 +185,10 @@ class SampleDecoder:
     """
     Decode `vibration` or `tach_waveform` messages of one type into `SampleBlock`s.
 
-    `kind` is a key of `SAMPLE_TYPES`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz) and `start_time` (s) serve where the
-    message does not carry them. Messages without header are counted from `start_time`; `counted`
-    tells that this happened. Raises `MessageError` on a malformed message.
+    `kind` is a key of `SAMPLE_TYPES`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz) and
+    `start_time` (s) serve where the message does not carry them. Messages without header are
+    counted from `start_time`; `counted` tells that this happened. Raises `MessageError` on a
+    malformed message.
     """
 
     def __init__(self, kind: str, *, sample_rate: float, start_time: float = 0.0,
@@ -263,7 +266,7 @@ def encode_samples_float32(block: SampleBlock) -> Float32MultiArray:
                   (float(high), float(low)))
 
 
-# --- pulses ---------------------------------------------------------------------------------------
+# --- pulses --------------------------------------------------------------------------------------
 
 def decode_time(seconds: int, nanoseconds: int) -> float:
     """Seconds of a ROS time; negative `seconds` are legal."""
@@ -298,7 +301,7 @@ def encode_pulse_array(times: FloatArray) -> Float64MultiArray:
     return encode_array(np.asarray(times, dtype=np.float64), ('pulse',))
 
 
-# --- results --------------------------------------------------------------------------------------
+# --- results -------------------------------------------------------------------------------------
 
 _AVERAGE_LABELS = {
     'synchronous_average': ('channel', 'angle'),

@@ -1,10 +1,10 @@
 """
 Declare, read and check parameters: described, ranged, kind to integers.
 
-A node lists its parameters as `Parameter` specifications. `ParameterSet` declares them (a float takes
-an integer, a float list an integer list, from `-p`, YAML and services), warns of overrides that match
-nothing, and on a change hands the whole new configuration first to `check`, whose `SaJitterError`
-refuses the change with its reason, and once it is set to `apply`.
+A node lists its parameters as `Parameter` specifications. `ParameterSet` declares them (a float
+takes an integer, a float list an integer list, from `-p`, YAML and services), warns of overrides
+that match nothing, and on a change hands the whole new configuration first to `check`, whose
+`SaJitterError` refuses the change with its reason, and once it is set to `apply`.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,9 +26,10 @@ class Parameter:
     """
     Specification of one parameter.
 
-    The default's type is the parameter's type; `[0.0]`-like defaults make lists, and `element` gives
-    the type of a list whose default is empty. `minimum` and `maximum` bound a number or every
-    element of a list, `above` is an open lower bound, `choices` are the values a string may take.
+    The default's type is the parameter's type; `[0.0]`-like defaults make lists, and `element`
+    gives the type of a list whose default is empty. `minimum` and `maximum` bound a number or
+    every element of a list, `above` is an open lower bound, `choices` are the values a string may
+    take.
     """
 
     name: str
