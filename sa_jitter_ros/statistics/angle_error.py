@@ -123,8 +123,8 @@ def gaussian_pulse_jitter(autocovariance: Sequence[float]) -> GaussianAngleError
     spectrum = table[0] + 2.0 * np.cos(
         2.0 * np.pi * np.outer(grid, np.arange(1, table.size))) @ table[1:]
     if spectrum.min() < -1e-9 * abs(table[0]):
-        raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no random '
-                         'sequence has a negative one; lower the correlations')
+        raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no '
+                         'random sequence has a negative one; lower the correlations')
 
     def at(lag: int) -> float:
         return float(table[abs(lag)]) if abs(lag) < table.size else 0.0

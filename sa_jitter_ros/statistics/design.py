@@ -25,6 +25,7 @@ Array = NDArray[Any]
 
 _MOST_CYCLES = 1_000_000
 _FEW = 8
+_MAIN_LOBE, _WIDEST = 1.32, 100.0  # widths in cycles of the order
 _RATE_SPAN = 1e9  # highest rate tried, over the lowest at which pulses keep their order
 
 
@@ -76,7 +77,7 @@ def required_keyphasor_rate(model: DeclaredModel, attenuation: float) -> float:
     ModelError where the jitter does not come from the rate (`jitter_std` or a table).
     """
     _require_limit('attenuation', attenuation)
-    if model.jitter_distribution == 'table' or model.jitter_std > 0.0:
+    if not _rate_matters(model):
         raise ModelError(
             f'jitter_std is {model.jitter_std} s and jitter_distribution '
             f'{model.jitter_distribution!r}, so that no keyphasor rate changes the jitter: leave '
@@ -91,8 +92,9 @@ def required_keyphasor_rate(model: DeclaredModel, attenuation: float) -> float:
         gain = abs(cycle_moments(at_rate.orders, [jitter]).mean[0])
         return float(1.0 - gain - attenuation)
 
-    # The mean is monotone for any smaller spread once it is: start there, not on a side lobe.
-    start = max(lowest, width * unit.fundamental_frequency * unit.orders[0])
+    # Not on a side lobe of the uniform law: its mean is 0 at a width of 1.32 cycles of the order.
+    widest = _MAIN_LOBE if model.jitter_distribution == 'uniform' else _WIDEST
+    start = max(lowest, width * unit.fundamental_frequency * unit.orders[0] / widest)
     if excess(math.log(start)) <= 0.0:
         return start
     return math.exp(brentq(excess, math.log(start), math.log(start * _RATE_SPAN), xtol=1e-10))
@@ -146,14 +148,20 @@ def design_grid(
     return DesignGrid(rates, cycles, figures[0], figures[1])
 
 
+def _rate_matters(model: DeclaredModel) -> bool:
+    """Return whether the declared jitter comes from the keyphasor rate."""
+    return model.jitter_distribution == 'uniform' or (
+        model.jitter_distribution != 'table' and model.jitter_std == 0.0)
+
+
 def _at_rates(model: DeclaredModel, rates: ArrayLike) -> Sequence[DeclaredModel | None]:
     """Return the model at each rate, None where its pulses could swap."""
     models: list[DeclaredModel | None] = []
     for rate in np.atleast_1d(np.asarray(rates, float)):
         if not (math.isfinite(rate) and rate > 0.0):
             raise ModelError(f'keyphasor_rates hold {rate}: rates are finite and above 0 Hz')
-        swaps = (model.jitter_distribution != 'table' and model.jitter_std == 0.0 and
-                 model.distribution.width * model.keyphasor_rate / rate >= model.trigger_period)
+        width = model.distribution.width * model.keyphasor_rate / rate
+        swaps = _rate_matters(model) and width >= model.trigger_period
         models.append(None if swaps else replace(model, keyphasor_rate=float(rate)))
     return models
 

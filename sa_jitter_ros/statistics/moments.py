@@ -10,10 +10,8 @@ angle error, done here by a Gauss-Legendre rule for all orders at once. Neighbou
 pulse, so lag 1 belongs in every variance.
 """
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,6 @@ Array = NDArray[Any]
 AngleOffset = Callable[[Array], Array]
 
 NODES = 64
-_CUMULANT_NODES = 6
 
 
 @dataclass(frozen=True)
@@ -207,54 +204,6 @@ def multi_harmonic_moments(
                 turns = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
                 pseudo += scale * turns * np.sum((weight[s] @ joint) * weight[t], axis=-1)
     return AverageMoments(means.sum(axis=0), variance, pseudo)
-
-
-def third_cumulants(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-    cycles: CycleMoments, *, nodes: int = _CUMULANT_NODES,
-) -> tuple[Array, Array]:
-    """
-    Return the joint cumulants k(X, X, X) and k(X, X, conj X) of the average, shape (orders,) each.
-
-    They are what the normal law of the central limit theorem lacks at order 1/sqrt(N_t). `cycles`
-    are the `cycle_moments` of the same processes.
-    """
-    g = require_orders(orders)
-    require_cycles(trigger_cycles)
-    u, w = unit_nodes(nodes)
-    length = correlation_length(processes)
-    axes = (u[:, None, None], u[:, None], u)
-    box = g[:, None, None, None]
-    m = cycles.mean
-    plain = np.zeros(g.size, complex)
-    mixed = np.zeros(g.size, complex)
-
-    def pair(i: int, j: int) -> Array:
-        return (cycles.pseudo_variance[abs(i - j)] if abs(i - j) <= length else 0.0) + m**2
-
-    def pair_conj(i: int, j: int) -> Array:
-        if abs(i - j) > length:
-            return np.abs(m) ** 2
-        moment: Array = cycles.variance[abs(i - j)] + np.abs(m) ** 2
-        return moment if j >= i else np.conj(moment)
-
-    for p in range(length + 1):
-        for q in range(length + 1):
-            triple = (0, p, p + q)
-            places = (trigger_cycles - p - q) / trigger_cycles**3
-            if places <= 0.0:
-                continue
-            arrangements = set(permutations(triple))
-            raw = joint_characteristic(processes, [box] * 3, axes, triple) @ w @ w @ w
-            lower = pair(0, p) + pair(0, p + q) + pair(p, p + q)
-            plain += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
-            for (a, b, c), count in Counter(
-                    (*sorted(order[:2]), order[2]) for order in arrangements).items():
-                raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c))
-                lower = m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b)
-                mixed += places * count * (
-                    raw @ w @ w @ w - lower + 2.0 * m * np.abs(m) ** 2)
-    return plain, mixed
 
 
 def uniform_mean(spread: ArrayLike) -> Array:

@@ -48,7 +48,7 @@ class AveragedSignal:
         if not (math.isfinite(self.cycle_length) and self.cycle_length > 0.0):
             raise ModelError(f'cycle_length is {self.cycle_length}: a trigger cycle lasts more '
                              'than 0 fundamental cycles')
-        sources = tuple(require_orders(self.source_orders or (self.order,)))
+        sources = tuple(require_orders(self.source_orders or (self.order,)).tolist())
         amplitudes = self.amplitudes * (len(sources) if len(self.amplitudes) == 1 else 1)
         if len(amplitudes) != len(sources):
             raise ModelError(f'{len(amplitudes)} amplitudes for {len(sources)} source_orders: '

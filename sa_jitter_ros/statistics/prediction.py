@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.amplitude_law import curved_law, normal_law
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.statistics.cumulants import third_cumulants
 from sa_jitter_ros.statistics.distributions import (
     Empirical,
     Normal,
@@ -33,7 +34,6 @@ from sa_jitter_ros.statistics.moments import (
     offset_moments,
     require_cycles,
     require_orders,
-    third_cumulants,
 )
 from sa_jitter_ros.statistics.sampled_law import sampled_law
 
@@ -73,8 +73,9 @@ class DeclaredModel:
 
     Rates and speeds are in Hz, times in s, orders in multiples of the shaft of interest.
     `pulses_per_trigger` 0 means all pulses of a revolution, `jitter_std` 0 the standard deviation
-    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown. Raises ModelError for values that make no
-    sense, alone or together.
+    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown. What a distribution does not use
+    (`jitter_std` of a uniform one, `jitter_table` of any but table) may stay set, so that the
+    distribution can be switched. Raises ModelError for values that make no sense.
     """
 
     keyphasor_rate: float
@@ -101,19 +102,11 @@ class DeclaredModel:
         _require('pulses_per_trigger', self.pulses_per_trigger,
                  self.pulses_per_trigger >= 0, '0 (all of a revolution) or above')
         require_cycles(self.trigger_cycles)
-        object.__setattr__(self, 'orders', tuple(float(g) for g in require_orders(self.orders)))
+        object.__setattr__(self, 'orders', tuple(require_orders(self.orders).tolist()))
+        object.__setattr__(self, 'jitter_table', tuple(self.jitter_table))
         if self.jitter_distribution not in DISTRIBUTIONS:
             raise ModelError(f'jitter_distribution is {self.jitter_distribution!r}: choose one of '
                              f'{", ".join(DISTRIBUTIONS)}')
-        if self.jitter_std > 0.0 and self.jitter_distribution not in ('normal', 'triangular'):
-            raise ModelError(
-                f'jitter_std is {self.jitter_std} s but jitter_distribution is '
-                f'{self.jitter_distribution!r}, which has its own width: leave it 0, or choose '
-                'normal or triangular')
-        if len(self.jitter_table) and self.jitter_distribution != 'table':
-            raise ModelError(
-                f'jitter_table holds {len(self.jitter_table)} errors but jitter_distribution is '
-                f'{self.jitter_distribution!r}: empty it, or choose table')
         if self.noise_std > 0.0 and self.sample_rate == 0.0:
             raise ModelError(f'noise_std is {self.noise_std} without sample_rate: how much noise '
                              'one line of the average holds depends on it; set sample_rate (Hz)')
