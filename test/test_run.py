@@ -61,11 +61,11 @@ def test_another_processor(refusal):
 
 
 def test_another_python(refusal):
-    assert 'CPython 3.9.2' in refusal('demo', tool='python3', script='echo CPython 3.9.2')
+    assert 'cpython 3.9.2' in refusal('demo', tool='python3', script='echo cpython 3.9.2')
 
 
 def test_python_without_its_venv_module(refusal):
-    script = 'case "$2" in *ensurepip*) exit 1 ;; esac; echo CPython 3.12.3'
+    script = 'case "$2" in *ensurepip*) exit 1 ;; esac; echo cpython 3.12.3'
     assert 'apt install python3-venv' in refusal('demo', tool='python3', script=script)
 
 
