@@ -1,0 +1,106 @@
+"""What a machine's vibration is made of: orders of its shafts, and local faults."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
+
+ComplexArray = NDArray[np.complex128]
+
+MAX_WIDTH = 0.15  # beyond it the fault's neighbours of the next revolution would count
+
+
+@dataclass(frozen=True)
+class Component:
+    """
+    A sinusoid locked to a shaft: amplitude x cos(2 pi order x angle + phase) on every channel.
+
+    `order` in multiples of the shaft, peak `amplitudes` and `phases` (rad) one per channel.
+    """
+
+    shaft: str
+    order: float
+    amplitudes: tuple[float, ...]
+    phases: tuple[float, ...]
+
+    @property
+    def phasor(self) -> ComplexArray:
+        """Return the complex amplitude of each channel."""
+        return np.asarray(np.array(self.amplitudes) * np.exp(1j * np.array(self.phases)))
+
+
+@dataclass(frozen=True)
+class ChippedTooth:
+    """
+    A burst once a revolution of a shaft, where the broken tooth passes.
+
+    It is amplitude x exp(-x^2/2) x cos(2 pi order (angle - place)), x = (angle - place) / `width`,
+    so that an order of the mesh is weakened or strengthened over `width` revolutions around
+    `place`. The order is whole and the width at most 0.15.
+    """
+
+    shaft: str
+    order: int
+    amplitudes: tuple[float, ...]
+    width: float = 0.02
+    place: float = 0.5
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        if self.order != int(self.order) or self.order < 0:
+            raise ParameterError(f'order {self.order} of a chipped tooth: must be a whole number')
+        if not 0 < self.width <= MAX_WIDTH:
+            raise ParameterError(f'width {self.width} of a chipped tooth: must be positive and at '
+                                 f'most {MAX_WIDTH} revolutions')
+
+    def burst(self, angle: FloatArray) -> FloatArray:
+        """Return the burst of unit amplitude at some angles of the shaft, revolutions."""
+        near = (angle - self.place + 0.5) % 1.0 - 0.5
+        window = sum(np.exp(-0.5 * ((near + turn) / self.width) ** 2) for turn in (-1, 0, 1))
+        return np.asarray(window * np.cos(2.0 * np.pi * self.order * near))
+
+    def phasor(self, order: float) -> ComplexArray:
+        """Return the complex amplitude of each channel at an order of the shaft."""
+        if order != round(order):
+            return np.zeros(len(self.amplitudes), dtype=np.complex128)
+        lines = sum(np.exp(-2.0 * (np.pi * self.width * (order + sign * self.order)) ** 2)
+                    for sign in (-1, 1)) * self.width * np.sqrt(2.0 * np.pi)
+        twin = 0.5 if order == 0 else 1.0
+        turn = np.exp(-2j * np.pi * order * self.place)
+        return np.asarray(np.array(self.amplitudes) * twin * lines * turn)
+
+
+def mesh(shaft: str, teeth: int, *, harmonics: Sequence[float] = (1.0, 0.5, 0.25),
+         channel_gains: Sequence[float] = (1.0,), sidebands: Mapping[float, float] | None = None,
+         seed: int = 0) -> tuple[Component, ...]:
+    """
+    Return the components of a gear mesh with random phases.
+
+    Parameters
+    ----------
+    shaft
+        Shaft of the gear.
+    teeth
+        Of the gear: the mesh order.
+    harmonics
+        Peak amplitudes of the mesh order and its multiples.
+    channel_gains
+        Factor on each channel.
+    sidebands
+        Distance in orders from each harmonic, with the amplitude relative to it, on either side.
+    seed
+        Of the phases.
+
+    """
+    lines = [(teeth * (k + 1.0), amplitude) for k, amplitude in enumerate(harmonics)]
+    lines += [(order + side * distance, relative * amplitude) for order, amplitude in list(lines)
+              for distance, relative in (sidebands or {}).items() for side in (-1, 1)]
+    stream = RandomStream(seed, f'mesh {shaft} {teeth}', rows=len(channel_gains))
+    phases = 2.0 * np.pi * stream.uniform(0, len(lines))
+    return tuple(
+        Component(shaft, order, tuple(amplitude * gain for gain in channel_gains),
+                  tuple(phases[:, k].tolist()))
+        for k, (order, amplitude) in enumerate(lines))

@@ -1,0 +1,84 @@
+"""What an effect is: one hook of `Effect` overridden, and what it may know of its machine."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.simulation.motion import Motion
+from sa_jitter_ros.simulation.random_streams import FloatArray
+from sa_jitter_ros.simulation.sinusoids import band_limited, NOTHING, SinusoidSum
+
+IndexArray = NDArray[np.int64]
+Signal = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """
+    What an effect may know of its machine.
+
+    `trigger_rate` is the nominal rate of trigger cycles in Hz, `motion` that of the tach shaft.
+    """
+
+    seed: int
+    sample_rate: float
+    channels: int
+    pulses_per_revolution: int
+    trigger_rate: float
+    motion: Motion
+
+
+class Effect:
+    """An effect that does nothing; the base of all."""
+
+    def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
+        """Return a relative fluctuation of the speed."""
+        return NOTHING
+
+    def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
+        """Return what is added to a shaft's angle as its vibration shows it, rad."""
+        return 0.0
+
+    def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
+        """Return a factor on the vibration of a shaft."""
+        return 1.0
+
+    def sampled(self, setting: Setting, signal: Signal, start: int,
+                stop: int) -> FloatArray | None:
+        """Return `channel` x `sample` of a signal, None to leave the sampling to others."""
+        return None
+
+    def added(self, setting: Setting, start: int, stop: int) -> FloatArray | float:
+        """Return what is added to samples `start` to `stop`, `channel` x `sample`."""
+        return 0.0
+
+    def pulse_delay(self, setting: Setting, index: IndexArray,
+                    times: FloatArray) -> FloatArray | float:
+        """Return the delay in s of the pulses `index`, which are due at `times`."""
+        return 0.0
+
+    def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
+        """Return the times as the clock of the keyphasor's acquisition gives them."""
+        return times
+
+    def kept(self, setting: Setting, index: IndexArray) -> NDArray[np.bool_]:
+        """Return which pulses are seen."""
+        return np.ones(index.shape, dtype=np.bool_)
+
+
+def slow_process(setting: Setting, std: float, name: str) -> SinusoidSum:
+    """Return a random function of time, band-limited well below half the trigger rate."""
+    rate = setting.trigger_rate
+    return band_limited(std=std, band=(0.02 * rate, 0.4 * rate), seed=setting.seed, name=name)
+
+
+def require_number(name: str, value: float, *, minimum: float = -math.inf,
+                   below: float = math.inf, above: float = -math.inf) -> None:
+    """Raise ParameterError unless `value` is finite, at least `minimum`, `above` and `below`."""
+    if not (math.isfinite(value) and minimum <= value < below and value > above):
+        limits = [f'{text} {limit:g}' for text, limit in (
+            ('at least', minimum), ('above', above), ('below', below)) if math.isfinite(limit)]
+        raise ParameterError(f'{name} {value}: must be {" and ".join(["finite", *limits])}')

@@ -1,0 +1,264 @@
+"""
+A gearbox whose truth is known: vibration and keyphasor pulses, exact at the true angle.
+
+Samples and pulses depend on the seed and their number only, never on the blocks they are read in:
+they are evaluated in chunks at fixed places, one of which is held.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
+import math
+from operator import add
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.simulation.components import ChippedTooth, ComplexArray, Component
+from sa_jitter_ros.simulation.effect import Effect, require_number, Setting
+from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
+from sa_jitter_ros.simulation.motion import Motion, Torsion
+from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
+from sa_jitter_ros.simulation.sinusoids import NOTHING, SinusoidSum
+
+CHUNK = 4096
+_PULSE_MARGIN = 3  # pulses beyond a window whose errors may carry them into it
+
+
+@dataclass(frozen=True, eq=False)
+class Gearbox:
+    """
+    A gearbox turned by its tach shaft.
+
+    Sample k is taken at k / `sample_rate`; the tach shaft passes angle 0, which is pulse 0,
+    shortly after time 0. The angle of a shaft is its ratio times that of the tach shaft.
+
+    Parameters
+    ----------
+    components
+        What the vibration consists of.
+    sample_rate
+        Of the vibration, Hz.
+    shafts
+        Speed of each shaft over that of the tach shaft.
+    speed
+        Speed profile of the tach shaft: pairs of time (s) and speed (Hz), linear between them.
+    fluctuation
+        Relative random speed fluctuation, as from `band_limited`.
+    torsion
+        Twists of the tach shaft.
+    keyphasor
+        The target and the waveform of its probe.
+    faults
+        Chipped teeth.
+    effects
+        What else happens, in this order: declared jitter and noise, undeclared effects.
+    seed
+        Of all that is random.
+
+    Raises
+    ------
+    ParameterError
+        If the parts do not fit each other.
+
+    """
+
+    components: Sequence[Component]
+    sample_rate: float
+    shafts: Mapping[str, float] = field(default_factory=lambda: {'shaft': 1.0})
+    speed: Sequence[tuple[float, float]] = ((0.0, 25.0),)
+    fluctuation: SinusoidSum = NOTHING
+    torsion: Sequence[Torsion] = ()
+    keyphasor: Keyphasor = field(default_factory=Keyphasor)
+    faults: Sequence[ChippedTooth] = ()
+    effects: Sequence[Effect] = ()
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit."""
+        require_number('sample_rate', self.sample_rate, above=0)
+        for name, ratio in self.shafts.items():
+            require_number(f'ratio of shaft {name}', ratio, above=0)
+        parts = self._parts
+        for part in parts:
+            if part.shaft not in self.shafts:
+                raise ParameterError(f'no shaft {part.shaft!r}: there are '
+                                     f'{", ".join(self.shafts)}')
+        sizes = {len(part.amplitudes) for part in parts} | {
+            len(component.phases) for component in self.components}
+        if len(sizes) != 1 or 0 in sizes:
+            raise ParameterError(f'components of {sorted(sizes)} channels: must all be of one '
+                                 'number')
+        self.setting  # noqa: B018 (an impossible motion must fail here)
+
+    @property
+    def _parts(self) -> tuple[Component | ChippedTooth, ...]:
+        return (*self.components, *self.faults)
+
+    @property
+    def channels(self) -> int:
+        """Return the number of vibration channels."""
+        return len(self._parts[0].amplitudes)
+
+    @cached_property
+    def setting(self) -> Setting:
+        """Return what the effects may know of this machine."""
+        keyphasor = self.keyphasor
+        motion = Motion(self.speed, self.fluctuation, self.torsion,
+                        -0.25 / keyphasor.pulses_per_revolution)
+        rate = motion.nominal_speed * keyphasor.pulses_per_revolution / keyphasor.trigger_pulses
+        setting = Setting(self.seed, self.sample_rate, self.channels,
+                          keyphasor.pulses_per_revolution, rate, motion)
+        terms = [effect.speed_fluctuation(setting) for effect in self.effects]
+        fluctuation = reduce(add, terms, self.fluctuation)
+        return replace(setting, motion=replace(motion, fluctuation=fluctuation))
+
+    # --- truth ------------------------------------------------------------------------------
+
+    def angle(self, times: FloatArray, shaft: str | None = None) -> FloatArray:
+        """Return the true angle of a shaft (None: the tach shaft) at `times` (s), revolutions."""
+        return (1.0 if shaft is None else self.shafts[shaft]) * self.setting.motion.angle(times)
+
+    def shaft_speed(self, times: FloatArray, shaft: str | None = None) -> FloatArray:
+        """Return the true speed of a shaft (None: the tach shaft) at `times` (s), Hz."""
+        return (1.0 if shaft is None else self.shafts[shaft]) * self.setting.motion.speed(times)
+
+    def amplitude(self, order: float, shaft: str) -> ComplexArray:
+        """
+        Return the true complex amplitude of an order of a shaft, one per channel.
+
+        Peak amplitude and phase of a cosine of the shaft's true angle, without effects; components
+        of all shafts that turn at this order count.
+        """
+        total = np.zeros(self.channels, dtype=np.complex128)
+        for component in self.components:
+            own = component.order * self.shafts[component.shaft] / self.shafts[shaft]
+            if math.isclose(own, order, rel_tol=1e-9):
+                total += component.phasor
+        for fault in self.faults:
+            own = order * self.shafts[shaft] / self.shafts[fault.shaft]
+            whole = round(own)
+            total += fault.phasor(whole if math.isclose(own, whole, rel_tol=1e-9) else own)
+        return total
+
+    # --- signals ----------------------------------------------------------------------------
+
+    def vibration(self, start: int, stop: int) -> FloatArray:
+        """Return samples `start` to `stop`, `channel` x `sample`."""
+        return self._vibration.read(start, stop)
+
+    def blocks(self, stop: int, samples_per_block: int = CHUNK) -> Iterator[FloatArray]:
+        """Iterate over the first `stop` samples in `channel` x `sample` blocks."""
+        for start in range(0, stop, samples_per_block):
+            yield self.vibration(start, min(start + samples_per_block, stop))
+
+    def tach_waveform(self, start: int, stop: int) -> FloatArray:
+        """Return samples `start` to `stop` of the keyphasor's waveform, taken at its own rate."""
+        return np.asarray(self._waveform.read(start, stop)[0])
+
+    def pulses(self, start: float, stop: float) -> Pulses:
+        """Return the pulses measured from time `start` (s) on and before `stop`, in order."""
+        pulses, kept = self._pulses_around(start, stop)
+        found = np.flatnonzero(kept & (pulses.index >= 0) & (pulses.times >= start)
+                               & (pulses.times < stop))
+        found = found[np.argsort(pulses.times[found], kind='stable')]
+        return Pulses(pulses.index[found], pulses.times[found], pulses.true_times[found])
+
+    def _pulses_around(self, start: float, stop: float) -> tuple[Pulses, NDArray[np.bool_]]:
+        """Return consecutive pulses that reach beyond a window, and which of them are seen."""
+        setting, count = self.setting, self.keyphasor.pulses_per_revolution
+        edges = np.array([start, stop])
+        slack = 2.0 * float(np.abs(self._observed(edges) - edges).max())
+        low, high = count * setting.motion.angle(np.array([start - slack, stop + slack]))
+        index = np.arange(math.floor(low) - _PULSE_MARGIN, math.ceil(high) + _PULSE_MARGIN + 1)
+        true_times = setting.motion.time_at(index / count)
+        delay = sum((effect.pulse_delay(setting, index, true_times) for effect in self.effects),
+                    start=np.zeros(index.size))
+        kept = np.ones(index.size, dtype=np.bool_)
+        for effect in self.effects:
+            kept &= effect.kept(setting, index)
+        return Pulses(index, self._observed(true_times + delay), true_times), kept
+
+    def _observed(self, times: FloatArray) -> FloatArray:
+        for effect in self.effects:
+            times = effect.observed(self.setting, times)
+        return times
+
+    @cached_property
+    def _vibration(self) -> '_Chunks':
+        return _Chunks(self._vibration_chunk)
+
+    @cached_property
+    def _waveform(self) -> '_Chunks':
+        return _Chunks(self._waveform_chunk)
+
+    def _vibration_chunk(self, start: int, stop: int) -> FloatArray:
+        samples = None
+        for effect in self.effects:
+            if samples is None:
+                samples = effect.sampled(self.setting, self._signal, start, stop)
+        if samples is None:
+            samples = self._signal(np.arange(start, stop) / self.sample_rate)
+        for effect in self.effects:
+            samples = samples + effect.added(self.setting, start, stop)
+        return samples
+
+    def _signal(self, times: FloatArray) -> FloatArray:
+        """Return the vibration at any times: the sum of all components at the true angle."""
+        total = np.zeros((self.channels, times.size))
+        tach_angle = self.setting.motion.angle(times)
+        for shaft, ratio in self.shafts.items():
+            components = [item for item in self.components if item.shaft == shaft]
+            faults = [item for item in self.faults if item.shaft == shaft]
+            if not components and not faults:
+                continue
+            wander = sum(effect.source_angle(self.setting, shaft, times)
+                         for effect in self.effects)
+            angle = ratio * tach_angle + wander / (2.0 * np.pi)
+            own = np.zeros_like(total)
+            if components:
+                cycles = np.multiply.outer([item.order for item in components], angle)
+                phasors = np.exp(2j * np.pi * (cycles % 1.0))
+                own += (np.array([item.phasor for item in components]).T @ phasors).real
+            for fault in faults:
+                own += np.multiply.outer(fault.amplitudes, fault.burst(angle))
+            for effect in self.effects:
+                own *= effect.gain(self.setting, shaft, times)
+            total += own
+        return total
+
+    def _waveform_chunk(self, start: int, stop: int) -> FloatArray:
+        keyphasor, motion = self.keyphasor, self.setting.motion
+        times = np.arange(start, stop) / keyphasor.rate
+        pulses, kept = self._pulses_around(times[0], times[-1])
+        # Between two pulses the waveform is late by what the line between their errors says.
+        true_times = times - np.interp(times, pulses.times, pulses.errors)
+        phase = keyphasor.pulses_per_revolution * motion.angle(true_times)
+        pulse = np.floor(phase + 0.25)
+        seen = kept[np.clip(pulse - pulses.index[0], 0, kept.size - 1).astype(np.int64)]
+        # A missing pulse leaves the waveform where it is just before one: low, or in the middle.
+        within = np.where(seen, phase - pulse, 0.0 if keyphasor.waveform == 'sine' else 0.74)
+        rate = keyphasor.pulses_per_revolution * motion.speed(true_times)
+        waveform = keyphasor.shape(within, np.maximum(rate, np.finfo(float).tiny))
+        noise = RandomStream(self.seed, 'keyphasor noise').normal(start, stop)
+        return waveform + keyphasor.noise_std * noise
+
+
+class _Chunks:
+    """Reads any stretch from chunks at fixed places, and holds the last chunk."""
+
+    def __init__(self, evaluate: Callable[[int, int], FloatArray]) -> None:
+        self._evaluate = evaluate
+        self._number: int | None = None
+        self._held = np.empty((0, 0))
+
+    def read(self, start: int, stop: int) -> FloatArray:
+        if not 0 <= start <= stop:
+            raise ParameterError(f'samples {start} to {stop}: must be 0 <= start <= stop')
+        pieces = []
+        for number in range(start // CHUNK, max(-(-stop // CHUNK), start // CHUNK + 1)):
+            if number != self._number:
+                self._held = self._evaluate(number * CHUNK, (number + 1) * CHUNK)
+                self._number = number
+            pieces.append(self._held[:, max(start - number * CHUNK, 0):stop - number * CHUNK])
+        return np.concatenate(pieces, axis=1)

@@ -1,0 +1,101 @@
+"""The keyphasor: pulses with known errors, and the waveform they are detected from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.simulation.effect import IndexArray, require_number
+from sa_jitter_ros.simulation.random_streams import FloatArray
+
+WAVEFORMS = ('ttl', 'sine')
+
+
+@dataclass(frozen=True, eq=False)
+class Pulses:
+    """
+    Pulses as they were measured, and the truth about them.
+
+    Pulse `index` is due at `true_times` (s), where the tach shaft has turned by `index` pulses; it
+    was measured at `times`, `errors` later.
+    """
+
+    index: IndexArray
+    times: FloatArray
+    true_times: FloatArray
+
+    @property
+    def errors(self) -> FloatArray:
+        """Return the pulse errors, measured minus true time, s."""
+        return self.times - self.true_times
+
+
+@dataclass(frozen=True)
+class Keyphasor:
+    """
+    A target with evenly spaced marks and the signal of its probe.
+
+    Parameters
+    ----------
+    pulses_per_revolution
+        Marks on the target.
+    pulses_per_trigger
+        Pulses of a trigger cycle; None for a whole revolution.
+    rate
+        Sampling rate of the waveform, Hz.
+    waveform
+        'ttl': low, and high from a pulse on for `duty` of a pulse's cycle; 'sine': one period a
+        pulse, which rises through the middle level at the pulse.
+    low, high
+        Levels.
+    duty
+        Share of the cycle that is high, up to 0.6.
+    rise_time
+        Of the edges, s; the pulse lies at half of it.
+    noise_std
+        White noise on the waveform, in units of the levels.
+
+    """
+
+    pulses_per_revolution: int = 1
+    pulses_per_trigger: int | None = None
+    rate: float = 50_000.0
+    waveform: str = 'ttl'
+    low: float = 0.0
+    high: float = 5.0
+    duty: float = 0.2
+    rise_time: float = 0.0
+    noise_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('pulses_per_revolution', self.pulses_per_revolution, minimum=1)
+        require_number('pulses_per_trigger', self.trigger_pulses, minimum=1)
+        require_number('keyphasor rate', self.rate, above=0)
+        require_number('duty', self.duty, above=0, below=0.6)
+        require_number('rise_time', self.rise_time, minimum=0)
+        require_number('keyphasor noise_std', self.noise_std, minimum=0)
+        if self.waveform not in WAVEFORMS:
+            raise ParameterError(f'keyphasor waveform {self.waveform!r}: must be one of '
+                                 f'{", ".join(WAVEFORMS)}')
+
+    @property
+    def trigger_pulses(self) -> int:
+        """Return the number of pulses of a trigger cycle."""
+        return self.pulses_per_trigger or self.pulses_per_revolution
+
+    def shape(self, phase: FloatArray, pulse_rate: FloatArray) -> FloatArray:
+        """
+        Return the noiseless waveform.
+
+        `phase` counts from 0 at a pulse to 1 at the next, and may start a quarter below;
+        `pulse_rate` is its rate in Hz.
+        """
+        middle = (self.low + self.high) / 2.0
+        if self.waveform == 'sine':
+            return middle + (self.high - self.low) / 2.0 * np.sin(2.0 * np.pi * phase)
+        edge = np.minimum(phase, self.duty - phase) / pulse_rate  # s inside the pulse
+        if self.rise_time > 0.0:
+            level = np.clip(0.5 + edge / self.rise_time, 0.0, 1.0)
+        else:
+            level = (edge >= 0.0).astype(np.float64)
+        return self.low + (self.high - self.low) * level

@@ -1,0 +1,168 @@
+"""
+How the tach shaft turns: speed profile, random fluctuation and torsion, exactly invertible.
+
+The angle is a chain of increasing maps, angle(t) = torsion(profile(warp(t))), each with an exact
+derivative, so that both the angle of any time and the time of any angle hold to rounding.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.simulation.random_streams import FloatArray
+from sa_jitter_ros.simulation.sinusoids import NOTHING, SinusoidSum
+
+MAX_FLUCTUATION = 0.9  # a bound ten standard deviations out, never reached
+MAX_TORSION = 0.5
+_PICARD_STEPS = 6
+_NEWTON_STEPS = 6
+
+
+@dataclass(frozen=True)
+class Torsion:
+    """
+    A twist of the tach shaft locked to its angle: `amplitude` rad, `order` times a revolution.
+
+    `phase` in rad, of a sine.
+    """
+
+    order: float
+    amplitude: float
+    phase: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """
+    The turning of the tach shaft.
+
+    Parameters
+    ----------
+    points
+        Speed profile: times (s, from 0, increasing) and speeds (Hz, not negative), linear between
+        them and constant after the last one (which also holds before time 0).
+    fluctuation
+        Relative speed fluctuation as a function of time.
+    torsion
+        Twists of the shaft.
+    start_angle
+        Angle at time 0, revolutions.
+
+    Raises
+    ------
+    ParameterError
+        If the profile is no profile or the shaft would turn backwards.
+
+    """
+
+    points: Sequence[tuple[float, float]]
+    fluctuation: SinusoidSum = NOTHING
+    torsion: Sequence[Torsion] = ()
+    start_angle: float = 0.0
+    _times: FloatArray = field(init=False, repr=False)
+    _speeds: FloatArray = field(init=False, repr=False)
+    _angles: FloatArray = field(init=False, repr=False)
+    _warp: SinusoidSum = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check that the shaft turns forwards and sum up the profile."""
+        points = np.array(self.points, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise ParameterError(f'speed profile {self.points}: give pairs of time in s and '
+                                 'speed in Hz')
+        times, speeds = np.ascontiguousarray(points.T)
+        if times[0] != 0 or (np.diff(times) <= 0).any():
+            raise ParameterError(f'times {times.tolist()} of the speed profile: must increase '
+                                 'from 0')
+        if (speeds < 0).any() or speeds[-1] == 0:
+            raise ParameterError(f'speeds {speeds.tolist()} Hz: must not be negative, nor the '
+                                 'last one 0')
+        if self.fluctuation.bound > MAX_FLUCTUATION:
+            raise ParameterError(
+                f'speed fluctuation may reach {self.fluctuation.bound:.3g} of the speed: at most '
+                f'{MAX_FLUCTUATION}; make it slower or smaller')
+        twist = sum(abs(item.order * item.amplitude) for item in self.torsion)
+        if not twist <= MAX_TORSION:
+            raise ParameterError(f'torsion changes the speed by {twist:.3g} of itself: at most '
+                                 f'{MAX_TORSION}')
+        steps = np.diff(times) * (speeds[1:] + speeds[:-1]) / 2.0
+        object.__setattr__(self, '_times', times)
+        object.__setattr__(self, '_speeds', speeds)
+        object.__setattr__(self, '_angles', np.concatenate([[0.0], np.cumsum(steps)]))
+        object.__setattr__(self, '_warp', self.fluctuation.integral())
+
+    @property
+    def nominal_speed(self) -> float:
+        """Return the speed that the profile ends with, Hz."""
+        return float(self._speeds[-1])
+
+    def angle(self, times: FloatArray) -> FloatArray:
+        """Return the tach shaft's angle in revolutions."""
+        return self._twisted(self._profile(self._warped(times)))
+
+    def speed(self, times: FloatArray) -> FloatArray:
+        """Return the tach shaft's speed in Hz: the exact derivative of the angle."""
+        warped = self._warped(times)
+        twist = self._twist_slope(self._profile(warped))
+        return self._profile_speed(warped) * (1.0 + self.fluctuation.value(times)) * twist
+
+    def time_at(self, angles: FloatArray) -> FloatArray:
+        """Return the time at which the tach shaft has an angle (revolutions)."""
+        if self.torsion:
+            angles = _invert(self._twisted, self._twist_slope, angles)
+        warped = self._profile_time(angles)
+        if not self._warp.amplitudes.size:
+            return warped
+        return _invert(self._warped, lambda times: 1.0 + self.fluctuation.value(times), warped)
+
+    def _warped(self, times: FloatArray) -> FloatArray:
+        return times + self._warp.value(times) - self._warp.value(np.zeros(()))
+
+    def _twisted(self, angles: FloatArray) -> FloatArray:
+        return angles + sum(
+            item.amplitude * np.sin(2.0 * np.pi * item.order * angles + item.phase)
+            for item in self.torsion) / (2.0 * np.pi)
+
+    def _twist_slope(self, angles: FloatArray) -> FloatArray:
+        return np.ones_like(angles) + sum(
+            item.amplitude * item.order * np.cos(2.0 * np.pi * item.order * angles + item.phase)
+            for item in self.torsion)
+
+    def _segment(self, values: FloatArray, starts: FloatArray) -> NDArray[np.intp]:
+        return np.clip(np.searchsorted(starts, values, side='right') - 1, 0, starts.size - 1)
+
+    def _profile_speed(self, times: FloatArray) -> FloatArray:
+        return np.interp(times, self._times, self._speeds, left=self.nominal_speed)
+
+    def _profile(self, times: FloatArray) -> FloatArray:
+        at = self._segment(times, self._times)
+        after = times - self._times[at]
+        mean_speed = (self._speeds[at] + self._profile_speed(times)) / 2.0
+        mean_speed = np.where(after < 0.0, self.nominal_speed, mean_speed)
+        return np.asarray(self.start_angle + self._angles[at] + after * mean_speed)
+
+    def _profile_time(self, angles: FloatArray) -> FloatArray:
+        angles = angles - self.start_angle
+        at = self._segment(angles, self._angles)
+        begin, left = self._speeds[at], angles - self._angles[at]
+        slopes = np.append(np.diff(self._speeds) / np.diff(self._times), 0.0)
+        end = np.sqrt(np.maximum(begin**2 + 2.0 * slopes[at] * left, 0.0))
+        mean_speed = np.where(left < 0.0, self.nominal_speed, (begin + end) / 2.0)
+        return np.asarray(self._times[at] + left / np.where(left == 0.0, 1.0, mean_speed))
+
+
+def _invert(function: Callable[[FloatArray], FloatArray],
+            slope: Callable[[FloatArray], FloatArray], values: FloatArray) -> FloatArray:
+    """
+    Return where a function with slopes of 0.5 to 1.5 takes `values`.
+
+    Steps of slope 1 halve the error at least and bring Newton's method home. Their number is
+    fixed: the result for a value must not depend on the other values.
+    """
+    places = np.array(values)
+    for step in range(_PICARD_STEPS + _NEWTON_STEPS):
+        error = function(places) - values
+        places -= error if step < _PICARD_STEPS else error / slope(places)
+    return places
