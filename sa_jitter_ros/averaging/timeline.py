@@ -124,16 +124,22 @@ class Stretch:
         return count
 
 
+def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
+    """Whether channels are as many and rates (Hz) equal to rounding."""
+    return (layout is not None and layout[0] == other[0]
+            and math.isclose(layout[1], other[1], rel_tol=1e-9))
+
+
 @dataclass
 class VibrationTimeline:
     """
     Takes blocks in any order of arrival and keeps `stretches` of consecutive samples.
 
-    A header time more than half a sample off the clock of its run is counted, more than
-    `time_tolerance` (s) starts a new run. A block that lies wholly before the last one's start is
-    held back until the next block tells: one that continues it makes a restart of the source, any
-    other a repeated or stray block, which is dropped. `epoch` counts the times that time ran back;
-    `previous_end` is where (s) it last did.
+    A header time more than half a sample off the clock of its run is counted. A block that is off
+    by more than `time_tolerance` (s), lies wholly before the last one's start or contradicts the
+    last one's samples is held back: if the next block continues it, it begins a new run, otherwise
+    it is dropped. A new run from before the old one's end is a restart; `epoch` counts those,
+    `previous_end` is where (s) the latest happened.
     """
 
     time_tolerance: float = 0.01
@@ -147,6 +153,7 @@ class VibrationTimeline:
     _suspect: SampleBlock | None = None
     _odd: tuple[int, float] | None = None
     _clock: Clock | None = None
+    _gap: tuple[int, float] = (0, np.inf)
 
     @property
     def layout(self) -> tuple[int, float] | None:
@@ -158,7 +165,8 @@ class VibrationTimeline:
     @property
     def end_time(self) -> float:
         """Time of the newest sample, minus infinity before the first."""
-        return self.stretches[-1].end_time if self.stretches else -np.inf
+        last = self._last
+        return self._clock.time_of(last.end_index - 1) if last and self._clock else -np.inf
 
     def add(self, block: SampleBlock) -> None:
         """Take a block; raises `SignalError` for one that cannot be used, which is counted."""
@@ -168,29 +176,25 @@ class VibrationTimeline:
             self.counts.blocks_rejected += 1
             self.counts.samples_dropped += block.samples.shape[-1] if block.samples.ndim else 0
             raise
-        last = self._last
-        if last is None or self._clock is None or changed:
-            self._new_run(block, restart=last is not None)
-            return
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
-            if block.index == suspect.end_index and abs(
-                    block.start_time - suspect.start_time
-                    - suspect.samples.shape[1] / suspect.sample_rate) <= self.time_tolerance:
-                self._new_run(suspect, restart=True)
-                last = suspect
+            if not changed and self._follows(suspect, block):
+                self._new_run(suspect)
             else:
-                self._drop(suspect, 'is repeated or out of order')
-        if block.index < last.index and block.start_time < last.start_time:
+                self._drop(suspect, 'are repeated or out of order')
+        if self._last is None or changed:
+            self._new_run(block)
+        elif self._doubtful(block):
             self._suspect = block
-            return
-        self._continue(block)
+        else:
+            self._continue(block)
 
     def confirm_restart(self) -> None:
-        """Take a held-back block for a restart: the pulses have run back as well."""
-        if self._suspect is not None:
-            suspect, self._suspect = self._suspect, None
-            self._new_run(suspect, restart=True)
+        """Take a block that is held back for a restart: the pulses have run back as well."""
+        suspect = self._suspect
+        if suspect is not None and suspect.start_time <= self.end_time:
+            self._suspect = None
+            self._new_run(suspect)
 
     def release(self, epoch: int, before: float) -> None:
         """Forget the samples before the time `before` (s) of `epoch`: they were used."""
@@ -231,18 +235,17 @@ class VibrationTimeline:
         """Whether the source changed its layout for good; raises `SignalError` on a bad block."""
         samples = block.samples
         if samples.ndim != 2 or samples.size == 0:
-            raise SignalError(f'block of shape {samples.shape}: send channel x sample, at least '
-                              'one of each')
+            raise SignalError(f'block of shape {samples.shape}: send channel x sample, not empty')
         if not (np.isfinite(block.start_time) and np.isfinite(block.sample_rate)
                 and block.sample_rate > 0.0):
             raise SignalError(f'block at {block.start_time} s with {block.sample_rate} Hz: send a '
                               'finite time and a positive rate')
         layout = samples.shape[0], block.sample_rate
-        if self.layout is None or layout == self.layout:
+        if self.layout is None or _alike(self.layout, layout):
             self._odd = None
             return False
         # One odd block is a fault; a second one in a row is a source that changed.
-        if layout == self._odd:
+        if _alike(self._odd, layout):
             self._odd = None
             return True
         self._odd = layout
@@ -250,45 +253,66 @@ class VibrationTimeline:
             f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} '
             f'at {self.layout[1]:g} Hz: keep both, or restart the source')
 
-    def _drop(self, block: SampleBlock, why: str) -> None:
-        self.counts.repeats += 1
-        self.counts.samples_dropped += block.samples.shape[1]
-        self.messages.append(f'block of samples {block.index} to {block.end_index - 1} {why}: '
-                             'dropped')
+    def _follows(self, block: SampleBlock, following: SampleBlock) -> bool:
+        expected = block.start_time + block.samples.shape[1] / block.sample_rate
+        return (following.index == block.end_index
+                and abs(following.start_time - expected) <= self.time_tolerance)
 
-    def _new_run(self, block: SampleBlock, *, restart: bool) -> None:
-        self._close()
-        if restart:
-            self.previous_end = self.end_time
-            self.epoch += 1
-            self.counts.restarts += 1
-            self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
-                                 f'{block.index}')
-        self._clock = Clock(block.start_time, block.index, block.sample_rate)
-        self._store(block.samples, block.index)
-        self._last = block
-
-    def _continue(self, block: SampleBlock) -> None:
-        assert self._last is not None
-        assert self._clock is not None
-        expected = self._last.end_index
+    def _doubtful(self, block: SampleBlock) -> bool:
+        """Whether a block must wait for the next one to tell what it is."""
+        assert self._last is not None and self._clock is not None
+        last = self._last
+        if block.index < last.index and block.start_time < last.start_time:
+            return True
         deviation = block.start_time - self._clock.time_of(block.index)
         if abs(deviation) > self.time_tolerance:
             self.counts.clock_deviation += 1
             self.messages.append(
                 f'time of sample {block.index} is {deviation:+.6g} s off (limit '
-                f'{self.time_tolerance:g} s): new run')
-            back = block.start_time <= self.end_time
-            self._new_run(block, restart=back)
-            return
+                f'{self.time_tolerance:g} s): new run if the next block continues it')
+            return True
+        # Other samples under the same indices are those of a source that started again.
+        start, end = max(block.index, last.index), min(block.end_index, last.end_index)
+        return start < end and not np.array_equal(
+            block.samples[:, start - block.index:end - block.index],
+            last.samples[:, start - last.index:end - last.index], equal_nan=True)
+
+    def _drop(self, block: SampleBlock, why: str) -> None:
+        self.counts.repeats += 1
+        self.counts.samples_dropped += block.samples.shape[1]
+        self.messages.append(f'samples {block.index} to {block.end_index - 1} {why}: dropped')
+
+    def _new_run(self, block: SampleBlock) -> None:
+        self._close()
+        if self._last is not None and (
+                block.start_time <= self.end_time
+                    or not _alike(self.layout, (len(block.samples), block.sample_rate))):
+            # Samples in the latest gap tell that it was the jump ahead which was wrong.
+            index, before = self._gap
+            gap = block.index >= index and block.start_time > before
+            self.previous_end = before if gap else self.end_time
+            self.epoch += 1
+            self.counts.restarts += 1
+            self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
+                                 f'{block.index}')
+        self._clock = Clock(block.start_time, block.index, block.sample_rate)
+        self._gap = 0, np.inf
+        self._store(block.samples, block.index)
+        self._last = block
+
+    def _continue(self, block: SampleBlock) -> None:
+        assert self._last is not None and self._clock is not None
+        expected = self._last.end_index
+        deviation = block.start_time - self._clock.time_of(block.index)
         if abs(deviation) * block.sample_rate > 0.5:
             self.counts.clock_deviation += 1
         if block.end_index <= expected:
-            self._drop(block, 'was received before')
+            self._drop(block, 'were received before')
             return
         if block.index > expected:
             self.counts.gaps += 1
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
+            self._gap = expected, self.end_time
             self._close()
         # a block that overlaps what was received adds its new part only
         start = max(expected, block.index)
