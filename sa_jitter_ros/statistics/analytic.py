@@ -73,8 +73,8 @@ class LaguerreLaw:
     The Laguerre expansion of the law of |X|^2, one entry per order (Eqs. 53-63, corrected).
 
     A gamma density of shape `shape` and scale `scale` times 1 + sum_i `weights[i]` q_i(y), y
-    standardised and q_i the Laguerre polynomials in it. In y nothing cancels; in x the shape of
-    2e5 that 100 cycles of small jitter have leaves no digit beyond degree 6.
+    standardised and q_i the Laguerre polynomials in it. In y nothing cancels; in x a shape of 2e5,
+    which 100 cycles of small jitter have, costs all digits beyond degree 6.
     """
 
     shape: Array
@@ -126,10 +126,12 @@ class LaguerreLaw:
         return np.array(values[:count])
 
 
-def laguerre_law(moments: AverageMoments, *, degree: int = 6) -> LaguerreLaw:
+def laguerre_law(moments: AverageMoments, *, degree: int = 4) -> LaguerreLaw:
     """
     Return the Laguerre expansion of the law of |X|^2 for a normal X with these moments.
 
+    At 100 cycles every degree improves it (2e-4 off at degree 4, 2e-5 at 10). At 20 cycles of
+    jitter below 0.4 cycles it diverges: degree 4 is the best, 0.005 off, degree 12 useless.
     Raises ParameterError for a degree below 2 (the gamma law itself).
     """
     if degree < 2:
@@ -165,8 +167,8 @@ def inversion_cdf(moments: AverageMoments, amplitude: ArrayLike) -> Array:
     """
     Return P(|X| <= amplitude) of a normal X by numerical inversion (Imhof 1961).
 
-    Shape (orders, k) for amplitudes of shape (k,) or (orders, k); a reference, good to 1e-8 and
-    slow where the jitter leaves little of the mean.
+    Shape (orders, k) for amplitudes of shape (k,) or (orders, k); a reference, good to 1e-12
+    as long as the mean is some standard deviations away from 0, to 1e-5 near 0.
     """
     y = np.atleast_2d(np.asarray(amplitude, float))
     y = np.broadcast_to(y, (moments.mean.size, y.shape[-1]))

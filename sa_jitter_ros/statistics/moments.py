@@ -106,10 +106,12 @@ class CycleMoments:
 
 def cycle_moments(
     orders: ArrayLike, processes: Sequence[AngleErrorProcess], *, nodes: int = NODES,
+    lags: int | None = None,
 ) -> CycleMoments:
     """
     Return the exact moments of single trigger cycles for orders of shape (n,).
 
+    `lags` is the largest lag wanted, by default the correlation length of the processes.
     With 64 nodes they are good to 1e-12 as long as the angle errors stay within a cycle of the
     order. Section 2 of the theory; Eqs. 30-37 of Camerini et al. 2019 as special cases.
     """
@@ -119,7 +121,8 @@ def cycle_moments(
     first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
     mean = first @ w
     variance, pseudo = [], []
-    for lag in range(correlation_length(processes) + 1):
+    length = correlation_length(processes)
+    for lag in range((length if lags is None else min(lags, length)) + 1):
         points = ([u[:, None], u], [0, lag])
         variance.append(joint_characteristic(processes, [plane, -plane], *points) @ w @ w
                         - np.abs(mean) ** 2)

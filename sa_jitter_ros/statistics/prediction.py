@@ -102,6 +102,7 @@ class DeclaredModel:
         _require('pulses_per_trigger', self.pulses_per_trigger,
                  self.pulses_per_trigger >= 0, '0 (all of a revolution) or above')
         require_cycles(self.trigger_cycles)
+        object.__setattr__(self, 'trigger_cycles', int(self.trigger_cycles))
         object.__setattr__(self, 'orders', tuple(require_orders(self.orders).tolist()))
         object.__setattr__(self, 'jitter_table', tuple(self.jitter_table))
         if self.jitter_distribution not in DISTRIBUTIONS:
@@ -217,7 +218,7 @@ def predict(
         moments = moments.scaled(gain).with_noise(noise)
         law = normal_law(moments)
     else:
-        cycles = cycle_moments(orders, everything, nodes=nodes)
+        cycles = cycle_moments(orders, everything, nodes=nodes, lags=model.trigger_cycles)
         moments = cycles.averaged(model.trigger_cycles).scaled(gain).with_noise(noise)
         law = normal_law(moments)
         lopsided = False

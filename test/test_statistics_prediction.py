@@ -1,0 +1,279 @@
+"""The prediction: declared models, every law, effects, design and detectability."""
+
+from dataclasses import replace
+import time
+
+import numpy as np
+import pytest
+from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw
+from sa_jitter_ros.statistics.angle_error import gaussian_pulse_jitter, GaussianAngleError
+from sa_jitter_ros.statistics.design import (
+    assess, design_grid, highest_order, required_keyphasor_rate, required_trigger_cycles,
+    trade_off)
+from sa_jitter_ros.statistics.detectability import detectability
+from sa_jitter_ros.statistics.distributions import Empirical, Normal, Triangular, Uniform
+from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
+from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
+from sa_jitter_ros.statistics.sampled_law import SampledLaw
+from scipy import stats
+
+MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=41,
+                      orders=(1.0, 19.0, 38.0), ratio=2.40789)
+SKEWED = tuple(np.random.default_rng(12).exponential(4e-5, 400))
+
+
+def simulate(model, order, iterations, seed):
+    """Amplitudes of one order of whole trigger cycles, noise included."""
+    signal = AveragedSignal(model.trigger_cycles, model.cycle_length, order)
+    noise = (4.0 * model.noise_std**2 / (model.sample_rate * model.duration)
+             if model.noise_std else 0.0)
+
+    class Scaled:
+        """The declared law in fundamental cycles."""
+
+        def draw(self, rng, shape):
+            return model.fundamental_frequency * model.distribution.draw(rng, shape)
+
+    return np.abs(monte_carlo(signal.whole_trigger_cycles, Scaled(), model.trigger_cycles,
+                              iterations, seed=seed, line_variance=noise))
+
+
+@pytest.mark.parametrize(('changes', 'order', 'bias'), [
+    ({}, 38.0, 0.004),
+    ({'ratio': 0.4137, 'trigger_cycles': 3, 'jitter_distribution': 'table',
+      'jitter_table': SKEWED, 'noise_std': 6.0, 'sample_rate': 5e4}, 200.0, 0.004),
+    ({'ratio': 5.8154, 'jitter_distribution': 'triangular', 'noise_std': 20.0,
+      'sample_rate': 5e4}, 16.0, 0.004),
+    ({'ratio': 5.8154, 'trigger_cycles': 1}, 16.0, 0.004),
+    ({'jitter_distribution': 'normal', 'jitter_std': 1e-4, 'trigger_cycles': 12}, 30.0, 0.012),
+    ({'jitter_distribution': 'table', 'jitter_table': SKEWED, 'trigger_cycles': 15}, 38.0, 0.004),
+    ({'jitter_distribution': 'table', 'jitter_table': SKEWED, 'trigger_cycles': 60}, 38.0, 0.02),
+    ({'pulses_per_revolution': 6, 'pulses_per_trigger': 2, 'trigger_cycles': 123}, 38.0, 0.004)])
+def test_prediction_agrees_with_an_independent_simulation(changes, order, bias):
+    model = replace(MODEL, orders=(0.5 * order, order), **changes)
+    prediction = predict(model)
+    draws = simulate(model, order, 20_000, seed=21)
+    root_n = np.sqrt(draws.size)
+    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[1]).statistic
+    assert distance < bias + 1.95 / root_n
+    assert prediction.mean_attenuation[1] == pytest.approx(
+        draws.mean(), abs=4.5 * draws.std() / root_n + 0.01 * draws.std())
+    assert prediction.standard_deviation[1] == pytest.approx(draws.std(), rel=0.03)
+    power = draws**2
+    exact = prediction.mean_attenuation**2 + prediction.variance
+    assert exact[1] == pytest.approx(power.mean(), abs=4.5 * power.std() / root_n)
+    np.testing.assert_allclose(exact, prediction.moments.mean_square, rtol=1e-9)
+    for name, level in (('quantile_05', 0.05), ('quantile_50', 0.5), ('quantile_95', 0.95)):
+        below = np.mean(draws <= getattr(prediction, name)[1])
+        tolerance = bias + 4.5 * np.sqrt(level * (1.0 - level)) / root_n
+        assert below == pytest.approx(level, abs=tolerance)
+
+
+def test_few_cycles_are_sampled_and_many_are_not():
+    assert isinstance(predict(replace(MODEL, trigger_cycles=3)).law, SampledLaw)
+    assert isinstance(predict(MODEL).law, AmplitudeLaw)
+    first, second = (predict(replace(MODEL, trigger_cycles=2)).quantile_50 for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+
+
+@pytest.mark.parametrize('changes', [
+    {}, {'trigger_cycles': 3}, {'jitter_distribution': 'table', 'jitter_table': SKEWED}])
+def test_64_orders_take_less_than_50_ms(changes):
+    model = replace(MODEL, orders=tuple(range(1, 65)), **changes)
+    times = []
+    for _ in range(5):
+        start = time.process_time()
+        predict(model)
+        times.append(time.process_time() - start)
+    assert min(times) < 0.05
+
+
+def test_declared_laws_and_lengths():
+    assert MODEL.distribution == Uniform(2e-4)
+    std = 1.0 / (np.sqrt(12.0) * 5000.0)
+    normal = replace(MODEL, jitter_distribution='normal')
+    assert normal.distribution == Normal(std)
+    assert replace(normal, jitter_std=3e-5).distribution == Normal(3e-5)
+    assert replace(MODEL, jitter_distribution='triangular').distribution == Triangular(std)
+    table = replace(MODEL, jitter_distribution='table', jitter_table=[1e-5, 3e-5])
+    assert isinstance(table.distribution, Empirical)
+    assert predict(table).header == (20.0, 5000.0, 41.0, 2.40789, pytest.approx(1e-5), 0.0)
+    six = replace(MODEL, pulses_per_revolution=6, pulses_per_trigger=2)
+    assert six.trigger_period == pytest.approx(1.0 / 60.0)
+    assert six.cycle_length == pytest.approx(2.40789 / 3.0)
+    assert replace(six, pulses_per_trigger=0).trigger_period == pytest.approx(0.05)
+    assert six.duration == pytest.approx(41.0 / 60.0)
+
+
+def test_noise_adds_to_the_mean_square_what_one_line_holds():
+    noisy = replace(MODEL, noise_std=2.0, sample_rate=5e4)
+    gained = predict(noisy).moments.mean_square - predict(MODEL).moments.mean_square
+    np.testing.assert_allclose(gained, 4.0 * 4.0 / (5e4 * MODEL.duration), rtol=1e-9)
+    assert np.all(predict(noisy).standard_deviation > predict(MODEL).standard_deviation)
+
+
+@pytest.mark.parametrize('cycles', [3, 41])
+def test_effects_enter_as_processes_offset_gain_and_noise(cycles):
+    model = replace(MODEL, trigger_cycles=cycles)
+    plain = predict(model)
+    half = predict(model, gain=0.5)
+    np.testing.assert_allclose(half.mean_attenuation, 0.5 * plain.mean_attenuation, rtol=1e-6)
+    np.testing.assert_allclose(half.quantile_05, 0.5 * plain.quantile_05, rtol=1e-5)
+    turned = predict(model, gain=1j)
+    np.testing.assert_allclose(turned.quantile_95, plain.quantile_95, rtol=1e-6)
+    loud = predict(model, line_variance=np.array([0.0, 0.1, 0.2]))
+    np.testing.assert_allclose(loud.moments.mean_square - plain.moments.mean_square,
+                               [0.0, 0.1, 0.2], atol=1e-12)
+    nothing = predict(model, offset=lambda u: np.zeros((cycles, u.size)))
+    np.testing.assert_allclose(nothing.moments.mean_square, plain.moments.mean_square, rtol=1e-12)
+    np.testing.assert_allclose(
+        nothing.mean_attenuation**2 + nothing.variance, plain.moments.mean_square, rtol=1e-9)
+
+
+def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):
+    model = replace(MODEL, orders=(19.0,), trigger_cycles=20)
+    std = 0.012  # fundamental cycles
+    prediction = predict(model, processes=[gaussian_pulse_jitter([std**2, 0.5 * std**2])])
+    noise = rng.normal(0.0, std / np.sqrt(2.0), (20_000, 22))
+    errors = (noise[:, 1:] + noise[:, :-1]
+              + model.fundamental_frequency * model.distribution.draw(rng, (20_000, 21)))
+    draws = np.abs(AveragedSignal(20, 2.40789, 19.0).whole_trigger_cycles(errors))
+    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[0]).statistic
+    assert distance < 0.01 + 1.95 / np.sqrt(draws.size)
+    assert prediction.mean_attenuation[0] == pytest.approx(
+        draws.mean(), abs=4.5 * draws.std() / np.sqrt(draws.size))
+
+
+def test_a_long_memory_falls_back_on_the_normal_law():
+    wander = GaussianAngleError(
+        lambda u, v, lag: np.full(np.broadcast(u, v).shape, 1e-4 * 0.9**lag), 40)
+    prediction = predict(MODEL, processes=[wander])
+    assert not np.any(prediction.law.bend)
+    assert np.all(prediction.mean_attenuation < predict(MODEL).mean_attenuation)
+    frozen = GaussianAngleError(wander.covariance, 10**9)
+    np.testing.assert_array_equal(predict(MODEL, processes=[frozen]).variance,
+                                  prediction.variance)
+
+
+@pytest.mark.parametrize(('changes', 'message'), [
+    ({'keyphasor_rate': 0.0}, 'keyphasor_rate is 0.0: it must be finite and above 0'),
+    ({'keyphasor_rate': float('nan')}, 'keyphasor_rate is nan'),
+    ({'trigger_speed': -3.0}, 'trigger_speed is -3.0'),
+    ({'ratio': float('inf')}, 'ratio is inf'),
+    ({'trigger_cycles': 0}, 'trigger_cycles is 0: an average holds a whole number of at least 1'),
+    ({'orders': ()}, r'orders have the shape \(0,\)'),
+    ({'orders': (1.0, -1.0)}, 'orders hold -1.0'),
+    ({'pulses_per_revolution': 0}, 'pulses_per_revolution is 0'),
+    ({'pulses_per_trigger': -1}, 'pulses_per_trigger is -1'),
+    ({'jitter_distribution': 'cauchy'}, "jitter_distribution is 'cauchy': choose one of uniform"),
+    ({'jitter_std': -1e-6}, 'jitter_std is -1e-06'),
+    ({'jitter_distribution': 'table'}, r'table has the shape \(0,\)'),
+    ({'jitter_distribution': 'table', 'jitter_table': (0.0, float('nan'))}, r'table\[1\] is nan'),
+    ({'noise_std': 0.1}, 'noise_std is 0.1 without sample_rate'),
+    ({'sample_rate': 3000.0}, 'order 38 is above the Nyquist order 31.1476'),
+    ({'keyphasor_rate': 20.0}, 'spread over 0.05 s but a trigger cycle lasts 0.05 s'),
+    ({'jitter_distribution': 'normal', 'jitter_std': 0.01}, 'pulses could swap'),
+    ({'jitter_distribution': 'table', 'jitter_table': (-0.04, 0.04)}, 'spread over 0.08 s'),
+])
+def test_models_that_make_no_sense_are_refused(changes, message):
+    with pytest.raises(ModelError, match=message):
+        replace(MODEL, **changes)
+
+
+@pytest.mark.parametrize('law', ['uniform', 'normal', 'triangular'])
+def test_required_keyphasor_rate_meets_the_limit_and_no_lower_one_does(law):
+    model = replace(MODEL, jitter_distribution=law)
+    for limit in (1e-4, 0.02, 0.5):
+        rate = required_keyphasor_rate(model, limit)
+        assert np.max(assess(replace(model, keyphasor_rate=rate)).attenuation) == pytest.approx(
+            limit, rel=1e-6)
+        assert np.max(assess(replace(model, keyphasor_rate=0.9 * rate)).attenuation) > limit
+    rates = [required_keyphasor_rate(replace(model, orders=(g,)), 0.02) for g in (10.0, 20.0)]
+    assert rates[1] == pytest.approx(2.0 * rates[0], rel=1e-6)
+
+
+def test_required_rate_never_lets_pulses_swap():
+    model = replace(MODEL, ratio=0.01, orders=(1.0,))
+    rate = required_keyphasor_rate(model, 0.5)
+    assert rate == pytest.approx(20.0, rel=1e-3)
+    assert assess(replace(model, keyphasor_rate=rate)).attenuation[0] < 0.5
+
+
+@pytest.mark.parametrize('changes', [{}, {'noise_std': 1.0, 'sample_rate': 5e4}])
+def test_required_cycles_are_the_fewest_from_which_on_the_limit_holds(changes):
+    model = replace(MODEL, orders=(38.0,), **changes)
+
+    def variation(cycles):
+        result = assess(replace(model, trigger_cycles=cycles))
+        return result.coefficient_of_variation[0]
+
+    for limit in (0.06, 0.05, 0.02):
+        cycles = required_trigger_cycles(model, limit)
+        assert variation(cycles) <= limit
+        assert variation(cycles + 1) <= limit
+        assert cycles == 1 or variation(cycles - 1) > limit
+    assert trade_off(model, [10.0, 5000.0], 0.02)[1] == cycles
+    assert np.isnan(trade_off(model, [10.0, 5000.0], 0.02)[0])
+
+
+def test_highest_order_is_the_reverse():
+    model = replace(MODEL, orders=tuple(range(1, 60)))
+    result = assess(model)
+    best = highest_order(model, 0.05, 0.5)
+    assert result.attenuation[int(best) - 1] <= 0.05 < result.attenuation[int(best)]
+    assert np.isnan(highest_order(model, 1e-9, 0.5))
+
+
+def test_design_grid_holds_the_worst_order():
+    grid = design_grid(MODEL, [10.0, 3000.0, 9000.0], [5, 50])
+    assert grid.attenuation.shape == (3, 2)
+    assert np.all(np.isnan(grid.attenuation[0]))
+    at = assess(replace(MODEL, keyphasor_rate=9000.0, trigger_cycles=50))
+    assert grid.attenuation[2, 1] == pytest.approx(at.attenuation[-1])
+    assert grid.coefficient_of_variation[2, 1] == pytest.approx(at.coefficient_of_variation[-1],
+                                                                rel=1e-6)
+    assert np.all(np.diff(grid.attenuation[1:], axis=0) < 0.0)
+    assert np.all(np.diff(grid.coefficient_of_variation[1:], axis=1) < 0.0)
+
+
+@pytest.mark.parametrize('ratio', [1.06, 0.9])
+def test_detection_agrees_with_simulated_states(ratio):
+    model = replace(MODEL, orders=(38.0,), noise_std=3.0, sample_rate=5e4)
+    result = detectability(model, ratio, [0.01, 0.1, 0.5])
+    healthy = simulate(model, 38.0, 20_000, seed=31)
+    faulty = ratio * simulate(replace(model, noise_std=3.0 / ratio), 38.0, 20_000, seed=32)
+    for k, rate in enumerate((0.01, 0.1, 0.5)):
+        for draws, expected in ((healthy, rate), (faulty, result.detection[0, k])):
+            beyond = np.mean(np.sign(ratio - 1.0) * (draws - result.threshold[0, k]) > 0.0)
+            tolerance = 4.5 * np.sqrt(expected * (1.0 - expected) / draws.size) + 0.004
+            assert beyond == pytest.approx(expected, abs=tolerance)
+    area = stats.mannwhitneyu(faulty, healthy).statistic / healthy.size**2
+    assert result.area[0] == pytest.approx(area if ratio > 1.0 else 1.0 - area, abs=0.01)
+
+
+def test_equal_states_are_detected_at_the_false_alarm_rate_and_jitter_hides_faults():
+    same = detectability(MODEL, 1.0, [0.05])
+    np.testing.assert_allclose(same.detection, 0.05, atol=1e-6)
+    np.testing.assert_allclose(same.area, 0.5, atol=1e-3)
+    coarse = detectability(replace(MODEL, keyphasor_rate=2500.0), 1.05, [0.05])
+    assert np.all(np.diff(coarse.detection[:, 0]) <= 0.0)
+    assert coarse.detection[-1, 0] < detectability(MODEL, 1.05, [0.05]).detection[-1, 0]
+
+
+@pytest.mark.parametrize(('call', 'error', 'message'), [
+    (lambda: required_keyphasor_rate(MODEL, 0.0), ParameterError, 'attenuation is 0.0'),
+    (lambda: required_trigger_cycles(MODEL, 1.0), ParameterError, 'variation is 1.0'),
+    (lambda: highest_order(MODEL, 2.0, 0.1), ParameterError, 'attenuation is 2.0'),
+    (lambda: required_keyphasor_rate(
+        replace(MODEL, jitter_distribution='normal', jitter_std=1e-5), 0.1), ModelError,
+     'no keyphasor rate changes the jitter'),
+    (lambda: required_trigger_cycles(replace(MODEL, noise_std=5e4, sample_rate=5e4), 1e-3),
+     ModelError, 'more than 1000000 trigger cycles'),
+    (lambda: design_grid(MODEL, [-5.0], [3]), ModelError, 'keyphasor_rates hold -5.0'),
+    (lambda: detectability(MODEL, -1.0, [0.1]), ParameterError, 'amplitude_ratio is -1.0'),
+    (lambda: detectability(MODEL, 1.1, [0.0]), ParameterError, 'between 0 and 1'),
+])
+def test_bad_design_questions_are_refused(call, error, message):
+    with pytest.raises(error, match=message):
+        call()
