@@ -17,9 +17,11 @@ CORE = {
     'angle': SCIENCE | {'errors'},
     'averaging': SCIENCE | {'angle', 'errors'},
     'statistics': SCIENCE | {'errors'},
+    'effects': SCIENCE | {'angle', 'errors', 'statistics'},
     'recordings': SCIENCE | {'errors', 'rosbags'},
     'simulation': SCIENCE | {'errors'},
-    'closure': SCIENCE | {'angle', 'averaging', 'errors', 'matplotlib', 'statistics'},
+    'closure': SCIENCE | {
+        'angle', 'averaging', 'effects', 'errors', 'matplotlib', 'recordings', 'statistics'},
 }
 ROS = {'ament_index_python', 'builtin_interfaces', 'rcl_interfaces', 'rclpy'}
 ROS_PARTS = {'commands', 'nodes'}

@@ -1,0 +1,162 @@
+"""The package as colcon and pip see it: manifest, dependencies, scripts, installed copies."""
+
+import ast
+import importlib
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+import os
+from pathlib import Path
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+import pytest
+import sa_jitter_ros
+import setuptools
+from test_architecture import is_ros, MODULES, needs
+
+ROOT = Path(__file__).resolve().parents[1]
+NAME = 'sa_jitter_ros'
+PYPI_NAMES = {'yaml': 'PyYAML'}
+ROSDEP_KEYS = {'rosbags': 'python3-rosbags-pip'}
+
+
+@pytest.fixture(scope='module')
+def setup():
+    """Return what setup.py tells setuptools."""
+    told = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(setuptools, 'setup', lambda **keywords: told.update(keywords))
+        patch.chdir(ROOT)
+        runpy.run_path('setup.py')
+    return told
+
+
+@pytest.fixture(scope='module')
+def scripts(setup):
+    """Return the console scripts: name to module."""
+    entries = (entry.split(' = ') for entry in setup['entry_points']['console_scripts'])
+    return {name: target.removesuffix(':main') for name, target in entries}
+
+
+@pytest.fixture(scope='module')
+def manifest():
+    """Return package.xml, checked against the rules of its format."""
+    warnings = []
+    parser = pytest.importorskip('catkin_pkg.package')
+    package = parser.parse_package(str(ROOT / 'package.xml'), warnings=warnings)
+    assert not warnings
+    return package
+
+
+@pytest.fixture(scope='module')
+def packages():
+    """Return all packages that are imported and neither ours nor Python's."""
+    own = {path.stem for path in MODULES} | {path.parent.name for path in MODULES}
+    return set().union(*map(needs, MODULES)) - own
+
+
+def test_manifest_is_of_format_3_for_ament_python(manifest):
+    assert manifest.package_format == 3
+    assert [export.content for export in manifest.exports] == ['ament_python']
+    assert manifest.licenses == ['Apache-2.0']
+    assert (ROOT / manifest.licenses[0].file).is_file()
+
+
+def test_names_and_versions_agree(manifest, setup):
+    assert manifest.name == setup['name'] == NAME
+    assert manifest.version == setup['version'] == sa_jitter_ros.__version__
+    assert (ROOT / 'resource' / NAME).is_file()
+
+
+def test_manifest_declares_what_is_imported(manifest, packages):
+    declared = {dependency.name for dependency in manifest.exec_depends}
+    assert {
+        package if is_ros(package) else ROSDEP_KEYS.get(package, f'python3-{package}')
+        for package in packages
+    } <= declared
+
+
+def test_setup_requires_what_is_imported_from_pypi(setup, packages):
+    required = {re.match(r'[\w-]+', line)[0] for line in setup['install_requires']}
+    assert {PYPI_NAMES.get(name, name) for name in packages if not is_ros(name)} <= required
+
+
+def test_every_script_has_a_main(scripts):
+    for name, module in scripts.items():
+        assert name.removeprefix('sa_jitter_') == module.rpartition('.')[2]
+        assert callable(importlib.import_module(module).main)
+
+
+def test_every_main_has_a_script(scripts):
+    mains = {
+        f'{NAME}.{path.parent.name}.{path.stem}'
+        for path in MODULES
+        if any(
+            isinstance(node, ast.FunctionDef) and node.name == 'main'
+            for node in ast.parse(path.read_text(encoding='utf-8')).body
+        )
+    }
+    assert mains == set(scripts.values())
+
+
+def test_every_folder_with_modules_is_installed(setup):
+    folders = {path.parent.relative_to(ROOT) for path in MODULES}
+    assert {'.'.join(folder.parts) for folder in folders} == set(setup['packages'])
+
+
+def test_every_configuration_is_installed(setup):
+    files = {file for _, files in setup['data_files'] for file in files}
+    assert files >= {str(file.relative_to(ROOT)) for file in ROOT.glob('config/*.yaml')}
+    assert 'package.xml' in files
+
+
+def test_pip_installed_the_tree_as_it_stands(scripts):
+    installed = Path(sysconfig.get_path('purelib')) / NAME
+    if not installed.is_dir():
+        pytest.skip(f'{NAME} is not installed in {sys.prefix}: ./run installs it')
+    assert modules_of(installed) == modules_of(ROOT / NAME)
+    for name, module in scripts.items():
+        assert os.access(Path(sysconfig.get_path('scripts')) / name, os.X_OK)
+        (entry,) = {e.value for e in entry_points(group='console_scripts', name=name)}
+        assert entry == f'{module}:main'
+
+
+def modules_of(folder):
+    """Return the text of every module in a folder, by its relative path."""
+    return {path.relative_to(folder): path.read_text() for path in folder.rglob('*.py')}
+
+
+@pytest.mark.slow
+def test_colcon_builds_what_ros2_run_looks_for(tmp_path, scripts):
+    if find_spec('colcon_ros') is None:
+        pytest.skip('colcon-ros is not installed')
+    source = tmp_path / 'src' / NAME
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns('.*', 'build', 'install', 'out'))
+    colcon = 'from colcon_core.command import main; main(argv=["build"])'
+    run(tmp_path, sys.executable, '-c', colcon)
+
+    look_up = (
+        '. install/setup.bash; exec "$0" -c "'
+        'from ament_index_python import get_package_prefix as prefix, get_package_share_directory;'
+        f'import {NAME};'
+        f'print(prefix({NAME!r}), get_package_share_directory({NAME!r}), {NAME}.__file__)"'
+    )
+    found = run(tmp_path, 'bash', '-c', look_up, sys.executable)
+    prefix, share, module = map(Path, found.split())
+    executables = (path for path in (prefix / 'lib' / NAME).iterdir() if os.access(path, os.X_OK))
+    assert {path.name for path in executables} == set(scripts)
+    assert module.is_relative_to(tmp_path / 'install')
+    assert (share / 'package.xml').is_file()
+    configured = {path.name for path in (share / 'config').glob('*.yaml')}
+    assert configured == {path.name for path in ROOT.glob('config/*.yaml')}
+
+
+def run(folder, *command):
+    """Run a command that must succeed in a folder and return what it printed."""
+    result = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
