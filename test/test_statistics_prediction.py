@@ -13,6 +13,7 @@ from sa_jitter_ros.statistics.design import (
     trade_off)
 from sa_jitter_ros.statistics.detectability import detectability
 from sa_jitter_ros.statistics.distributions import Empirical, Normal, Triangular, Uniform
+from sa_jitter_ros.statistics.mixture import mixed
 from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from sa_jitter_ros.statistics.sampled_law import SampledLaw
@@ -154,6 +155,40 @@ def test_a_long_memory_falls_back_on_the_normal_law():
     frozen = GaussianAngleError(wander.covariance, 10**9)
     np.testing.assert_array_equal(predict(MODEL, processes=[frozen]).variance,
                                   prediction.variance)
+
+
+def test_effects_can_take_the_place_of_the_declared_jitter():
+    nothing = predict(MODEL, declared_jitter=False)
+    np.testing.assert_allclose(nothing.mean_attenuation, 1.0, rtol=1e-12)
+    np.testing.assert_allclose(nothing.quantile_05, 1.0, rtol=1e-7)  # sqrt of rounding errors
+    std = MODEL.fundamental_frequency / (np.sqrt(12.0) * MODEL.keyphasor_rate)
+    process = predict(MODEL, processes=[gaussian_pulse_jitter([std**2])], declared_jitter=False)
+    normal = predict(replace(MODEL, jitter_distribution='normal'))
+    np.testing.assert_allclose(process.quantile_05, normal.quantile_05, rtol=1e-7)
+
+
+def test_a_mixture_of_scenarios_is_the_law_of_a_random_one(rng):
+    slips = np.linspace(-0.01, 0.01, 9)  # fundamental cycles per trigger cycle
+    model = replace(MODEL, orders=(1.0, 19.0), noise_std=3.0, sample_rate=5e4)
+
+    def skewed(slip):
+        return predict(model, offset=lambda u: slip * (np.arange(41)[:, None] + u))
+
+    result = mixed([skewed(slip) for slip in slips])
+    errors = (model.fundamental_frequency * model.distribution.draw(rng, (18_000, 42))
+              + np.repeat(slips, 2000)[:, None] * np.arange(42))
+    noise = np.sqrt(2.0 * 9.0 / (5e4 * model.duration)) * rng.normal(size=(2, 18_000))
+    draws = np.abs(AveragedSignal(41, model.cycle_length, 19.0).whole_trigger_cycles(errors)
+                   + noise[0] + 1j * noise[1])
+    assert stats.kstest(draws, lambda x: result.law.cdf(x)[1]).statistic < 0.012
+    np.testing.assert_allclose(result.mean_attenuation**2 + result.variance,
+                               result.moments.mean_square, rtol=1e-9)
+    assert result.standard_deviation[1] == pytest.approx(draws.std(), rel=0.02)
+    assert np.mean(draws < result.quantile_95[1]) == pytest.approx(0.95, abs=0.008)
+    with pytest.raises(ModelError, match='0 variants cannot be mixed'):
+        mixed([])
+    with pytest.raises(ModelError, match='all of the same orders'):
+        mixed([result, predict(MODEL)])
 
 
 @pytest.mark.parametrize(('changes', 'message'), [

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.statistics.angle_error import unit_nodes
 from sa_jitter_ros.statistics.moments import AverageMoments
+from sa_jitter_ros.statistics.sampled_law import require_probabilities
 
 Array = NDArray[Any]
 
@@ -104,13 +104,8 @@ class AmplitudeLaw:
 
         Raises ParameterError for a probability outside (0, 1).
         """
-        p = np.atleast_1d(np.asarray(probability, float))
-        if not np.all((p > 0.0) & (p < 1.0)):
-            raise ParameterError(f'probabilities {p} must lie between 0 and 1, both excluded')
-        mean, std = self.mean[:, None], np.sqrt(self.variance)[:, None]
-        reach = 1.02 * std * np.sqrt(np.maximum(p / (1.0 - p), (1.0 - p) / p))  # Cantelli
-        return _increasing_root(lambda y: self.cdf(y) - p, np.maximum(mean - reach, 0.0),
-                                mean + reach)
+        p, low, high = quantile_bracket(self.mean, self.variance, probability)
+        return increasing_root(lambda y: self.cdf(y) - p, low, high)
 
     def _rows(self, mask: Array) -> 'AmplitudeLaw':
         """Return the law of some of the orders."""
@@ -226,7 +221,20 @@ def _chord(y: Array, mean: Array, std: Array) -> tuple[Array, Array]:
             np.where(std[..., None] > 0.0, weight, point))
 
 
-def _increasing_root(function: Callable[[Array], Array], low: Array, high: Array) -> Array:
+def quantile_bracket(
+    mean: Array, variance: Array, probability: ArrayLike,
+) -> tuple[Array, Array, Array]:
+    """
+    Return probabilities (k,) and bounds (orders, k) of their quantiles, by Cantelli's inequality.
+
+    Raises ParameterError for a probability outside (0, 1).
+    """
+    p = require_probabilities(probability)
+    reach = 1.02 * np.sqrt(variance)[:, None] * np.sqrt(np.maximum(p / (1.0 - p), (1.0 - p) / p))
+    return p, np.maximum(mean[:, None] - reach, 0.0), mean[:, None] + reach
+
+
+def increasing_root(function: Callable[[Array], Array], low: Array, high: Array) -> Array:
     """Return the bracketed roots of an increasing vectorised function by the Illinois rule."""
     f_low, f_high = function(low), function(high)
     root, last = 0.5 * (low + high), np.zeros(low.shape)

@@ -141,7 +141,7 @@ def joint_characteristic(
     positions: Sequence[ArrayLike], cycles: Sequence[int],
 ) -> Array:
     """Return the joint characteristic function of the sum of independent processes."""
-    product: Array = np.ones(())
+    product: Array = np.ones(np.broadcast_shapes(*map(np.shape, (*coefficients, *positions))))
     for process in processes:
         product = product * process.characteristic(coefficients, positions, cycles)
     return product

@@ -118,7 +118,7 @@ def cycle_moments(
     g = require_orders(orders)
     u, w = unit_nodes(nodes)
     plane = g[:, None, None]
-    first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
+    first = joint_characteristic(processes, [g[:, None]], [u], [0])
     mean = first @ w
     variance, pseudo = [], []
     length = correlation_length(processes)
@@ -145,7 +145,7 @@ def offset_moments(
     u, w = unit_nodes(nodes)
     phasor = np.exp(2j * np.pi * g[:, None, None] * offset(u)) * w
     plane = g[:, None, None]
-    first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
+    first = joint_characteristic(processes, [g[:, None]], [u], [0])
     mean = np.sum(phasor.mean(axis=1) * first, axis=1)
     variance = np.zeros(g.size)
     pseudo = np.zeros(g.size, complex)
@@ -186,7 +186,7 @@ def multi_harmonic_moments(
     shift = 2.0 * np.pi * cycle_length * (sources[:, None] - g)  # per cycle, (source, order)
     weight = a[:, None, None] * np.exp(1j * shift[:, :, None] * u) * w
     steps = np.exp(1j * shift[:, :, None] * np.arange(trigger_cycles))
-    first = [joint_characteristic(processes, [s], [u], [0]) * np.ones(u.size) for s in sources]
+    first = [joint_characteristic(processes, [s], [u], [0]) for s in sources]
     means = np.array([steps[s].mean(axis=-1) * (weight[s] @ first[s])
                       for s in range(sources.size)])
     variance = np.zeros(g.size)

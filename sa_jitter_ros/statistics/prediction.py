@@ -192,6 +192,7 @@ class Prediction:
 def predict(
     model: DeclaredModel, *, processes: Sequence[AngleErrorProcess] = (),
     offset: AngleOffset | None = None, gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0,
+    declared_jitter: bool = True,
 ) -> Prediction:
     """
     Return the law of the amplitudes that an average shows of unit components.
@@ -199,6 +200,9 @@ def predict(
     Effects beyond the declared jitter: random `processes` and a deterministic `offset` of the
     angle (fundamental cycles), a `gain` per order (complex or real) that acts on the component
     alone, and `line_variance`, E|n|^2 of what is added incoherently to each peak amplitude.
+    Without `declared_jitter` they take the place of the declared one; equally likely scenarios are
+    predicted one by one and combined with `mixture.mixed`.
+
     Mean square and complex moments are exact for any of them. The law itself is sampled for few
     trigger cycles of plain jitter (fixed seed), curved for more, and normal where an effect has
     an offset or a long memory.
@@ -206,36 +210,42 @@ def predict(
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
     jitter = model.distribution
-    everything = (IndependentPulseJitter(jitter, frequency), *processes)
+    declared = (IndependentPulseJitter(jitter, frequency),) if declared_jitter else ()
+    everything = (*declared, *processes)
+    plain = declared_jitter and not processes and offset is None
     spread = float(orders.max()) * frequency * math.sqrt(jitter.variance)
-    nodes = int(np.clip(16.0 + 16.0 * spread, 32 if processes or offset else 16, 80))
+    nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 80))
     noise = np.asarray(line_variance) + (
         noise_line_variance(model.noise_std, model.sample_rate, model.duration)
         if model.noise_std else 0.0)
-    law: AmplitudeDistribution
+    count = model.trigger_cycles
     if offset is not None:
-        moments = offset_moments(orders, everything, model.trigger_cycles, offset, nodes=nodes)
+        moments = offset_moments(orders, everything, count, offset, nodes=nodes)
         moments = moments.scaled(gain).with_noise(noise)
-        law = normal_law(moments)
-    else:
-        cycles = cycle_moments(orders, everything, nodes=nodes, lags=model.trigger_cycles)
-        moments = cycles.averaged(model.trigger_cycles).scaled(gain).with_noise(noise)
-        law = normal_law(moments)
-        lopsided = False
-        if correlation_length(everything) <= _CURVED_REACH:
-            plain, mixed = third_cumulants(orders, everything, model.trigger_cycles, cycles)
-            g = np.asarray(gain)
-            law = curved = curved_law(moments, plain * g**3, mixed * g * np.abs(g) ** 2)
-            lopsided = bool(np.max(np.abs(curved.skew)) > _LOPSIDED)
-        if not processes and model.trigger_cycles <= (
-                _FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
-            law = sampled_law(orders * frequency, jitter, model.trigger_cycles, moments,
-                              gain=gain, line_variance=noise)
+        return prediction_of_law(model, moments, normal_law(moments))
+    cycles = cycle_moments(orders, everything, nodes=nodes, lags=count)
+    moments = cycles.averaged(count).scaled(gain).with_noise(noise)
+    if correlation_length(everything) > _CURVED_REACH:
+        return prediction_of_law(model, moments, normal_law(moments))
+    g = np.asarray(gain)
+    equal, mixed = third_cumulants(orders, everything, count, cycles)
+    curved = curved_law(moments, equal * g**3, mixed * g * np.abs(g) ** 2)
+    lopsided = np.max(np.abs(curved.skew)) > _LOPSIDED
+    if plain and count <= (_FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
+        return prediction_of_law(model, moments, sampled_law(
+            orders * frequency, jitter, count, moments, gain=gain, line_variance=noise))
+    return prediction_of_law(model, moments, curved)
+
+
+def prediction_of_law(
+    model: DeclaredModel, moments: AverageMoments, law: AmplitudeDistribution,
+) -> Prediction:
+    """Return the figures of a law that was found for a model."""
     quantiles = law.ppf(QUANTILES)
     variance = law.variance
     return Prediction(
-        model=model, order=orders, mean_attenuation=law.mean, variance=variance,
-        standard_deviation=np.sqrt(variance), quantile_05=quantiles[:, 0],
+        model=model, order=np.asarray(model.orders), mean_attenuation=law.mean,
+        variance=variance, standard_deviation=np.sqrt(variance), quantile_05=quantiles[:, 0],
         quantile_50=quantiles[:, 1], quantile_95=quantiles[:, 2], moments=moments, law=law)
 
 

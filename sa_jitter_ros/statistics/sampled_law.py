@@ -52,9 +52,7 @@ class SampledLaw:
 
         Raises ParameterError for a probability outside (0, 1).
         """
-        p = np.atleast_1d(np.asarray(probability, float))
-        if not np.all((p > 0.0) & (p < 1.0)):
-            raise ParameterError(f'probabilities {p} must lie between 0 and 1, both excluded')
+        p = require_probabilities(probability)
         position = p * (self.draws.shape[1] - 1)
         index = np.minimum(position.astype(int), self.draws.shape[1] - 2)
         part = position - index
@@ -97,3 +95,11 @@ def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
     half[half == 0.0] = np.finfo(half.dtype).tiny
     gain = np.sin(half) / half
     return gain * np.cos(middle), gain * np.sin(middle)
+
+
+def require_probabilities(probability: ArrayLike) -> Array:
+    """Return probabilities of shape (k,); raise ParameterError for one outside (0, 1)."""
+    p = np.atleast_1d(np.asarray(probability, float))
+    if not np.all((p > 0.0) & (p < 1.0)):
+        raise ParameterError(f'probabilities {p} must lie between 0 and 1, both excluded')
+    return p
