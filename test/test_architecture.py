@@ -21,7 +21,7 @@ CORE = {
     'recordings': SCIENCE | {'errors', 'rosbags'},
     'simulation': SCIENCE | {'errors'},
     'closure': SCIENCE | {
-        'angle', 'averaging', 'effects', 'errors', 'matplotlib', 'recordings', 'statistics'},
+        'angle', 'averaging', 'effects', 'errors', 'matplotlib', 'statistics'},
 }
 ROS = {'ament_index_python', 'builtin_interfaces', 'rcl_interfaces', 'rclpy'}
 ROS_PARTS = {'commands', 'nodes'}
