@@ -1,0 +1,241 @@
+"""Node `machine_simulator`: a gearbox whose truth is known, as the topics of its measurement."""
+
+from collections.abc import Iterator, Sequence
+from itertools import count
+import math
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.nodes.base import run_node
+from sa_jitter_ros.nodes.parameters import Parameter, Values
+from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
+from sa_jitter_ros.simulation import (
+    AdditiveNoise, band_limited, ChippedTooth, DeclaredJitter, Effect, Gearbox, Keyphasor,
+    make_effects, mesh, Torsion)
+from sa_jitter_ros.simulation.pulse_effects import JITTER_DISTRIBUTIONS
+from sa_jitter_ros.simulation.sinusoids import NOTHING
+
+FIXED = {'read_only': True}
+PARAMETERS = (
+    Parameter('seed', 0, 'of all random numbers', minimum=0, **FIXED),
+    Parameter('start_time', 0.0, 'time of the first sample', unit='s', **FIXED),
+    Parameter('duration', 0.0, 'machine time to simulate, 0 for no end', unit='s', minimum=0.0,
+              **FIXED),
+    Parameter('sample_rate', 20000.0, 'of the vibration', unit='Hz', above=0.0, **FIXED),
+    Parameter('channel_gains', [1.0], 'gain of each vibration channel; their number is that of '
+              'the channels', **FIXED),
+    Parameter('shafts', ['shaft'], 'names of the shafts', **FIXED),
+    Parameter('speed', 25.0, 'of the tach shaft', unit='Hz', above=0.0, **FIXED),
+    Parameter('speed_profile', [], 'time (s), speed (Hz), time, speed, ... instead of a constant '
+              'speed, linear in between', minimum=0.0, **FIXED),
+    Parameter('speed_fluctuation_std', 0.0, 'relative random speed fluctuation, band-limited',
+              minimum=0.0, maximum=0.1, **FIXED),
+    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of it',
+              unit='Hz', above=0.0, **FIXED),
+    Parameter('torsion_order', 2.0, 'twists a revolution of the tach shaft', minimum=0.0, **FIXED),
+    Parameter('torsion_amplitude', 0.0, 'of the twist', unit='rad', minimum=0.0, **FIXED),
+    Parameter('noise_std', 0.1, 'declared white noise per vibration sample, in units of the '
+              'vibration', minimum=0.0),
+    Parameter('tach', 'pulses', 'what the keyphasor gives',
+              choices=('pulses', 'waveform', 'both', 'none'), **FIXED),
+    Parameter('pulses_per_revolution', 1, 'of the tach shaft', minimum=1, maximum=100000, **FIXED),
+    Parameter('pulses_per_trigger', 0, 'pulses of a trigger cycle, 0 for all of a revolution',
+              minimum=0, maximum=100000, **FIXED),
+    Parameter('keyphasor_rate', 10000.0, 'declared rate at which the keyphasor is sampled',
+              unit='Hz', above=0.0),
+    Parameter('jitter_distribution', 'uniform', 'declared pulse error: a law, or sampled for '
+              'pulse times that are rounded up to the clock of keyphasor_rate',
+              choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
+    Parameter('jitter_std', 0.0, 'standard deviation of it, 0 for 1/(sqrt(12) keyphasor_rate)',
+              unit='s', minimum=0.0),
+    Parameter('jitter_table', [], 'equally likely errors, for the distribution table', unit='s'),
+    Parameter('waveform', 'ttl', 'of the keyphasor', choices=('ttl', 'sine'), **FIXED),
+    Parameter('waveform_rate', 50000.0, 'sampling rate of the waveform', unit='Hz', above=0.0,
+              **FIXED),
+    Parameter('waveform_rise_time', 0.0, 'of a ttl edge', unit='s', minimum=0.0, **FIXED),
+    Parameter('waveform_noise_std', 0.0, 'white noise on the waveform of 0 to 5 V', unit='V',
+              minimum=0.0, **FIXED),
+)
+# Effects that the declared model lacks; parameters as the predictor has them.
+EFFECT_PARAMETERS = {
+    'excess_jitter': (
+        Parameter('std', 2e-5, 'of an independent normal pulse error', unit='s', minimum=0.0),),
+    'correlated_jitter': (
+        Parameter('std', 2e-5, 'of a normal pulse error', unit='s', minimum=0.0),
+        Parameter('correlation', 0.8, 'of neighbouring pulses', minimum=-0.999, maximum=0.999)),
+    'target_geometry': (
+        Parameter('pulse_angles', [0.0, 0.005], 'how far each mark is off its even place',
+                  unit='rad'),),
+    'clock_skew': (
+        Parameter('skew', 1e-5, 'relative excess of the clock of the keyphasor', minimum=-0.1,
+                  maximum=0.1),),
+    'keyphasor_quantisation': (
+        Parameter('clock_rate', 5000.0, 'clock to which pulse times are rounded up; replaces the '
+                  'declared jitter', unit='Hz', above=0.0),
+        Parameter('period_std', 0.0, 'of the trigger period, by a slow speed fluctuation',
+                  unit='s', minimum=0.0)),
+    'missing_pulses': (
+        Parameter('probability', 0.02, 'of a pulse to be lost', minimum=0.0, maximum=0.99),),
+    'speed_fluctuation': (
+        Parameter('acceleration_std', 10.0, 'random acceleration of the tach shaft',
+                  unit='rad/s^2', minimum=0.0),),
+    'phase_wander': (
+        Parameter('std', 0.01, 'slow angle between a shaft and its vibration', unit='rad',
+                  minimum=0.0),),
+    'amplitude_modulation': (
+        Parameter('std', 0.2, 'slow relative change of the amplitude', minimum=0.0),),
+    'interpolation_loss': (
+        Parameter('method', 'linear', 'interpolator that the vibration has been through',
+                  choices=('linear', 'cubic', 'spline')),),
+    'additive_noise': (
+        Parameter('std', 0.5, 'white noise per sample, in units of the vibration', minimum=0.0),),
+    'interfering_tone': (
+        Parameter('frequency', 100.0, 'of a tone that no shaft makes', unit='Hz', above=0.0),
+        Parameter('amplitude', 0.5, 'of the tone', minimum=0.0)),
+}
+
+
+def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
+    """Parameters of one shaft."""
+    return (
+        Parameter(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft', above=0.0, **FIXED),
+        Parameter(f'{shaft}.teeth', 23, 'of its gear: the mesh order', minimum=1, **FIXED),
+        Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '
+                  'its multiples', minimum=0.0, **FIXED),
+        Parameter(f'{shaft}.sidebands', 0.2, 'relative amplitude one order beside each',
+                  minimum=0.0, **FIXED),
+        Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst of a chipped tooth, '
+                  'once a revolution'),
+    )
+
+
+def effect_parameters() -> Iterator[Parameter]:
+    """Iterate over the parameters of all effects."""
+    for name, items in EFFECT_PARAMETERS.items():
+        yield Parameter(f'effects.{name}.enabled', False, f'add the effect {name}')
+        for item in items:
+            yield Parameter(**{**vars(item), 'name': f'effects.{name}.{item.name}'})
+
+
+def effects_of(values: Values) -> tuple[Effect, ...]:
+    """Return declared jitter and noise and the enabled effects; raises `ParameterError`."""
+    options = {}
+    for name, items in EFFECT_PARAMETERS.items():
+        if values[f'effects.{name}.enabled']:
+            found = {item.name: values[f'effects.{name}.{item.name}'] for item in items}
+            options[name] = {key: tuple(value) if isinstance(value, list) else value
+                             for key, value in found.items()}
+    declared: list[Effect] = [AdditiveNoise(values['noise_std'], 'declared_noise')]
+    law, rate = values['jitter_distribution'], values['keyphasor_rate']
+    if law == 'sampled' and 'keyphasor_quantisation' not in options:
+        options['keyphasor_quantisation'] = {'clock_rate': rate}
+    elif law in JITTER_DISTRIBUTIONS and 'keyphasor_quantisation' not in options:
+        declared.append(DeclaredJitter(
+            law, values['jitter_std'] or 1.0 / (math.sqrt(12.0) * rate),
+            tuple(values['jitter_table'])))
+    return (*declared, *make_effects(options))
+
+
+def machine_of(values: Values) -> Gearbox:
+    """Gearbox that the parameters describe; raises `ParameterError`."""
+    gains, seed, profile = values['channel_gains'], values['seed'], values['speed_profile']
+    if len(profile) % 2:
+        raise ParameterError(f'speed_profile has {len(profile)} numbers: give pairs of time and '
+                             'speed')
+    band = values['speed_fluctuation_band']
+    if len(band) != 2:
+        raise ParameterError(f'speed_fluctuation_band is {band}: give two frequencies')
+    std = values['speed_fluctuation_std']
+    components, faults = [], []
+    for shaft in values['shafts']:
+        teeth, depth = values[f'{shaft}.teeth'], values[f'{shaft}.chipped_tooth']
+        components += mesh(shaft, teeth, harmonics=values[f'{shaft}.harmonics'],
+                           channel_gains=gains, sidebands={1.0: values[f'{shaft}.sidebands']},
+                           seed=seed)
+        if depth:
+            faults.append(ChippedTooth(shaft, teeth, tuple(depth * gain for gain in gains),
+                                       width=min(0.5 / teeth, 0.15)))
+    return Gearbox(
+        components, values['sample_rate'],
+        shafts={shaft: values[f'{shaft}.ratio'] for shaft in values['shafts']},
+        speed=list(zip(profile[::2], profile[1::2])) or [(0.0, values['speed'])],
+        fluctuation=band_limited(std=std, band=tuple(band), seed=seed, name='fluctuation')
+        if std else NOTHING,
+        torsion=(Torsion(values['torsion_order'], values['torsion_amplitude']),)
+        if values['torsion_amplitude'] else (),
+        keyphasor=Keyphasor(
+            pulses_per_revolution=values['pulses_per_revolution'],
+            pulses_per_trigger=values['pulses_per_trigger'] or None,
+            rate=values['waveform_rate'], waveform=values['waveform'], high=5.0,
+            rise_time=values['waveform_rise_time'], noise_std=values['waveform_noise_std']),
+        faults=faults, effects=effects_of(values), seed=seed)
+
+
+class MachineSimulator(PlaybackNode):
+    """Publishes a simulated gearbox's vibration and keyphasor; `machine` is its truth."""
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('machine_simulator', PARAMETERS, **node_kwargs)
+        self.parameters.declare(tuple(effect_parameters()))
+        for shaft in self.parameters.values()['shafts']:
+            self.parameters.declare(shaft_parameters(shaft))
+        self._values = values = self.parameters.values()
+        self.machine = machine_of(values)
+        rate, channels = self.machine.sample_rate, self.machine.channels
+        self._block = self.block_samples(rate, channels)
+        self._samples = round(values['duration'] * rate)
+        self._pulses = values['tach'] in ('pulses', 'both')
+        self._with_waveform = values['tach'] in ('waveform', 'both')
+        self._done = 0
+        self.begin(portion_seconds=self._block / rate, portion_bytes=8 * self._block * channels,
+                   pulses=self._pulses, waveform=self._with_waveform)
+
+    def check(self, values: Values) -> None:
+        """Raise ParameterError if no machine can be like that."""
+        machine_of(values)
+
+    def apply(self, values: Values) -> None:
+        """Go on with a machine that has changed."""
+        idle = ('playing', 'rate')
+        if any(values[key] != self._values[key] for key in values if key not in idle):
+            self.machine = machine_of(values)
+        self._values = values
+        super().apply(values)
+
+    def portions(self) -> Iterator[Portion]:
+        """Return the machine's signals from where they were left, for `duration` if it is set."""
+        first = self._done
+        blocks = (range(first, first + self._samples, self._block) if self._samples
+                  else count(first, self._block))
+        for start in blocks:
+            stop = start + self._block
+            if self._samples:
+                stop = min(stop, first + self._samples)
+            self._done = stop
+            yield self._portion(start, stop)
+
+    def _portion(self, start: int, stop: int) -> Portion:
+        machine, origin = self.machine, self._values['start_time']
+        rate, tach_rate = machine.sample_rate, machine.keyphasor.rate
+        vibration = SampleBlock(machine.vibration(start, stop), origin + start / rate, rate, start)
+        waveform: tuple[SampleBlock, ...] = ()
+        if self._with_waveform:
+            low, high = round(start / rate * tach_rate), round(stop / rate * tach_rate)
+            if high > low:
+                waveform = (SampleBlock(machine.tach_waveform(low, high)[None],
+                                        origin + low / tach_rate, tach_rate, low),)
+        pulses = (machine.pulses(start / rate, stop / rate).times if self._pulses
+                  else np.empty(0))
+        return Portion((stop - start) / rate, (vibration,), waveform, origin + pulses)
+
+    def progress(self, sent: float) -> str:
+        """Say how much machine time was simulated."""
+        total = f' of {self._samples / self.machine.sample_rate:.1f}' if self._samples else ''
+        return f'{sent:.1f}{total} s sent'
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(MachineSimulator, args)

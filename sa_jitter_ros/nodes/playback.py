@@ -1,0 +1,239 @@
+"""What the player and the simulator share: sending a stream at a steady pace, start and stop."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+import math
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
+from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference,
+                                          encode_samples, encode_samples_float32, known_type,
+                                          PULSE_TYPES, SAMPLE_TYPES)
+from sa_jitter_ros.nodes.parameters import as_ros_parameter, Parameter, Values
+from sensor_msgs.msg import TimeReference
+from std_msgs.msg import Float64MultiArray
+
+FloatArray = NDArray[np.float64]
+
+MAX_MESSAGE_BYTES = 300_000
+TRANSPORT_BYTES_PER_SECOND = 100e6
+PATIENCE = 0.5  # s of lag after which the pace is no longer made up for
+PROGRESS_PERIOD = 5.0  # s between log lines on progress
+
+PLAYBACK_PARAMETERS = (
+    Parameter('rate', 1.0, 'speed of playing as a multiple of real time', above=0.0,
+              maximum=1000.0),
+    Parameter('playing', True, 'set false to stop, true to go on'),
+    Parameter('block_seconds', 0.05, 'machine time in a message; messages stay below 300 kB',
+              unit='s', minimum=0.001, maximum=1.0, read_only=True),
+    Parameter('wait_seconds', 3.0, 'how long to wait for subscribers before starting', unit='s',
+              minimum=0.0, maximum=60.0, read_only=True),
+    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration: '
+              'std_msgs/Float64MultiArray or std_msgs/Float32MultiArray', read_only=True),
+    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
+              'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
+    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses',
+              read_only=True),
+)
+_WRITTEN_TYPES = {name: SAMPLE_TYPES[name] for name in SAMPLE_TYPES if 'MultiArray' in name}
+
+
+@dataclass(frozen=True)
+class Portion:
+    """A stretch of a stream: what is to be published, and how much machine time (s) it is."""
+
+    seconds: float
+    vibration: tuple[SampleBlock, ...]
+    waveform: tuple[SampleBlock, ...]
+    pulses: FloatArray
+
+
+class Pacer:
+    """Machine time that is due by the steady clock, at a rate that can change, with pauses."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate
+        self._due = 0.0
+        self._since: float | None = None
+
+    def due(self, now: float) -> float:
+        """Return the machine time in s that should have been sent by `now`."""
+        return self._due + (0.0 if self._since is None else (now - self._since) * self.rate)
+
+    def run(self, now: float, *, rate: float, running: bool) -> None:
+        """Go on at a rate from `now`, or pause."""
+        self._due = self.due(now)
+        self.rate, self._since = rate, now if running else None
+
+    def forgive(self, lag: float) -> None:
+        """Give up on `lag` seconds of machine time that were not sent in time."""
+        self._due -= lag
+
+
+def finite_blocks(block: SampleBlock) -> tuple[SampleBlock, ...]:
+    """Return the stretches of a block without NaN or infinity: a gap is what is not sent."""
+    finite = np.isfinite(block.samples).all(axis=0)
+    if finite.all():
+        return (block,)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(np.int8)))
+    return tuple(
+        SampleBlock(block.samples[:, start:stop], block.start_time + start / block.sample_rate,
+                    block.sample_rate, block.index + int(start))
+        for start, stop in edges.reshape(-1, 2))
+
+
+class PlaybackNode(MonitoringNode):
+    """Publishes the portions of a stream at a pace; a subclass gives them by `portions`."""
+
+    def __init__(self, name: str, parameters: tuple[Parameter, ...], **node_kwargs: Any) -> None:
+        super().__init__(name, PLAYBACK_PARAMETERS + parameters, **node_kwargs)
+        values = self.parameters.values()
+        kind = known_type('vibration_type', values['vibration_type'], _WRITTEN_TYPES)
+        self._encode = (encode_samples if SAMPLE_TYPES[kind] is Float64MultiArray
+                        else encode_samples_float32)
+        self._vibration = self.create_output(SAMPLE_TYPES[kind], 'vibration', INPUT_QOS)
+        self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
+        self._keyphasor = values['keyphasor']
+        self._pulse = self._waveform = None
+        self._pacer = Pacer(values['rate'])
+        self._playing, self._started = values['playing'], False
+        self._born = time.monotonic()
+        self._wait = values['wait_seconds']
+        self._sent = 0.0
+        self._sent_pulses = 0
+        self._progress_time = -math.inf
+        self._stream: Iterator[Portion] | None = None
+
+    # --- what a subclass does ---
+
+    def portions(self) -> Iterator[Portion]:
+        """Return the next pass through the stream, its times and indices going on."""
+        raise NotImplementedError
+
+    def again(self) -> bool:
+        """Return whether another pass follows."""
+        return False
+
+    def progress(self, sent: float) -> str:
+        """Say how far `sent` seconds of machine time are."""
+        return f'{sent:.1f} s sent'
+
+    # --- starting ---
+
+    def block_samples(self, sample_rate: float, channels: int) -> int:
+        """Return the number of samples in a message."""
+        seconds = self.parameters.values()['block_seconds']
+        most = (MAX_MESSAGE_BYTES - 4096) // (8 * channels)
+        return max(1, min(round(seconds * sample_rate), most))
+
+    def begin(self, *, portion_seconds: float, portion_bytes: int, pulses: bool,
+              waveform: bool) -> None:
+        """Make the keyphasor's publishers and start the timer; call last in `__init__`."""
+        if pulses:
+            self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
+        if waveform:
+            self._waveform = self.create_output(Float64MultiArray, 'tach_waveform', INPUT_QOS)
+        self._portion_seconds, self._portion_bytes = portion_seconds, portion_bytes
+        self._stream = self.portions()
+        self._timer = self.create_steady_timer(self._period(self._pacer.rate), self._tick)
+        self.parameters.watch(check=self.check, apply=self.apply)
+
+    def check(self, values: Values) -> None:
+        """Raise SaJitterError if the node could not run with these values."""
+
+    def apply(self, values: Values) -> None:
+        """Take over values that changed."""
+        if values['playing'] and not self._playing and self._stream is None:
+            self._stream = self.portions()  # it had ended: play it again
+        self._playing = values['playing']
+        self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
+        self._pacer.run(time.monotonic(), rate=values['rate'],
+                        running=self._playing and self._started)
+
+    def _period(self, rate: float) -> float:
+        return float(np.clip(self._portion_seconds / rate, 0.002, 0.05))
+
+    # --- sending ---
+
+    def _tick(self) -> None:
+        if not self._playing or not (self._started or self._may_start()):
+            return
+        due = self._pacer.due(time.monotonic())
+        period = self._period(self._pacer.rate)
+        most = math.ceil(period * self._pacer.rate / self._portion_seconds) + 1
+        most = min(most, max(1, int(period * TRANSPORT_BYTES_PER_SECOND / self._portion_bytes)))
+        try:
+            for _ in range(most):
+                if self._sent >= due or not self._send_next():
+                    break
+        except SaJitterError as error:
+            self.faults['stream'] = str(error)
+            self.get_logger().error(str(error))
+            self._end()
+            return
+        lag = due - self._sent
+        if self._playing and lag > PATIENCE * self._pacer.rate + 2 * self._portion_seconds:
+            self._pacer.forgive(lag)
+            self.warn(f'cannot send at {self._pacer.rate:g} x real time: slower than asked')
+        self._log_progress()
+
+    def _may_start(self) -> bool:
+        """Start once the outputs that matter have subscribers, or after the waiting time."""
+        tach = [item for item in (self._pulse, self._waveform) if item is not None]
+        heard = self._vibration.get_subscription_count() > 0 and (
+            not tach or any(item.get_subscription_count() > 0 for item in tach))
+        now = time.monotonic()
+        self._started = heard or now - self._born >= self._wait
+        if self._started:
+            self._pacer.run(now, rate=self._pacer.rate, running=True)
+        return self._started
+
+    def _send_next(self) -> bool:
+        if self._stream is None:
+            return False
+        portion = next(self._stream, None)
+        if portion is None and self.again():
+            self._stream = self.portions()
+            portion = next(self._stream, None)
+        if portion is None:
+            self.get_logger().info(f'end: {self.progress(self._sent)}, {self._sent_pulses} pulses')
+            self._end()
+            return False
+        for block in portion.vibration:
+            self._vibration.publish(self._encode(block))
+        for block in portion.waveform:
+            self._waveform.publish(encode_samples(block))
+        self._send_pulses(portion.pulses)
+        self._sent += portion.seconds
+        return True
+
+    def _send_pulses(self, times: FloatArray) -> None:
+        self._sent_pulses += times.size
+        if self._pulse_type is not TimeReference:
+            if times.size:
+                self._pulse.publish(encode_pulse_array(times))
+            return
+        for pulse in times.tolist():
+            self._pulse.publish(encode_pulse_reference(pulse, self._keyphasor))
+
+    def _end(self) -> None:
+        self._stream = None
+        self.set_parameters([as_ros_parameter('playing', False)])
+
+    def _log_progress(self) -> None:
+        now = time.monotonic()
+        if now - self._progress_time >= PROGRESS_PERIOD:
+            self._progress_time = now
+            self.get_logger().info(self.progress(self._sent))
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Say what is going on and how far it is."""
+        state = ('ended' if self._stream is None else 'stopped' if not self._playing
+                 else 'playing' if self._started else 'waiting for subscribers')
+        return f'{state}, {self.progress(self._sent)}', {
+            'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': str(self._sent_pulses)}

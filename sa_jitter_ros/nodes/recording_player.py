@@ -1,0 +1,158 @@
+"""Node `recording_player`: a recording as the topics it was measured on."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.nodes.base import run_node
+from sa_jitter_ros.nodes.parameters import Parameter
+from sa_jitter_ros.nodes.playback import finite_blocks, PlaybackNode, Portion
+from sa_jitter_ros.recordings import ChannelMap, open_recording, Recording
+
+FloatArray = NDArray[np.float64]
+
+PARAMETERS = (
+    Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
+    Parameter('loop', False, 'start again at the end, times and indices going on'),
+    Parameter('tach', 'auto', 'keyphasor to play: the first of pulses, waveform and reference '
+              'pulses that there is (auto), or one of them, or pulses and waveform both',
+              choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'),
+              read_only=True),
+    Parameter('keyphasor_rate', 0.0, 'clock to which pulse times are rounded up, as if the '
+              'keyphasor had been sampled; 0 for times as recorded', unit='Hz', minimum=0.0,
+              read_only=True),
+    Parameter('acquisition', 0, 'which acquisition, of a file that holds several', minimum=0,
+              read_only=True),
+    Parameter('sample_rate', 0.0, 'sampling rate where the file does not say it, else 0',
+              unit='Hz', minimum=0.0, read_only=True),
+    Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic; '
+              'empty for all but the tach', element=str, read_only=True),
+    Parameter('tach_channel', '', 'name or number of the channel that is the tach waveform',
+              read_only=True),
+    Parameter('time_column', '', 'column of a .csv with the times', read_only=True),
+)
+
+
+class RecordingPlayer(PlaybackNode):
+    """Publishes a recording's vibration and keyphasor."""
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('recording_player', PARAMETERS, **node_kwargs)
+        values = self.parameters.values()
+        if not values['recording']:
+            raise ParameterError("recording is '': give a file, as in --ros-args -p "
+                                 'recording:=rig.npz')
+        self._recording = recording = open_recording(
+            values['recording'], acquisition=values['acquisition'],
+            sample_rate=values['sample_rate'] or None,
+            channel_map=ChannelMap(tuple(values['vibration_channels']), values['tach_channel'],
+                                   values['time_column']))
+        for remark in recording.remarks:
+            self.warn(remark)
+        self._pulse_times, self._with_waveform = keyphasor_of(recording, values['tach'])
+        if self._pulse_times is not None and values['keyphasor_rate'] > 0.0:
+            self._pulse_times = (np.ceil(self._pulse_times * values['keyphasor_rate'])
+                                 / values['keyphasor_rate'])
+        if self._pulse_times is None and not self._with_waveform:
+            self.get_logger().warning('plays vibration only: no keyphasor')
+        self._passes = 0
+        self._block = self.block_samples(recording.sample_rate, recording.channels)
+        self.begin(portion_seconds=self._block / recording.sample_rate,
+                   portion_bytes=8 * self._block * recording.channels,
+                   pulses=self._pulse_times is not None, waveform=self._with_waveform)
+        self.get_logger().info(
+            f'{recording.description or values["recording"]}: {recording.channels} channels at '
+            f'{recording.sample_rate:g} Hz, {recording.duration:.3f} s')
+
+    def portions(self) -> Iterator[Portion]:
+        """Return one pass through the recording, times and indices going on from the last."""
+        number, self._passes = self._passes, self._passes + 1
+        return passage(self._recording, self._pulse_times, self._with_waveform, self._block,
+                       number, self.counts)
+
+    def again(self) -> bool:
+        """Return whether the recording is looped."""
+        return bool(self.parameters.values()['loop'])
+
+    def progress(self, sent: float) -> str:
+        """Say how far the recording is."""
+        total = self._recording.duration
+        passed = sent - (self._passes - 1) * total
+        loops = f', pass {self._passes}' if self._passes > 1 else ''
+        return f'{passed:.1f} of {total:.1f} s ({passed / total:.0%}){loops}'
+
+
+def keyphasor_of(recording: Recording, tach: str) -> tuple[FloatArray | None, bool]:
+    """Return the pulse times to play (None for none) and whether to play the waveform."""
+    offers = {'pulses': recording.pulse_times is not None, 'waveform': recording.tach is not None,
+              'reference': recording.reference_pulse_times is not None}
+    wanted = {'auto': next(([name] for name in offers if offers[name]), []), 'none': [],
+              'both': ['pulses', 'waveform']}.get(tach, [tach])
+    for name in wanted:
+        if not offers[name]:
+            found = ', '.join(item for item in offers if offers[item]) or 'no keyphasor'
+            raise ParameterError(f'tach is {tach!r}, but the recording has {found}: choose auto')
+    pulses = (recording.reference_pulse_times if 'reference' in wanted
+              else recording.pulse_times if 'pulses' in wanted else None)
+    return pulses, 'waveform' in wanted
+
+
+def passage(recording: Recording, pulse_times: FloatArray | None, with_waveform: bool,
+            block_samples: int, number: int, counts: dict[str, int]) -> Iterator[Portion]:
+    """
+    Iterate over pass `number` of a recording.
+
+    Samples that are NaN are left out and counted in `counts`; so are pulses beyond the vibration.
+    """
+    rate, origin = recording.sample_rate, recording.start_time
+    first = number * recording.samples
+    shift = first / rate
+    pulses = np.empty(0) if pulse_times is None else pulse_times
+    # The first pass also sends the pulses before the first sample.
+    start_time = -np.inf if number == 0 else origin
+    tach_rate = (recording.tach_rate or rate) if with_waveform else rate
+    waveform = _Taken(recording.tach_blocks() if with_waveform else iter(()))
+    tach_first = round(shift * tach_rate)
+    done = 0
+    for block in recording.blocks(block_samples):
+        start, done = done, done + block.shape[1]
+        stop_time = origin + done / rate
+        low, high = np.searchsorted(pulses, [start_time, stop_time])
+        start_time = stop_time
+        vibration = finite_blocks(SampleBlock(block, origin + (first + start) / rate, rate,
+                                              first + start))
+        counts['samples_dropped'] += block.shape[1] - sum(
+            item.samples.shape[1] for item in vibration)
+        tach_index = round(start / rate * tach_rate)
+        samples = waveform.take(round(done / rate * tach_rate) - tach_index)
+        index = tach_first + tach_index
+        tach = (finite_blocks(SampleBlock(samples, origin + index / tach_rate, tach_rate, index))
+                if samples.shape[1] else ())
+        yield Portion(block.shape[1] / rate, vibration, tach, pulses[low:high] + shift)
+    counts['pulses_dropped'] += int(np.count_nonzero(pulses >= start_time))
+
+
+class _Taken:
+    """Takes stretches of any length from a row of blocks."""
+
+    def __init__(self, blocks: Iterator[FloatArray]) -> None:
+        self._blocks = blocks
+        self._held = np.empty((1, 0))
+
+    def take(self, count: int) -> FloatArray:
+        """Return the next `count` samples, fewer at the end."""
+        while self._held.shape[1] < count:
+            block = next(self._blocks, None)
+            if block is None:
+                break
+            self._held = np.concatenate([self._held, block], axis=1)
+        taken, self._held = self._held[:, :count], self._held[:, count:]
+        return taken
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(RecordingPlayer, args)
