@@ -1,0 +1,1 @@
+"""Commands: each module has a `main` that a console script calls."""
