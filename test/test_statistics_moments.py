@@ -185,6 +185,14 @@ def test_leakage_between_components(ratio, cycles, rng):
     assert_moments(draws / cycles, moments)
 
 
+def test_leakage_over_many_orders_takes_the_nodes_it_needs():
+    jitter = [IndependentPulseJitter(Uniform(0.4 / 19.0))]
+    default, fine = (multi_harmonic_moments(
+        [19.0, 38.0], [19.0, 38.0], [1.0, 2.0], jitter, 41, 2.40789, nodes=n) for n in (64, 400))
+    for name in ('mean', 'variance', 'pseudo_variance'):
+        np.testing.assert_allclose(getattr(default, name), getattr(fine, name), atol=1e-12)
+
+
 def test_one_component_alone_is_the_single_harmonic_case():
     jitter = [IndependentPulseJitter(Uniform(0.3))]
     single = cycle_moments([1.0], jitter).averaged(9)
@@ -214,6 +222,8 @@ def test_noise_in_one_line_of_an_average_in_peak_units(rng):
     (lambda jitter: cycle_moments([1.0], jitter).averaged(2.5), 'trigger_cycles is 2.5'),
     (lambda jitter: multi_harmonic_moments([1.0], [1.0], [1.0], jitter, 3, 0.0),
      'cycle_length is 0.0'),
+    (lambda jitter: multi_harmonic_moments([1.0], [500.0], [1.0], jitter, 3, 1.0),
+     'makes 499 turns a trigger cycle'),
     (lambda jitter: gaussian_pulse_jitter([1.0, 0.9]), 'spectrum as low as'),
     (lambda jitter: gaussian_pulse_jitter([]), 'list of finite numbers'),
 ])

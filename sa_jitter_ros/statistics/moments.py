@@ -12,6 +12,7 @@ pulse, so lag 1 belongs in every variance.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ Array = NDArray[Any]
 AngleOffset = Callable[[Array], Array]
 
 NODES = 64
+_MOST_TURNS = 300.0
 
 
 @dataclass(frozen=True)
@@ -169,11 +171,12 @@ def multi_harmonic_moments(
     nodes: int = NODES,
 ) -> AverageMoments:
     """
-    Return the moments of the analysed orders of a signal of several components, leakage included.
+    Return the moments of analysed orders of a signal of several components, leakage included.
 
     The signal is sum_s a_s exp(j 2 pi g_s theta) with `source_orders` g_s and complex `amplitudes`
     a_s; a trigger cycle is `cycle_length` (r) fundamental cycles long. An integer r lets a source
-    leak coherently into its neighbours, a bias that no number of cycles removes (Fig. 7).
+    leak coherently into its neighbours, a bias that no number of cycles removes (Fig. 7). Raises
+    ModelError for components that are more than 300 turns a trigger cycle away from an order.
     """
     g = require_orders(orders)
     sources = require_orders(source_orders)
@@ -182,8 +185,14 @@ def multi_harmonic_moments(
     if not cycle_length > 0.0:
         raise ModelError(f'cycle_length is {cycle_length}: a trigger cycle lasts more than 0 '
                          'fundamental cycles')
-    u, w = unit_nodes(nodes)
-    shift = 2.0 * np.pi * cycle_length * (sources[:, None] - g)  # per cycle, (source, order)
+    turns = cycle_length * (sources[:, None] - g)  # per trigger cycle, (source, order)
+    most = float(np.max(np.abs(turns)))
+    if most > _MOST_TURNS:
+        raise ModelError(
+            f'a source makes {most:.6g} turns a trigger cycle against an analysed order, more '
+            f'than {_MOST_TURNS:g}: so far apart nothing leaks, leave it out')
+    u, w = unit_nodes(max(nodes, math.ceil(np.pi * most) + 24))
+    shift = 2.0 * np.pi * turns
     weight = a[:, None, None] * np.exp(1j * shift[:, :, None] * u) * w
     steps = np.exp(1j * shift[:, :, None] * np.arange(trigger_cycles))
     first = [joint_characteristic(processes, [s], [u], [0]) for s in sources]
@@ -198,14 +207,14 @@ def multi_harmonic_moments(
             for t, late in enumerate(sources):
                 joint = (joint_characteristic(processes, [early, -late], *points)
                          - np.multiply.outer(first[s], first[t].conj()))
-                turns = np.sum(steps[s][:, :trigger_cycles - lag]
-                               * steps[t][:, lag:].conj(), axis=-1)
+                beat = np.sum(steps[s][:, :trigger_cycles - lag]
+                              * steps[t][:, lag:].conj(), axis=-1)
                 variance += scale * np.real(
-                    turns * np.sum((weight[s] @ joint) * weight[t].conj(), axis=-1))
+                    beat * np.sum((weight[s] @ joint) * weight[t].conj(), axis=-1))
                 joint = (joint_characteristic(processes, [early, late], *points)
                          - np.multiply.outer(first[s], first[t]))
-                turns = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
-                pseudo += scale * turns * np.sum((weight[s] @ joint) * weight[t], axis=-1)
+                beat = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
+                pseudo += scale * beat * np.sum((weight[s] @ joint) * weight[t], axis=-1)
     return AverageMoments(means.sum(axis=0), variance, pseudo)
 
 

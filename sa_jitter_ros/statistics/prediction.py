@@ -214,7 +214,7 @@ def predict(
     everything = (*declared, *processes)
     plain = declared_jitter and not processes and offset is None
     spread = float(orders.max()) * frequency * math.sqrt(jitter.variance)
-    nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 80))
+    nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 160))
     noise = np.asarray(line_variance) + (
         noise_line_variance(model.noise_std, model.sample_rate, model.duration)
         if model.noise_std else 0.0)
