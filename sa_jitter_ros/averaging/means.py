@@ -128,7 +128,8 @@ class ExponentialMean:
     Exponentially weighted mean with the noise reduction of `cycles` equal weights.
 
     The weight of a new array is 2 / (cycles + 1), for which white noise has the variance
-    1 / cycles of one array's; until that many have come it is the plain mean.
+    1 / cycles of one array's; until that many have come it is the plain mean. Where it became
+    undefined, the next defined value starts it anew.
     """
 
     def __init__(self, cycles: float) -> None:
@@ -147,8 +148,10 @@ class ExponentialMean:
             self._variance = np.zeros(values.shape)
         else:
             step = values - self._mean
-            self._mean += weight * step
-            self._variance = (1.0 - weight) * (self._variance + weight * np.abs(step) ** 2)
+            anew = np.isnan(self._mean)
+            self._mean = np.where(anew, values, self._mean + weight * step)
+            self._variance = np.where(
+                anew, 0.0, (1.0 - weight) * (self._variance + weight * np.abs(step) ** 2))
         self._squared_weights = (1.0 - weight) ** 2 * self._squared_weights + weight**2
 
     @property

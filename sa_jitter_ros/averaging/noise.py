@@ -23,8 +23,9 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
     if count < 2:
         return np.full(cycles.shape[1:], np.nan)
     mean = cycles.mean(axis=0)
-    direction = np.where(mean == 0.0, 1.0, mean)
-    radial = (cycles * np.conj(direction / np.abs(direction))).real
+    size = np.abs(mean)
+    turn = np.where(size > 0.0, mean, 1.0) / np.where(size > 0.0, size, 1.0)
+    radial = (cycles * np.conj(turn)).real
     lines = (count - 1) // 2
     if lines < _MEDIAN_FROM:
         return np.asarray(np.sqrt(radial.var(axis=0, ddof=1) / count))

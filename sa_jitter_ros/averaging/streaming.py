@@ -15,7 +15,8 @@ from sa_jitter_ros.angle.laws import angle_law
 from sa_jitter_ros.angle.pulses import PulseValidator, TriggerPulses
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, SynchronousAverage
-from sa_jitter_ros.averaging.timeline import SampleBlock, Stretch, VibrationTimeline
+from sa_jitter_ros.averaging.stretch import Stretch
+from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 FloatArray = NDArray[np.float64]
@@ -26,12 +27,14 @@ class Trigger:
     """
     A trigger pulse at `time` (s).
 
-    `starts_run` tells that no trigger cycle ends here, `epoch` how often time ran back before.
+    `starts_run` tells that no trigger cycle ends here, `epoch` how often time ran back before,
+    `elapsed` is the time (s) gone by since the first pulse, whenever it ran back.
     """
 
     time: float
     starts_run: bool
     epoch: int
+    elapsed: float
 
 
 @dataclass
@@ -113,29 +116,35 @@ class StreamingAverager:
     # --- pulses ---
 
     def _queue(self, triggers: TriggerPulses) -> None:
-        for time, starts, restarted in zip(triggers.times.tolist(), triggers.starts_run.tolist(),
-                                           triggers.restarted.tolist()):
+        for number, (time, starts, restarted) in enumerate(zip(
+                triggers.times.tolist(), triggers.starts_run.tolist(),
+                triggers.restarted.tolist())):
             newest = self.timeline.epoch
+            # the first pulses of all may be few enough to leave the vibration before out of it
+            reach = time if self._triggers else triggers.times[number:number + 3][-1]
             if restarted:
                 # held until its vibration comes, unless that restarted before
                 self._pulse_epoch = max(self._pulse_epoch + 1, newest)
-            elif self._pulse_epoch < newest and time > self.timeline.previous_end:
+            elif self._pulse_epoch < newest and not self.timeline.held_before(reach):
                 # the vibration restarted and the pulses had not run ahead of it
                 self._pulse_epoch, starts = newest, True
-            self._triggers.append(Trigger(time, starts or not self._triggers, self._pulse_epoch))
+            last = self._triggers[-1] if self._triggers else Trigger(time, True, 0, 0.0)
+            self._triggers.append(Trigger(time, starts or not self._triggers, self._pulse_epoch,
+                                          last.elapsed + max(time - last.time, 0.0)))
 
     def _bound_pulses(self) -> None:
         """Drop and count the oldest pulses that wait longer than the buffer for their vibration."""
         limit = self.timeline.buffer_seconds
         waiting = self._triggers[self._next:]
-        if not waiting or waiting[-1].time - waiting[0].time <= limit:
+        if not waiting or waiting[-1].elapsed - waiting[0].elapsed <= limit:
             return
         if waiting[0].epoch > self.timeline.epoch:
             # the vibration does not run back: these pulses belong to what there is
             self._pulse_epoch = self.timeline.epoch
             self._triggers[self._next:] = [
                 replace(item, epoch=self._pulse_epoch) for item in waiting]
-        keep = next(i for i, item in enumerate(waiting) if waiting[-1].time - item.time <= limit)
+        keep = next(i for i, item in enumerate(waiting)
+                    if waiting[-1].elapsed - item.elapsed <= limit)
         if keep:
             self.counts.pulses_dropped += keep
             self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
@@ -163,11 +172,7 @@ class StreamingAverager:
             if isinstance(stretch, str):
                 self._discard(1, stretch)
                 continue
-            try:
-                averages += self._hand_over(stretch)
-            except SignalError as error:
-                self._discard(1, str(error))
-                continue
+            averages += self._hand_over(stretch)
             self._next += 1
         self._forget_used()
         return averages
@@ -204,12 +209,18 @@ class StreamingAverager:
             break
         if ahead and start.epoch == timeline.epoch:
             return None
+        remedy = ''
+        if timeline.layout is not None:
+            rate = timeline.layout[1]
+            margin = max(item.margin(end.time - start.time, rate) for item in self.shafts.values())
+            if end.time - start.time + 2 * margin / rate > timeline.buffer_seconds:
+                remedy = f' (raise buffer_seconds = {timeline.buffer_seconds:g} s, it is longer)'
         return (f'no gapless vibration for the trigger cycle from {start.time:.6g} s to '
-                f'{end.time:.6g} s')
+                f'{end.time:.6g} s{remedy}')
 
     def _hand_over(self, stretch: Stretch) -> list[tuple[str, SynchronousAverage]]:
         """Give the next cycle to every shaft."""
-        begin = max(self._run, self._next - self._law.before)
+        begin = max(self._run, self._next - self._law.before, 0)
         stop = self._next + 2
         for item in self._triggers[stop:stop + self._law.after_first]:
             if item.starts_run:
@@ -218,7 +229,7 @@ class StreamingAverager:
         pulses = np.array([item.time for item in self._triggers[begin:stop]])
         first = self._next - begin
         low, high = stretch.position(pulses[first:first + 2])
-        averages = []
+        averages, failed = [], ''
         self._lead = 0.0
         for name, shaft in self.shafts.items():
             margin = shaft.margin(float(pulses[first + 1] - pulses[first]), stretch.clock.rate)
@@ -227,9 +238,17 @@ class StreamingAverager:
             cycle = CycleSamples(
                 stretch.samples[offset:int(np.ceil(high)) + margin + 1],
                 stretch.clock.time_of(stretch.index + offset), stretch.clock.rate, pulses, first)
-            average = shaft.update(cycle)
+            try:
+                average = shaft.update(cycle)
+            except SignalError as error:  # of this shaft: the others go on
+                self.counts.averages_dropped += shaft.reset()
+                failed = f'{name}: {error}'
+                continue
             if average is not None:
                 averages.append((name, average))
+        if failed:
+            self.counts.cycles_dropped += 1
+            self._messages.append(f'{failed}: trigger cycle discarded')
         self.counts.cycles += 1
         self._speed = (self._speed[0] + 1,
                        self._speed[1] + float(pulses[first + 1] - pulses[first]))
@@ -250,7 +269,7 @@ class StreamingAverager:
         self._begin_run()
 
     def _begin_run(self) -> None:
-        self._run = self._next
+        self._run, self._lead = self._next, np.inf
         lost = [shaft.reset() for shaft in self.shafts.values()]
         self.counts.averages_dropped += sum(lost)
 
@@ -260,7 +279,7 @@ class StreamingAverager:
             return
         head = self._triggers[min(self._next, len(self._triggers) - 1)]
         self.timeline.release(head.epoch, head.time - self._lead)
-        keep = max(self._run, self._next - self._law.before)
+        keep = max(self._run, self._next - self._law.before, 0)
         del self._triggers[:keep]
         self._next -= keep
         self._run -= keep

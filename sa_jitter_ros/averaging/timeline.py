@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.stretch import Clock, Stretch
 from sa_jitter_ros.errors import SignalError
 
 FloatArray = NDArray[np.float64]
@@ -47,81 +48,6 @@ class TimelineCounts:
     clock_deviation: int = 0
     blocks_rejected: int = 0
     non_finite: int = 0
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Times of a run of samples: that of the first one, and on from there by index over rate."""
-
-    time: float
-    index: int
-    rate: float
-
-    def time_of(self, index: float) -> float:
-        """Time (s) of a sample index."""
-        return self.time + (index - self.index) / self.rate
-
-
-class Stretch:
-    """
-    Consecutive finite samples on one clock; grows at the end, is trimmed at the start.
-
-    `epoch` counts how often time ran back before it; `closed` tells that no sample will follow.
-    """
-
-    def __init__(self, clock: Clock, epoch: int, index: int, samples: FloatArray) -> None:
-        self.clock, self.epoch, self.closed = clock, epoch, False
-        self._data = np.ascontiguousarray(samples.T)
-        self._begin, self._end = 0, len(self._data)
-        self._index = index
-
-    @property
-    def index(self) -> int:
-        """Index of the first sample held."""
-        return self._index + self._begin
-
-    @property
-    def end_index(self) -> int:
-        """Index after the last sample held."""
-        return self._index + self._end
-
-    @property
-    def samples(self) -> FloatArray:
-        """Samples held (sample, channel), without a copy."""
-        return self._data[self._begin:self._end]
-
-    @property
-    def start_time(self) -> float:
-        """Time of the first sample held."""
-        return self.clock.time_of(self.index)
-
-    @property
-    def end_time(self) -> float:
-        """Time of the last sample held."""
-        return self.clock.time_of(self.end_index - 1)
-
-    def position(self, time: float) -> float:
-        """Position of a time (s) in samples from the first one held."""
-        return (time - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
-
-    def append(self, samples: FloatArray) -> None:
-        """Add samples (channel, sample) behind the last one."""
-        count = samples.shape[1]
-        if self._end + count > len(self._data):
-            held = self.samples
-            size = max(2 * (len(held) + count), 1024)
-            data = np.empty((size, held.shape[1]))
-            data[:len(held)] = held
-            self._index, self._data = self.index, data
-            self._begin, self._end = 0, len(held)
-        self._data[self._end:self._end + count] = samples.T
-        self._end += count
-
-    def trim(self, index: int) -> int:
-        """Forget the samples before `index`; returns how many those were."""
-        count = min(max(index - self.index, 0), self._end - self._begin)
-        self._begin += count
-        return count
 
 
 def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
@@ -214,6 +140,11 @@ class VibrationTimeline:
             item.trim(item.end_index)
         self._tidy()
         return taken
+
+    def held_before(self, time: float) -> bool:
+        """Whether samples from before the latest restart are held that reach a time (s)."""
+        return time <= self.previous_end and any(
+            item.epoch < self.epoch and item.end_time >= time for item in self.stretches)
 
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
