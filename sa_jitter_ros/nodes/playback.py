@@ -102,7 +102,7 @@ class PlaybackNode(MonitoringNode):
         self._pulse = self._waveform = None
         self._pacer = Pacer(values['rate'])
         self._playing, self._started = values['playing'], False
-        self._born = time.monotonic()
+        self._born, self._rest = time.monotonic(), 0.0
         self._wait = values['wait_seconds']
         self._sent = 0.0
         self._sent_pulses = 0
@@ -161,9 +161,10 @@ class PlaybackNode(MonitoringNode):
     # --- sending ---
 
     def _tick(self) -> None:
-        if not self._playing or not (self._started or self._may_start()):
+        now = time.monotonic()
+        if not self._playing or now < self._rest or not (self._started or self._may_start()):
             return
-        due = self._pacer.due(time.monotonic())
+        due = self._pacer.due(now)
         period = self._period(self._pacer.rate)
         most = math.ceil(period * self._pacer.rate / self._portion_seconds) + 1
         most = min(most, max(1, int(period * TRANSPORT_BYTES_PER_SECOND / self._portion_bytes)))
@@ -180,6 +181,9 @@ class PlaybackNode(MonitoringNode):
         if self._playing and lag > PATIENCE * self._pacer.rate + 2 * self._portion_seconds:
             self._pacer.forgive(lag)
             self.warn(f'cannot send at {self._pacer.rate:g} x real time: slower than asked')
+        # Who shares the executor gets as much of its time.
+        ended = time.monotonic()
+        self._rest = ended + (ended - now)
         self._log_progress()
 
     def _may_start(self) -> bool:

@@ -64,8 +64,8 @@ class RecordingPlayer(PlaybackNode):
                    portion_bytes=8 * self._block * recording.channels,
                    pulses=self._pulse_times is not None, waveform=self._with_waveform)
         self.get_logger().info(
-            f'{recording.description or values["recording"]}: {recording.channels} channels at '
-            f'{recording.sample_rate:g} Hz, {recording.duration:.3f} s')
+            f'{values["recording"]}: {recording.channels} channels at {recording.sample_rate:g} '
+            f'Hz, {recording.duration:.3f} s')
 
     def portions(self) -> Iterator[Portion]:
         """Return one pass through the recording, times and indices going on from the last."""

@@ -238,8 +238,11 @@ class Gearbox:
         seen = kept[np.clip(pulse - pulses.index[0], 0, kept.size - 1).astype(np.int64)]
         # A missing pulse leaves the waveform where it is just before one: low, or in the middle.
         within = np.where(seen, phase - pulse, 0.0 if keyphasor.waveform == 'sine' else 0.74)
-        rate = keyphasor.pulses_per_revolution * motion.speed(true_times)
-        waveform = keyphasor.shape(within, np.maximum(rate, np.finfo(float).tiny))
+        rise: FloatArray | float = 0.0
+        if keyphasor.rise_time > 0.0:
+            pulse_rate = keyphasor.pulses_per_revolution * motion.speed(true_times)
+            rise = keyphasor.rise_time * pulse_rate
+        waveform = keyphasor.shape(within, rise)
         noise = RandomStream(self.seed, 'keyphasor noise').normal(start, stop)
         return waveform + keyphasor.noise_std * noise
 

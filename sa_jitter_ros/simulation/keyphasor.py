@@ -83,19 +83,19 @@ class Keyphasor:
         """Return the number of pulses of a trigger cycle."""
         return self.pulses_per_trigger or self.pulses_per_revolution
 
-    def shape(self, phase: FloatArray, pulse_rate: FloatArray) -> FloatArray:
+    def shape(self, phase: FloatArray, rise: FloatArray | float) -> FloatArray:
         """
         Return the noiseless waveform.
 
-        `phase` counts from 0 at a pulse to 1 at the next, and may start a quarter below;
-        `pulse_rate` is its rate in Hz.
+        `phase` counts from 0 at a pulse to 1 at the next, and may start a quarter below; a ttl
+        edge takes the share `rise` of that.
         """
         middle = (self.low + self.high) / 2.0
         if self.waveform == 'sine':
             return middle + (self.high - self.low) / 2.0 * np.sin(2.0 * np.pi * phase)
-        edge = np.minimum(phase, self.duty - phase) / pulse_rate  # s inside the pulse
+        inside = np.minimum(phase, self.duty - phase)
         if self.rise_time > 0.0:
-            level = np.clip(0.5 + edge / self.rise_time, 0.0, 1.0)
+            level = np.clip(0.5 + inside / np.maximum(rise, np.finfo(np.float64).tiny), 0.0, 1.0)
         else:
-            level = (edge >= 0.0).astype(np.float64)
+            level = (inside >= 0.0).astype(np.float64)
         return self.low + (self.high - self.low) * level
