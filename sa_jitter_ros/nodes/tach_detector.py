@@ -1,5 +1,6 @@
 """Node `tach_detector`: the sampled keyphasor signal in, tach pulses out."""
 
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,11 @@ from sa_jitter_ros.nodes.parameters import Parameter, Values
 from sensor_msgs.msg import TimeReference
 
 FloatArray = NDArray[np.float64]
+
+# A window of pulses comes at once when the levels have been learnt. A subscriber queues 200,
+# and it may be busy with an average for a while: they go out little by little.
+BURST = 10
+BURST_PERIOD = 0.01  # s
 
 PARAMETERS = (
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of tach_waveform',
@@ -74,8 +80,10 @@ class TachDetector(MonitoringNode):
         self._detector = detector_of(values)
         self._epoch = 0
         self._pulses = 0
+        self._waiting: deque[float] = deque()
         self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
         self.create_input(SAMPLE_TYPES[waveform_type], 'tach_waveform', self._on_waveform)
+        self.create_steady_timer(BURST_PERIOD, self._send_waiting)
         self.parameters.watch(check=detector_of, apply=self._apply)
 
     def _apply(self, values: Values) -> None:
@@ -102,12 +110,16 @@ class TachDetector(MonitoringNode):
 
     def _publish(self, times: FloatArray) -> None:
         self._pulses += len(times)
-        if self._pulse_type is not TimeReference:
-            if len(times):
-                self._pulse.publish(encode_pulse_array(times))
-            return
-        for time in times.tolist():
-            self._pulse.publish(encode_pulse_reference(time, self._keyphasor))
+        if self._pulse_type is TimeReference:
+            self._waiting.extend(times.tolist())
+            self._send_waiting()
+        elif len(times):
+            self._pulse.publish(encode_pulse_array(times))
+
+    def _send_waiting(self) -> None:
+        count = max(BURST, len(self._waiting) // 100)
+        for _ in range(min(count, len(self._waiting))):
+            self._pulse.publish(encode_pulse_reference(self._waiting.popleft(), self._keyphasor))
 
     def update_counts(self) -> None:
         """Gather the counts of the core."""

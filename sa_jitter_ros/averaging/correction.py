@@ -1,0 +1,114 @@
+"""An average with the errors of its pulses recovered from the vibration, and taken out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.laws import angle_law
+from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
+from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
+from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, SynchronousAverage
+
+FloatArray = NDArray[np.float64]
+
+_REACH = 0.02  # of a trigger cycle by which a corrected pulse may move
+
+
+@dataclass(frozen=True)
+class Correction:
+    """
+    What the vibration tells about the pulses of an average.
+
+    `corrected` is the average between corrected pulses, the raw one where the recovery was refused
+    (`recovery.reason` says why). `attenuation` (channel, order) is raw over corrected amplitude;
+    the noise of the two is the same noise, so that its `attenuation_standard_error` is that of a
+    ratio of correlated amplitudes.
+    """
+
+    corrected: SynchronousAverage
+    recovery: PulseErrorRecovery
+    attenuation: FloatArray
+    attenuation_standard_error: FloatArray
+
+
+class CorrectingAverager:
+    """A `ShaftAverager` whose averages come with their `Correction` where settings ask for it."""
+
+    def __init__(self, settings: AverageSettings) -> None:
+        self._shaft = ShaftAverager(settings)
+        self._cycles: list[CycleSamples] = []
+
+    @property
+    def settings(self) -> AverageSettings:
+        """Settings in force."""
+        return self._shaft.settings
+
+    def reset(self) -> bool:
+        """Begin again at angle 0; returns whether an unfinished average was lost."""
+        self._cycles.clear()
+        return self._shaft.reset()
+
+    def change(self, settings: AverageSettings) -> bool:
+        """Go on with other settings and the same angle; returns whether an average was lost."""
+        self._cycles.clear()
+        return self._shaft.change(settings)
+
+    def margin(self, period: float, rate: float) -> int:
+        """Samples that a cycle of `period` s at `rate` Hz needs on either side."""
+        reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
+        return self._shaft.margin(period, rate) + reach
+
+    def update(self, cycle: CycleSamples) -> SynchronousAverage | None:
+        """Take the next trigger cycle; returns an average, corrected, when one is due."""
+        average = self._shaft.update(cycle)
+        if not self.settings.correct_jitter:
+            return average
+        self._cycles.append(cycle)
+        if average is None:
+            return None
+        cycles, self._cycles = self._cycles, []
+        return replace(average, correction=correct_average(average, cycles, self.settings))
+
+
+def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
+                    settings: AverageSettings) -> Correction:
+    """
+    Recover the pulse errors of a block average and average its cycles again without them.
+
+    `cycles` are the trigger cycles of `raw`, `settings` those it was made with.
+    """
+    law = angle_law(settings.law)
+    points = grid_points(max(cycle.period for cycle in cycles), cycles[0].rate)
+    u = np.arange(points) / points
+    grid = np.stack([cycle.at(law, u, method=settings.interpolation) for cycle in cycles])
+    clock = settings.keyphasor_rate or cycles[0].rate
+    recovery = recover_pulse_errors(
+        grid, periods=np.diff(raw.pulses), ratio=settings.cycles, first_angle=raw.angle,
+        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+    corrected = raw
+    largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
+    if largest > reach:
+        recovery = replace(recovery, accepted=False, errors=np.zeros_like(recovery.errors),
+                           reason=f'a pulse error of {largest:.3g} s is above {reach:.3g} s, '
+                                  f'{_REACH:.0%} of a trigger cycle: validate the pulses')
+    elif recovery.accepted:
+        corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        amplitude = np.abs(corrected.amplitudes)
+        attenuation = np.abs(raw.amplitudes) / amplitude
+        # The noises of raw and corrected are correlated by what the signal keeps, `attenuation`.
+        error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
+    return Correction(corrected, recovery, attenuation, error)
+
+
+def _average_again(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
+                   settings: AverageSettings, pulses: FloatArray) -> SynchronousAverage:
+    """Average the same cycles between corrected pulses."""
+    again = replace(settings, samples_per_revolution=raw.waveform.shape[1])
+    shaft = ShaftAverager(again, first_cycle=round(raw.angle / settings.cycles))
+    for index, cycle in enumerate(cycles):
+        average = shaft.update(replace(cycle, pulses=pulses, first=index))
+    assert average is not None
+    return replace(average, sequence=raw.sequence)

@@ -1,0 +1,137 @@
+"""What the demo does with a recording: how to average it, and what to declare for it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
+from sa_jitter_ros.angle.pulses import PulseValidator
+from sa_jitter_ros.averaging.shaft import AverageSettings
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings import open_recording, Recording
+
+FloatArray = NDArray[np.float64]
+
+LOOK = 10.0  # s of a recording that are looked at before it is played
+ORDERS = 6
+AVERAGES = 8  # that a recording should give
+BLOCK = 16384
+
+
+@dataclass(frozen=True)
+class Plan:
+    """
+    How a source is played, averaged and predicted.
+
+    `source` is the node that plays it, with `source_parameters`; `seconds` it lasts, `speed` of
+    the tach shaft and `keyphasor_rate` in Hz; `waveform` tells that pulses come from a tach
+    waveform; `note` is a remark for the user.
+    """
+
+    source: str
+    source_parameters: Mapping[str, object]
+    title: str
+    seconds: float
+    channels: tuple[str, ...]
+    unit: str
+    speed: float
+    keyphasor_rate: float
+    pulses_per_revolution: int
+    ratio: float
+    trigger_cycles: int
+    orders: tuple[float, ...]
+    waveform: bool = False
+    note: str = ''
+
+
+_SPEED, _RATIO, _CLOCK, _SECONDS = 16.6, 2.40789, 3000.0, 20.0
+SIMULATED = Plan(
+    source='machine_simulator',
+    source_parameters={
+        'speed': _SPEED, 'shaft.ratio': _RATIO, 'shaft.teeth': 19,
+        'shaft.harmonics': (1.0, 0.5, 0.25), 'shaft.sidebands': 0.1,
+        'speed_fluctuation_std': 2e-4, 'channel_gains': (1.0, 0.6), 'noise_std': 0.3,
+        'sample_rate': 20000.0, 'keyphasor_rate': _CLOCK, 'duration': _SECONDS, 'seed': 1},
+    title='simulated gearbox, gear of 19 teeth', seconds=_SECONDS,
+    channels=('channel 0', 'channel 1'), unit='m/s^2', speed=_SPEED, keyphasor_rate=_CLOCK,
+    pulses_per_revolution=1, ratio=_RATIO, trigger_cycles=30,
+    orders=(18.0, 19.0, 20.0, 37.0, 38.0, 39.0, 57.0))
+
+
+def plan_recording(path: Path, *, keyphasor_rate: float = 0.0) -> Plan:
+    """
+    Look at the first seconds of a recording.
+
+    With `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if the
+    keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
+    """
+    recording = open_recording(path)
+    first, pulses = _pulses(recording)
+    validator = PulseValidator(pulses_per_revolution=recording.pulses_per_revolution)
+    triggers = validator.update(pulses)
+    cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
+    if len(cycles) < 4:
+        raise RecordingError(f'{len(pulses)} pulses give {len(cycles)} trigger cycles in '
+                             f'the first {LOOK:g} s: at least 4 are needed')
+    period = float(np.median(cycles))
+    revolutions = recording.vibration.samples / recording.sample_rate / period
+    trigger_cycles = int(np.clip(revolutions // AVERAGES, 2, 100))
+    waveform = recording.pulse_times is None and recording.tach is not None
+    if keyphasor_rate and waveform:
+        raise RecordingError('a tach waveform has the rate at which it was sampled: leave '
+                             '--keyphasor-rate out')
+    rate = keyphasor_rate or recording.tach_rate or recording.sample_rate
+    note = '' if keyphasor_rate or recording.tach_rate else (
+        'the recording does not say at which rate the keyphasor was sampled: that of the '
+        'vibration is assumed')
+    return Plan(
+        source='recording_player',
+        source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate},
+        title=path.name, seconds=recording.vibration.samples / recording.sample_rate,
+        channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
+        speed=1.0 / period, keyphasor_rate=rate,
+        pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
+        trigger_cycles=trigger_cycles,
+        orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
+        waveform=waveform, note=note)
+
+
+def _pulses(recording: Recording) -> tuple[SampleBlock, FloatArray]:
+    """Vibration and pulse times of the first seconds."""
+    count = round(LOOK * recording.sample_rate)
+    samples = next(recording.vibration.blocks(count))
+    block = SampleBlock(samples, recording.start_time, recording.sample_rate, 0)
+    end = recording.start_time + samples.shape[1] / recording.sample_rate
+    times = recording.pulse_times
+    if times is None:
+        times = recording.reference_pulse_times
+    if times is not None:
+        return block, times[times <= end]
+    if recording.tach is None or recording.tach_rate is None:
+        raise RecordingError('no keyphasor: neither pulse times nor a tach waveform; averaging '
+                             'needs one')
+    waveform = next(recording.tach.blocks(math.ceil(LOOK * recording.tach_rate)))
+    detector = KeyphasorDetector()
+    found = detector.update(waveform[0], recording.start_time, recording.tach_rate)
+    return block, np.concatenate((found, detector.flush()))
+
+
+def _strongest_orders(recording: Recording, block: SampleBlock, pulses: FloatArray,
+                      trigger_cycles: int) -> tuple[float, ...]:
+    """Orders that stand out most in the first average."""
+    averager = StreamingAverager(
+        {'shaft': AverageSettings(cycles=recording.ratio, trigger_cycles=trigger_cycles)},
+        validator=PulseValidator(pulses_per_revolution=recording.pulses_per_revolution),
+        timeline=VibrationTimeline(buffer_seconds=2.0 * LOOK))
+    averages = averager.add_pulses(pulses) + averager.add_samples(block)
+    if not averages:
+        return (1.0, 2.0, 3.0)
+    waveform = averages[0][1].waveform
+    amplitude = np.abs(np.fft.rfft(waveform, axis=1)).max(axis=0)[1:waveform.shape[1] // 3]
+    strongest = np.sort(np.argsort(amplitude)[-ORDERS:]) + 1
+    return tuple(float(order) for order in strongest)

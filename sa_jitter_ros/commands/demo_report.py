@@ -1,0 +1,123 @@
+"""What the demo ends with: a table of the orders, and two figures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.commands.demo_plan import Plan
+from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage
+
+FloatArray = NDArray[np.float64]
+
+RAW, CORRECTED, MEASURED = 'tab:red', 'tab:blue', 'black'
+
+
+def amplitude_rows(amplitudes: Sequence[AverageMessage]) -> tuple[FloatArray, FloatArray]:
+    """Tables (average, order, field) of every order on its strongest channel, and the channels."""
+    table = np.stack([item.values for item in amplitudes])  # average, channel, order, field
+    channels = np.argmax(np.nanmean(table[..., 1], axis=0), axis=0)
+    return table[:, channels, np.arange(table.shape[2])], channels
+
+
+def text_table(plan: Plan, amplitudes: Sequence[AverageMessage],
+               prediction: PredictionMessage | None) -> str:
+    """Table of the orders: measured amplitude, attenuation, and what was predicted."""
+    rows, channels = amplitude_rows(amplitudes)
+    unit = f' [{plan.unit}]' if plan.unit and plan.unit != 'unknown' else ''
+    lines = [f'{"order":>8} {"channel":>12} {"amplitude" + unit:>16} {"corrected":>10} '
+             f'{"noise":>9} {"attenuation":>12} {"predicted mean [5 % .. 95 %]":>30}']
+    for i in range(rows.shape[1]):
+        order, raw, _, corrected, _, attenuation, _, noise = (
+            _mean(rows[:, i, field]) for field in range(rows.shape[2]))
+        row = prediction.values[i] if prediction is not None else np.full(7, np.nan)
+        lines.append(
+            f'{order:8g} {plan.channels[int(channels[i])][:12]:>12} {raw:16.5g} {corrected:10.5g} '
+            f'{noise:9.2g} {attenuation:12.4f} {row[1]:14.4f} [{row[4]:.4f} .. {row[6]:.4f}]')
+    return '\n'.join(lines)
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean without NaN; NaN where there is nothing else."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float('nan')
+
+
+def draw_waveform(plan: Plan, raw: AverageMessage, error: AverageMessage | None,
+                  corrected: AverageMessage | None, path: Path) -> None:
+    """Draw the last synchronous average of up to three channels over the angle."""
+    strongest = np.argsort(-np.nanstd(raw.values, axis=1))[:3]
+    figure = Figure(figsize=(9.0, 2.4 * len(strongest) + 0.8), layout='constrained')
+    panels = figure.subplots(len(strongest), 1, sharex=True, squeeze=False)[:, 0]
+    angle = np.arange(raw.values.shape[1]) / raw.values.shape[1] * 360.0
+    for axes, channel in zip(panels, strongest):
+        if error is not None:
+            axes.fill_between(angle, raw.values[channel] - 2.0 * error.values[channel],
+                              raw.values[channel] + 2.0 * error.values[channel], color=RAW,
+                              alpha=0.25, linewidth=0.0, label='± 2 standard errors')
+        axes.plot(angle, raw.values[channel], color=RAW, linewidth=0.8, label='average')
+        if corrected is not None:
+            axes.plot(angle, corrected.values[channel], color=CORRECTED, linewidth=0.8,
+                      label='with corrected pulses')
+        axes.set_ylabel(f'{plan.channels[channel]}\n{_unit(plan)}')
+        axes.margins(x=0.0)
+    panels[0].legend(loc='upper right', ncols=3, fontsize='small')
+    panels[0].set_title(f'{plan.title}: average of {raw.header.fundamental_cycles} revolutions, '
+                        f'tach shaft at {raw.header.mean_trigger_speed:.4g} Hz', fontsize='medium')
+    panels[-1].set_xlabel('angle of the shaft [degrees]')
+    _save(figure, path)
+
+
+def draw_orders(plan: Plan, amplitudes: Sequence[AverageMessage],
+                prediction: PredictionMessage | None, path: Path) -> None:
+    """Draw amplitudes of the orders, and their attenuation against the predicted one."""
+    rows, _ = amplitude_rows(amplitudes)
+    figure = Figure(figsize=(9.0, 6.2), layout='constrained')
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    position = np.arange(rows.shape[1])
+    _stems(top, position - 0.08, rows[..., 1], RAW, 'measured')
+    if np.isfinite(rows[..., 3]).any():
+        _stems(top, position + 0.08, rows[..., 3], CORRECTED, 'with corrected pulses')
+    top.set_yscale('log')
+    top.set_ylabel(f'amplitude {_unit(plan)}')
+    top.legend(fontsize='small')
+    top.set_title(f'{plan.title}: {len(amplitudes)} averages of {plan.trigger_cycles} trigger '
+                  'cycles, every order on its strongest channel', fontsize='medium')
+    if prediction is not None:
+        low, high = prediction.values[:, 4], prediction.values[:, 6]
+        bottom.bar(position, high - low, bottom=low, width=0.6, color='tab:gray', alpha=0.35,
+                   label='predicted, 5 % to 95 %')
+        bottom.hlines(prediction.values[:, 1], position - 0.3, position + 0.3, color='tab:gray',
+                      label='predicted mean')
+    measured = rows[..., 5]
+    for i in position:
+        bottom.plot(np.full(len(measured), i), measured[:, i], 'o', color=MEASURED,
+                    markersize=3.0, alpha=0.6,
+                    label='measured, one average each' if i == 0 else None)
+    bottom.use_sticky_edges = False
+    bottom.margins(y=0.08)
+    bottom.set_ylabel('attenuation\n(1: nothing lost)')
+    bottom.set_xticks(position, [f'{order:g}' for order in rows[0, :, 0]])
+    bottom.set_xlabel('order [multiples of the shaft]')
+    bottom.legend(fontsize='small', loc='lower left')
+    _save(figure, path)
+
+
+def _stems(axes: Axes, position: FloatArray, values: FloatArray, color: str, label: str) -> None:
+    """Mean of each order as a stem's head, the scatter over averages as its bar."""
+    mean, spread = np.nanmean(values, axis=0), np.nanstd(values, axis=0)
+    axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,
+                  markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter over averages')
+
+
+def _unit(plan: Plan) -> str:
+    return f'[{plan.unit}]' if plan.unit and plan.unit != 'unknown' else '[unit unknown]'
+
+
+def _save(figure: Figure, path: Path) -> None:
+    FigureCanvasAgg(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,94 @@
+"""What the averager publishes about one shaft."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.publisher import Publisher
+from sa_jitter_ros.averaging.indicators import INDICATORS, RunningIndicators
+from sa_jitter_ros.averaging.residual import GearSettings
+from sa_jitter_ros.averaging.shaft import SynchronousAverage
+from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.nodes.base import MonitoringNode
+from sa_jitter_ros.nodes.messages import (AMPLITUDE_FIELDS, AverageHeader, AverageMessage,
+                                          encode_average, PULSE_ERROR_FIELDS)
+from std_msgs.msg import Float64MultiArray
+
+FloatArray = NDArray[np.float64]
+
+
+class ShaftOutput:
+    """Publishers of one shaft, and its condition indicators, which have a history."""
+
+    def __init__(self, node: MonitoringNode, name: str) -> None:
+        self._node, self._name = node, name
+        self._publishers: dict[str, Publisher] = {
+            kind: node.create_output(Float64MultiArray, f'{name}/{kind}')
+            for kind in ('synchronous_average', 'standard_error', 'order_amplitude',
+                         'condition_indicator', 'corrected_average', 'pulse_error')}
+        self._gear = GearSettings()
+        self._indicators = RunningIndicators(self._gear)
+        self.published = self.refused = 0
+        self.refusal = ''
+
+    def use(self, gear: GearSettings) -> None:
+        """Take other mesh orders; the indicators' history starts anew."""
+        if gear != self._gear:
+            self._gear, self._indicators = gear, RunningIndicators(gear)
+
+    def publish(self, average: SynchronousAverage, share: float) -> None:
+        """Publish one average; `share` is the tach revolutions in a trigger cycle."""
+        header = AverageHeader(
+            average.start_time, average.end_time, average.sequence, average.trigger_cycles,
+            average.fundamental_cycles,
+            average.trigger_cycles * share / (average.end_time - average.start_time))
+        self._send('synchronous_average', header, average.waveform)
+        self._send('standard_error', header, average.standard_error)
+        self._send('order_amplitude', header, amplitude_table(average), AMPLITUDE_FIELDS)
+        self.published += 1
+        correction = average.correction
+        if correction is not None and not correction.recovery.accepted:
+            self.refused += 1
+            self.refusal = correction.recovery.reason
+        elif correction is not None:
+            recovery = correction.recovery
+            self._send('corrected_average', header, correction.corrected.waveform)
+            self._send('pulse_error', header, np.stack(
+                (average.pulses, recovery.errors, recovery.standard_errors), axis=1),
+                PULSE_ERROR_FIELDS)
+        best = correction.corrected if correction is not None else average
+        if np.isfinite(best.waveform).all():
+            self._indicate(header, best.waveform)
+
+    def _indicate(self, header: AverageHeader, waveform: FloatArray) -> None:
+        """Publish the condition indicators, of the corrected average where there is one."""
+        try:
+            self._indicators.update(waveform)
+        except SignalError:  # the source came back with other channels
+            self._indicators = RunningIndicators(self._gear)
+            self._indicators.update(waveform)
+        except ParameterError as error:
+            self._node.warn(f'{self._name}: {error}')
+            return
+        self._send('condition_indicator', header, self._indicators.get().values, INDICATORS)
+
+    def _send(self, kind: str, header: AverageHeader, values: Any,
+              names: tuple[str, ...] = ()) -> None:
+        self._publishers[kind].publish(encode_average(kind, AverageMessage(header, values, names)))
+
+
+def amplitude_table(average: SynchronousAverage) -> FloatArray:
+    """Channel x order x `AMPLITUDE_FIELDS`; NaN where there is no correction."""
+    table = np.full((*average.amplitudes.shape, len(AMPLITUDE_FIELDS)), np.nan)
+    table[..., 0] = average.orders
+    table[..., 1] = np.abs(average.amplitudes)
+    table[..., 2] = np.angle(average.amplitudes)
+    table[..., 7] = average.noise
+    if average.correction is not None and average.correction.recovery.accepted:
+        correction = average.correction
+        table[..., 3] = np.abs(correction.corrected.amplitudes)
+        table[..., 4] = np.angle(correction.corrected.amplitudes)
+        table[..., 5] = correction.attenuation
+        table[..., 6] = correction.attenuation_standard_error
+        table[..., 7] = correction.corrected.noise  # jitter does not scatter it any more
+    return table
