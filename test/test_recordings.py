@@ -448,12 +448,14 @@ def test_bag_of_float32_needs_a_rate(recording, tmp_path):
 def test_lost_samples_in_a_bag_are_nan(recording, tmp_path):
     pytest.importorskip('rosbags')
     vibration = recording.read()
-    vibration[:, 1000:1400] = np.nan
+    vibration[:, 950:1351] = np.nan
+    vibration[1, 1407] = np.nan
     gappy = replace(recording, vibration=ArraySource(vibration))
     write_bag(tmp_path / 'bag', gappy, samples_per_block=100)
     opened = open_recording(tmp_path / 'bag')
+    vibration[:, 1407] = np.nan
     np.testing.assert_array_equal(opened.read(), vibration)
-    assert opened.remarks == ('/vibration: 400 lost samples are NaN',)
+    assert opened.remarks == ('/vibration: 402 lost samples are NaN',)
 
 
 def write_messages(path, kind, messages, topic='vibration'):

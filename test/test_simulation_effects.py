@@ -222,7 +222,7 @@ def test_effects_of_size_zero_change_nothing():
     ({'excess_jiter': {'std': 1.0}}, "no effect 'excess_jiter': there are excess_jitter"),
     ({'excess_jitter': {'sdt': 1.0}}, 'effect excess_jitter has std and not sdt'),
     ({'excess_jitter': {'std': -1.0}}, 'excess_jitter.std -1.0: must be finite and at least 0'),
-    ({'correlated_jitter': {'std': 1.0, 'correlation': 1.0}}, 'above -1 and below 1'),
+    ({'correlated_jitter': {'std': 1.0, 'correlation': 1.0}}, 'above -0.9999 and below 0.9999'),
     ({'keyphasor_quantisation': {'clock_rate': 0.0}}, 'clock_rate 0.0'),
     ({'keyphasor_quantisation': {'clock_rate': 1.0, 'period_std': -1.0}}, 'period_std -1.0'),
     ({'target_geometry': {'pulse_angles': ()}}, 'at least one finite angle'),

@@ -50,8 +50,7 @@ def write_bag(path: str | os.PathLike[str], recording: Recording, *, storage: st
 
     """
     try:
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.rosbag2.errors import WriterError
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
         from rosbags.typesys import get_typestore, Stores
     except ImportError as error:
         raise RecordingError(
@@ -121,14 +120,17 @@ class _Messages:
 
     def _samples(self, blocks: Iterator[FloatArray], start: float, rate: float,
                  kind: str) -> Iterator[tuple[float, Any]]:
-        index = 0
+        done = 0
         for block in blocks:
-            time = start + index / rate
-            header = (np.array([time, rate, index]) if kind == FLOAT64 else
-                      np.array(divmod(index, INDEX_BASE), dtype=np.float64))
-            index += block.shape[1]
-            if not np.isnan(block).any():  # a gap is what was not sent
-                yield start + index / rate, self._array(block, ('channel', 'sample'), header, kind)
+            known = ~np.isnan(block).any(axis=0)  # a gap is what was not sent
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], known.astype(np.int8), [0]])))
+            for low, high in edges.reshape(-1, 2).tolist():
+                index = done + low
+                header = (np.array([start + index / rate, rate, index]) if kind == FLOAT64 else
+                          np.array(divmod(index, INDEX_BASE), dtype=np.float64))
+                yield start + (done + high) / rate, self._array(
+                    block[:, low:high], ('channel', 'sample'), header, kind)
+            done += block.shape[1]
 
     def _array(self, values: FloatArray, labels: tuple[str, ...], header: FloatArray,
                kind: str) -> Any:

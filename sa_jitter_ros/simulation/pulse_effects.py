@@ -12,6 +12,7 @@ from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum
 from scipy.special import ndtri
 
+MAX_CORRELATION = 0.9999  # beyond it the process remembers more pulses than are worth drawing
 JITTER_DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 
 
@@ -76,7 +77,8 @@ class CorrelatedJitter(Effect):
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('correlated_jitter.std', self.std, minimum=0)
-        require_number('correlated_jitter.correlation', self.correlation, above=-1, below=1)
+        require_number('correlated_jitter.correlation', self.correlation, above=-MAX_CORRELATION,
+                       below=MAX_CORRELATION)
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the delay of each pulse."""
