@@ -17,7 +17,7 @@ from sa_jitter_ros.statistics.mixture import mixed
 from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from sa_jitter_ros.statistics.sampled_law import SampledLaw
-from scipy import stats
+from scipy import signal, stats
 
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=41,
                       orders=(1.0, 19.0, 38.0), ratio=2.40789)
@@ -26,7 +26,7 @@ SKEWED = tuple(np.random.default_rng(12).exponential(4e-5, 400))
 
 def simulate(model, order, iterations, seed):
     """Amplitudes of one order of whole trigger cycles, noise included."""
-    signal = AveragedSignal(model.trigger_cycles, model.cycle_length, order)
+    averaged = AveragedSignal(model.trigger_cycles, model.cycle_length, order)
     noise = (4.0 * model.noise_std**2 / (model.sample_rate * model.duration)
              if model.noise_std else 0.0)
 
@@ -36,7 +36,7 @@ def simulate(model, order, iterations, seed):
         def draw(self, rng, shape):
             return model.fundamental_frequency * model.distribution.draw(rng, shape)
 
-    return np.abs(monte_carlo(signal.whole_trigger_cycles, Scaled(), model.trigger_cycles,
+    return np.abs(monte_carlo(averaged.whole_trigger_cycles, Scaled(), model.trigger_cycles,
                               iterations, seed=seed, line_variance=noise))
 
 
@@ -146,15 +146,35 @@ def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):
         draws.mean(), abs=4.5 * draws.std() / np.sqrt(draws.size))
 
 
-def test_a_long_memory_falls_back_on_the_normal_law():
-    wander = GaussianAngleError(
-        lambda u, v, lag: np.full(np.broadcast(u, v).shape, 1e-4 * 0.9**lag), 40)
-    prediction = predict(MODEL, processes=[wander])
-    assert not np.any(prediction.law.bend)
-    assert np.all(prediction.mean_attenuation < predict(MODEL).mean_attenuation)
-    frozen = GaussianAngleError(wander.covariance, 10**9)
-    np.testing.assert_array_equal(predict(MODEL, processes=[frozen]).variance,
-                                  prediction.variance)
+def slow_wander(std):
+    """Exponentially correlated angle error that forgets a fifth of itself in a trigger cycle."""
+    return GaussianAngleError(lambda u, v, lag: std**2 * 0.8 ** np.abs(lag + v - u), 40)
+
+
+@pytest.mark.parametrize(('cycles', 'std'), [(41, 0.05), (41, 0.15), (130, 0.1)])
+def test_slow_wander_is_predicted_beside_jitter(cycles, std, rng):
+    model = replace(MODEL, orders=(38.0,), trigger_cycles=cycles)
+    prediction = predict(model, processes=[slow_wander(std / 38.0)])
+    points, n = 6, 6000  # points in a cycle
+    forget = 0.8 ** (1.0 / points)
+    noise = np.sqrt(1.0 - forget**2) * rng.normal(size=(points * cycles, n))
+    noise[0] /= np.sqrt(1.0 - forget**2)
+    wander = signal.lfilter([1.0], [1.0, -forget], noise, axis=0).reshape(cycles, points, n)
+    errors = model.fundamental_frequency * model.distribution.draw(rng, (cycles + 1, 1, n))
+    u = (np.arange(points)[:, None] + 0.5) / points
+    angle = errors[:-1] * (1.0 - u) + errors[1:] * u + std / 38.0 * wander
+    draws = np.abs(np.exp(2j * np.pi * 38.0 * angle).mean(axis=(0, 1)))
+    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[0]).statistic
+    assert distance < 0.012 + 1.95 / np.sqrt(n)
+    assert prediction.standard_deviation[0] == pytest.approx(draws.std(), rel=0.075)
+    assert prediction.mean_attenuation[0] == pytest.approx(draws.mean(), abs=0.004)
+
+
+@pytest.mark.parametrize('memory', [3, 40, 10**9])
+def test_an_effect_of_no_size_changes_nothing(memory):
+    tiny = GaussianAngleError(lambda u, v, lag: np.full(np.broadcast(u, v).shape, 1e-20), memory)
+    np.testing.assert_allclose(predict(MODEL, processes=[tiny]).standard_deviation,
+                               predict(MODEL).standard_deviation, rtol=1e-6)
 
 
 def test_effects_can_take_the_place_of_the_declared_jitter():

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from itertools import permutations
+import math
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from sa_jitter_ros.statistics.angle_error import (
 )
 from sa_jitter_ros.statistics.moments import (
     correlation_length,
+    cycle_moments,
     CycleMoments,
     require_cycles,
     require_orders,
@@ -22,7 +24,11 @@ from sa_jitter_ros.statistics.moments import (
 
 Array = NDArray[Any]
 
+_REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
+_CLEAR = 8.0  # variance of a cycle over its squared mean
+_MOST_BLOCKS = 64
+_PAIR_NODES = 32
 
 
 def third_cumulants(
@@ -70,3 +76,59 @@ def third_cumulants(
                 mixed += places * count * (
                     raw @ w @ w @ w - lower + 2.0 * m * np.abs(m) ** 2)
     return plain, mixed
+
+
+def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Array, Array]:
+    """
+    Return k(X, X, X) and k(X, X, conj X) as the pair moments of the cycles alone suggest.
+
+    A triple moment is taken for the product of its three pair moments over its three means: exact
+    for phasors of a Gaussian phase, and cheap where the memory is long. Long averages are summed
+    in blocks. 0 where the scatter of a cycle buries its mean and leaves nothing to expand about.
+    """
+    require_cycles(trigger_cycles)
+    size = np.abs(cycles.mean)
+    clear = np.real(cycles.variance[0]) < _CLEAR * size**2
+    m = np.where(clear, cycles.mean, 1.0)
+    block = math.ceil(trigger_cycles / _MOST_BLOCKS)
+    count = round(trigger_cycles / block)
+    steps = np.arange(1 - block, block)
+    lags = block * np.arange(count)[:, None] + steps
+    weight = (block - np.abs(steps)) / block**2 * (np.abs(lags) < len(cycles.variance))
+    known = np.minimum(np.abs(lags), len(cycles.variance) - 1)
+    backward = (lags < 0)[:, :, None]
+    p = np.einsum('ld,ldo->ol', weight, cycles.pseudo_variance[known] / m**2)
+    j = np.einsum('ld,ldo->ol', weight, np.where(
+        backward, np.conj(cycles.variance[known]), cycles.variance[known]) / np.abs(m) ** 2)
+    distance = np.subtract.outer(np.arange(count), np.arange(count))
+    p, j = p[:, np.abs(distance)], j[:, np.abs(distance)]
+    j = np.where(distance > 0, j.conj(), j)
+    p_row, j_row, j_column = p.sum(axis=2), j.sum(axis=2), j.sum(axis=1)
+    plain = 3.0 * np.sum(p_row**2, axis=1) + np.sum(p * (p @ p), axis=(1, 2))
+    mixed = (2.0 * np.sum(p_row * j_row, axis=1) + np.sum(j_column**2, axis=1)
+             + np.sum(p * (j @ j.transpose(0, 2, 1)), axis=(1, 2)))
+    factor = np.where(clear, m, 0.0) / count**3
+    return plain * factor * m**2, mixed * factor * size**2
+
+
+def average_cumulants(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments,
+) -> tuple[Array, Array]:
+    """
+    Return k(X, X, X) and k(X, X, conj X): integrated where the memory is short, else superposed.
+
+    With both kinds of processes the superposition is corrected by its error for the short ones.
+    """
+    short = [process for process in processes if process.correlation_length <= _REACH]
+    if len(short) == len(processes):
+        return third_cumulants(orders, processes, trigger_cycles, cycles)
+    plain, mixed = superposed_cumulants(cycles, trigger_cycles)
+    if not short:
+        return plain, mixed
+    alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
+    exact = third_cumulants(orders, short, trigger_cycles, alone)
+    close = superposed_cumulants(alone, trigger_cycles)
+    gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
+    return (plain + (exact[0] - close[0]) * gain**3,
+            mixed + (exact[1] - close[1]) * gain * np.abs(gain) ** 2)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.amplitude_law import curved_law, normal_law
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
-from sa_jitter_ros.statistics.cumulants import third_cumulants
+from sa_jitter_ros.statistics.cumulants import average_cumulants
 from sa_jitter_ros.statistics.distributions import (
     Empirical,
     Normal,
@@ -28,7 +28,6 @@ from sa_jitter_ros.statistics.distributions import (
 from sa_jitter_ros.statistics.moments import (
     AngleOffset,
     AverageMoments,
-    correlation_length,
     cycle_moments,
     noise_line_variance,
     offset_moments,
@@ -45,7 +44,6 @@ DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 # Up to here the law is sampled; with one more cycle the curved law is up to 0.015 off in its CDF,
 # and 0.04 off for jitter as skewed as an exponential law.
 _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
-_CURVED_REACH = 3  # correlation in cycles up to which third cumulants are worth their time
 
 
 class AmplitudeDistribution(Protocol):
@@ -204,8 +202,8 @@ def predict(
     predicted one by one and combined with `mixture.mixed`.
 
     Mean square and complex moments are exact for any of them. The law itself is sampled for few
-    trigger cycles of plain jitter (fixed seed), curved for more, and normal where an effect has
-    an offset or a long memory.
+    trigger cycles of plain jitter (fixed seed), normal where an effect has an offset, and curved
+    otherwise.
     """
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
@@ -225,10 +223,8 @@ def predict(
         return prediction_of_law(model, moments, normal_law(moments))
     cycles = cycle_moments(orders, everything, nodes=nodes, lags=count)
     moments = cycles.averaged(count).scaled(gain).with_noise(noise)
-    if correlation_length(everything) > _CURVED_REACH:
-        return prediction_of_law(model, moments, normal_law(moments))
     g = np.asarray(gain)
-    equal, mixed = third_cumulants(orders, everything, count, cycles)
+    equal, mixed = average_cumulants(orders, everything, count, cycles)
     curved = curved_law(moments, equal * g**3, mixed * g * np.abs(g) ** 2)
     lopsided = np.max(np.abs(curved.skew)) > _LOPSIDED
     if plain and count <= (_FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
