@@ -1,0 +1,39 @@
+"""The parameter files that come with the package start their nodes."""
+
+from pathlib import Path
+
+import pytest
+from rclpy.context import Context
+from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
+from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
+from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
+from sa_jitter_ros.nodes.tach_detector import TachDetector
+import yaml
+
+CONFIG = Path(__file__).resolve().parents[1] / 'config'
+NODES = {'jitter_predictor': JitterPredictor, 'machine_simulator': MachineSimulator,
+         'synchronous_averager': SynchronousAverager, 'tach_detector': TachDetector}
+
+
+def flat(parameters, prefix=''):
+    """Return parameters by their full name."""
+    result = {}
+    for key, value in parameters.items():
+        result.update(flat(value, f'{prefix}{key}.') if isinstance(value, dict)
+                      else {f'{prefix}{key}': value})
+    return result
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_parameter_file_starts_its_node_and_every_entry_counts(name):
+    path = CONFIG / f'{name}.yaml'
+    given = flat(yaml.safe_load(path.read_text())['/**']['ros__parameters'])
+    context = Context()
+    context.init(args=['--ros-args', '--params-file', str(path)])
+    try:
+        node = NODES[name](context=context)
+        for key, value in given.items():
+            assert node.get_parameter(key).value == value
+        node.destroy_node()
+    finally:
+        context.try_shutdown()

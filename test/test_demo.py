@@ -1,0 +1,97 @@
+"""The demo as a user meets it: separate processes over DDS, a table and figures."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sa_jitter_ros.commands.demo_plan import plan_recording
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings import Recording
+from sa_jitter_ros.recordings.npz_format import write_npz
+from sa_jitter_ros.recordings.recording import ArraySource
+from sa_jitter_ros.simulation import Gearbox, make_effects, mesh
+
+CLOCK, RATE, SPEED, SECONDS = 4000.0, 20000.0, 31.7, 6.0
+
+
+def run_demo(environment, *arguments):
+    """Run the demo as a process of its own."""
+    return subprocess.run(
+        [sys.executable, '-c',
+         'from sa_jitter_ros.commands.demo import main; raise SystemExit(main())', *arguments],
+        env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.fixture
+def machine():
+    """Return a gearbox whose keyphasor is sampled too slowly for its mesh orders."""
+    return Gearbox(mesh('shaft', 23, harmonics=(1.0, 0.5, 0.25)), RATE,
+                   speed=((0.0, SPEED),), seed=3, effects=make_effects(
+                       {'keyphasor_quantisation': {'clock_rate': CLOCK, 'period_std': 5e-5}}))
+
+
+@pytest.fixture
+def recording(machine, tmp_path):
+    """Return a recording of it in a file."""
+    count = round(RATE * SECONDS)
+    path = tmp_path / 'rig.npz'
+    write_npz(path, Recording(
+        ArraySource(machine.vibration(0, count)), RATE, units=('g',),
+        pulse_times=machine.pulses(0.0, SECONDS).times, tach_rate=CLOCK))
+    return path
+
+
+def test_orders_and_averages_are_chosen_from_the_recording(recording):
+    plan = plan_recording(recording)
+    assert {23.0, 46.0, 69.0} < set(plan.orders)
+    assert plan.trigger_cycles == SECONDS * SPEED // 8
+    assert plan.speed == pytest.approx(SPEED, rel=0.01)
+    assert plan.keyphasor_rate == CLOCK
+
+
+def test_recording_without_keyphasor_is_refused(machine, tmp_path):
+    path = tmp_path / 'mute.npz'
+    write_npz(path, Recording(ArraySource(machine.vibration(0, 20000)), RATE))
+    with pytest.raises(RecordingError, match='no keyphasor'):
+        plan_recording(path)
+
+
+def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environment, tmp_path):
+    done = run_demo(process_environment, str(recording), '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert re.search(r'speed +31\.\d+ Hz \| averages +\d', done.stdout)
+    table = {float(row[0]): row for row in map(str.split, done.stdout.splitlines())
+             if row and re.fullmatch(r'\d+', row[0])}
+    for order, amplitude in ((23.0, 1.0), (46.0, 0.5), (69.0, 0.25)):
+        *_, raw, corrected, _, attenuation, predicted, _, _, _ = table[order]
+        assert float(corrected) == pytest.approx(amplitude, rel=0.01)
+        assert float(raw) < float(corrected)
+        assert float(attenuation) == pytest.approx(float(raw) / float(corrected), abs=0.01)
+        assert 0.0 < float(predicted) < 1.0
+    for name in ('waveform.png', 'orders.png'):
+        assert (tmp_path / 'out' / name).read_bytes().startswith(b'\x89PNG')
+
+
+def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_path):
+    path = tmp_path / 'broken.npz'
+    path.write_bytes(b'PK\x03\x04 and nothing else')
+    done = run_demo(process_environment, str(path))
+    assert done.returncode == 2
+    assert done.stdout == ''
+    assert len(done.stderr.splitlines()) == 1
+    assert str(path) in done.stderr
+
+
+@pytest.mark.parametrize('name', ['gear0_gearbox', 'motor_30V_100kHz'])
+def test_measured_recordings_give_averages_whose_loss_is_known(
+        name, shared_data, process_environment, tmp_path):
+    done = run_demo(process_environment, str(shared_data / f'{name}.npz'), '--output',
+                    str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    rows = [row for row in map(str.split, done.stdout.splitlines())
+            if row and re.fullmatch(r'\d+', row[0])]
+    attenuation = np.array([float(row[-5]) for row in rows])
+    assert len(rows) >= 5
+    np.testing.assert_allclose(attenuation, 1.0, atol=0.01)
