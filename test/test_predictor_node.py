@@ -73,7 +73,7 @@ def test_parameter_change_is_published_at_once(bench):
         message.values, expected(keyphasor_rate=9000.0, orders=[4.0, 19.0]))
 
 
-@pytest.mark.parametrize('change, reason', [
+@pytest.mark.parametrize(('change', 'reason'), [
     ({'keyphasor_rate': -1.0}, 'keyphasor_rate is -1.0 Hz: give more than 0.0'),
     ({'keyphasor_rate': 15.0}, 'pulses could swap'),
     ({'noise_std': 1.0}, 'sample_rate'),
