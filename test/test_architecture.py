@@ -20,8 +20,10 @@ CORE = {
     'effects': SCIENCE | {'angle', 'errors', 'statistics'},
     'recordings': SCIENCE | {'errors', 'rosbags'},
     'simulation': SCIENCE | {'errors'},
+    'reproduction': SCIENCE | {
+        'angle', 'averaging', 'errors', 'matplotlib', 'simulation', 'statistics'},
     'closure': SCIENCE | {
-        'angle', 'averaging', 'effects', 'errors', 'matplotlib', 'statistics'},
+        'angle', 'averaging', 'effects', 'errors', 'matplotlib', 'recordings', 'statistics'},
 }
 ROS = {'ament_index_python', 'builtin_interfaces', 'rcl_interfaces', 'rclpy'}
 ROS_PARTS = {'commands', 'nodes'}
