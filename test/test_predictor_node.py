@@ -5,6 +5,7 @@ import pytest
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sa_jitter_ros.effects import EFFECTS, make_effect, predict_with
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import INPUT_QOS, LATCHED_QOS
@@ -81,6 +82,7 @@ def test_parameter_change_is_published_at_once(bench):
     ({'jitter_distribution': 'table'}, 'table'),
     ({'orders': ['a']}, 'orders'),
     ({'trigger_cycles': 0}, 'trigger_cycles'),
+    ({'effects.interpolation_loss.enabled': True}, 'declare sample_rate'),
 ])
 def test_inconsistent_parameters_are_refused_with_the_reason(bench, change, reason):
     b = bench()
@@ -110,6 +112,31 @@ def test_speed_is_left_alone_unless_asked(bench):
     b = bench()
     b.speed.publish(Float64(data=22.0))
     assert not b.spin(lambda: len(b.received) > 1, timeout=0.2)
+
+
+def test_effects_enter_the_prediction_and_leave_it_again(bench):
+    b = bench()
+    assert b.set_parameters(**{'effects.excess_jitter.enabled': True,
+                               'effects.excess_jitter.std': 5e-5}).successful
+    assert b.spin(lambda: len(b.received) == 2)
+    model = DeclaredModel(**{**MODEL, 'orders': tuple(MODEL['orders'])})
+    with_effect = predict_with(model, (make_effect('excess_jitter', std=5e-5),))
+    np.testing.assert_array_equal(b.received[-1].values[:, 1], with_effect.mean_attenuation)
+    assert (b.received[-1].values[:, 1] < expected()[:, 1]).all()
+    refused = b.set_parameters(**{'effects.excess_jitter.std': -1.0})
+    assert not refused.successful
+    assert 'effects.excess_jitter.std' in refused.reason
+    assert b.set_parameters(**{'effects.excess_jitter.enabled': False}).successful
+    assert b.spin(lambda: len(b.received) == 3)
+    np.testing.assert_array_equal(b.received[-1].values, expected())
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_effect_has_its_parameters(bench, name):
+    b = bench(sample_rate=20000.0)
+    assert b.set_parameters(**{f'effects.{name}.enabled': True}).successful
+    assert b.spin(lambda: len(b.received) == 2)
+    assert np.isfinite(b.received[-1].values).all()
 
 
 def test_unusable_start_parameters_raise(ros_context):

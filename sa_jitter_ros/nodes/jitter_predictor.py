@@ -1,18 +1,19 @@
 """Node `jitter_predictor`: what the declared keyphasor does to each order of the average."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import math
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.effects import (EFFECTS, enabled_effects, parameter_defaults, parameter_ranges,
+                                   predict_with)
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (encode_prediction, PREDICTION_FIELDS,
                                           PredictionMessage)
 from sa_jitter_ros.nodes.parameters import Parameter, Values
-from sa_jitter_ros.statistics.prediction import (DeclaredModel, DISTRIBUTIONS, predict,
-                                                 Prediction)
+from sa_jitter_ros.statistics.prediction import DeclaredModel, DISTRIBUTIONS, Prediction
 from std_msgs.msg import Float64, Float64MultiArray
 
 PARAMETERS = (
@@ -47,30 +48,53 @@ _MODEL = ('keyphasor_rate', 'trigger_speed', 'trigger_cycles', 'orders', 'ratio'
           'jitter_table', 'noise_std', 'sample_rate')
 
 
+def effect_parameters() -> Iterator[Parameter]:
+    """Iterate over the parameters of every effect, `effects.<name>.<parameter>`."""
+    for name, kind in EFFECTS.items():
+        yield Parameter(f'effects.{name}.enabled', False, f'add the effect: {kind.summary}')
+        defaults = parameter_defaults(kind)
+        for key, limits in parameter_ranges(kind).items():
+            default = defaults[key]
+            yield Parameter(
+                f'effects.{name}.{key}', list(default) if isinstance(default, tuple) else default,
+                limits.description, unit=limits.unit, choices=limits.choices,
+                minimum=limits.minimum if math.isfinite(limits.minimum) else None,
+                maximum=limits.maximum if math.isfinite(limits.maximum) else None,
+                above=limits.above if math.isfinite(limits.above) else None)
+
+
 def declared_model(values: Values) -> DeclaredModel:
     """Model that the parameters declare; raises `ModelError`."""
     return DeclaredModel(**{name: tuple(values[name]) if isinstance(values[name], list)
                             else values[name] for name in _MODEL})
 
 
+def check(values: Values) -> None:
+    """Raise `SaJitterError` unless the parameters make a model with effects."""
+    model = declared_model(values)
+    for effect in enabled_effects(values):
+        effect.processes(model), effect.gain(model), effect.line_variance(model)
+
+
 class JitterPredictor(MonitoringNode):
     """Publishes `prediction`, and again whenever a parameter or the speed changes."""
 
     def __init__(self, **node_kwargs: Any) -> None:
-        super().__init__('jitter_predictor', PARAMETERS, **node_kwargs)
+        super().__init__('jitter_predictor', (*PARAMETERS, *effect_parameters()), **node_kwargs)
         self._values = self.parameters.values()
+        self._effects = enabled_effects(self._values)
         self._published = 0
         self._model = declared_model(self._values)
         self._prediction = self.create_output(Float64MultiArray, 'prediction', LATCHED_QOS)
         self.create_input(Float64, 'shaft_speed', self._on_speed)
-        self.parameters.watch(check=declared_model, apply=self._apply)
+        self.parameters.watch(check=check, apply=self._apply)
         self._predict(self._model)
 
     def _apply(self, values: Values) -> None:
         speed = self._model.trigger_speed
         follows = values['follow_shaft_speed'] and self._values['follow_shaft_speed']
         given = values['trigger_speed'] != self._values['trigger_speed']
-        self._values = values
+        self._values, self._effects = values, enabled_effects(values)
         model = declared_model(values)
         if follows and not given:
             try:
@@ -90,7 +114,7 @@ class JitterPredictor(MonitoringNode):
             self._predict(replace(self._model, trigger_speed=speed))
 
     def _predict(self, model: DeclaredModel) -> None:
-        prediction = predict(model)
+        prediction = predict_with(model, self._effects)
         self._model = model
         self._published += 1
         self._prediction.publish(encode_prediction(prediction_message(prediction)))
@@ -100,7 +124,8 @@ class JitterPredictor(MonitoringNode):
         model = self._model
         return (f'{len(model.orders)} orders at {model.trigger_speed:.6g} Hz, keyphasor '
                 f'{model.keyphasor_rate:.6g} Hz, {model.trigger_cycles} trigger cycles',
-                {'predictions': str(self._published)})
+                {'predictions': str(self._published),
+                 'effects': ', '.join(effect.name for effect in self._effects)})
 
 
 def prediction_message(prediction: Prediction) -> PredictionMessage:
