@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw
-from sa_jitter_ros.statistics.angle_error import gaussian_pulse_jitter, GaussianAngleError
+from sa_jitter_ros.statistics.angle_error import (
+    gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
 from sa_jitter_ros.statistics.design import (
     assess, design_grid, highest_order, required_keyphasor_rate, required_trigger_cycles,
     trade_off)
@@ -130,6 +131,18 @@ def test_effects_enter_as_processes_offset_gain_and_noise(cycles):
     np.testing.assert_allclose(nothing.moments.mean_square, plain.moments.mean_square, rtol=1e-12)
     np.testing.assert_allclose(
         nothing.mean_attenuation**2 + nothing.variance, plain.moments.mean_square, rtol=1e-9)
+
+
+def test_excess_jitter_of_few_cycles_is_sampled_with_the_declared_one(rng):
+    model = replace(MODEL, orders=(19.0,), trigger_cycles=3)
+    frequency = model.fundamental_frequency
+    excess = IndependentPulseJitter(Normal(8e-5), frequency)
+    prediction = predict(model, processes=[excess])
+    assert isinstance(prediction.law, SampledLaw)
+    errors = frequency * (model.distribution.draw(rng, (20_000, 4)) + 8e-5 * rng.normal(
+        size=(20_000, 4)))
+    draws = np.abs(AveragedSignal(3, model.cycle_length, 19.0).whole_trigger_cycles(errors))
+    assert stats.ks_2samp(draws, prediction.law.draws[0]).pvalue > 1e-3
 
 
 def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):

@@ -22,6 +22,7 @@ from sa_jitter_ros.statistics.distributions import (
     Empirical,
     Normal,
     PulseErrorDistribution,
+    Sum,
     Triangular,
     Uniform,
 )
@@ -201,17 +202,17 @@ def predict(
     Without `declared_jitter` they take the place of the declared one; equally likely scenarios are
     predicted one by one and combined with `mixture.mixed`.
 
-    Mean square and complex moments are exact for any of them. The law itself is sampled for few
-    trigger cycles of plain jitter (fixed seed), normal where an effect has an offset, and curved
-    otherwise.
+    Mean square and complex moments are exact for any of them. The law itself is sampled (fixed
+    seed) for few trigger cycles of independent jitter, normal under an offset, curved otherwise.
     """
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
-    jitter = model.distribution
-    declared = (IndependentPulseJitter(jitter, frequency),) if declared_jitter else ()
+    declared = (IndependentPulseJitter(model.distribution, frequency),) if declared_jitter else ()
     everything = (*declared, *processes)
-    plain = declared_jitter and not processes and offset is None
-    spread = float(orders.max()) * frequency * math.sqrt(jitter.variance)
+    jitters = [process.distribution for process in everything
+               if isinstance(process, IndependentPulseJitter) and process.frequency == frequency]
+    plain = len(jitters) == len(everything) > 0
+    spread = float(orders.max()) * frequency * math.sqrt(sum(law.variance for law in jitters))
     nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 160))
     noise = np.asarray(line_variance) + (
         noise_line_variance(model.noise_std, model.sample_rate, model.duration)
@@ -229,7 +230,7 @@ def predict(
     lopsided = np.max(np.abs(curved.skew)) > _LOPSIDED
     if plain and count <= (_FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
         return prediction_of_law(model, moments, sampled_law(
-            orders * frequency, jitter, count, moments, gain=gain, line_variance=noise))
+            orders * frequency, Sum(*jitters), count, moments, gain=gain, line_variance=noise))
     return prediction_of_law(model, moments, curved)
 
 
