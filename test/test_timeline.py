@@ -43,7 +43,8 @@ def test_blocks_of_any_size_make_one_stretch(sizes):
                              for start, size in zip(starts, sizes)))
     assert held(timeline) == [(0, 0.0, sum(sizes) - 1.0)]
     assert timeline.end_time == pytest.approx((sum(sizes) - 1) / RATE)
-    assert not timeline.messages and not timeline.counts.samples_dropped
+    assert not timeline.messages
+    assert not timeline.counts.samples_dropped
 
 
 @given(st.lists(st.tuples(st.integers(1, 50), st.integers(0, 30)), min_size=1, max_size=20))
@@ -121,7 +122,7 @@ def test_repeated_samples_are_dropped(again):
     assert held(timeline) == [(0, 0.0, 299.0)]
     assert timeline.counts.repeats == 1
     assert timeline.counts.samples_dropped == again[1]
-    assert not timeline.counts.restarts and not timeline.counts.gaps
+    assert timeline.counts.restarts == 0 == timeline.counts.gaps
 
 
 def test_overlapping_block_adds_its_new_part():

@@ -191,7 +191,8 @@ class VibrationTimeline:
 
     def _doubtful(self, block: SampleBlock) -> bool:
         """Whether a block must wait for the next one to tell what it is."""
-        assert self._last is not None and self._clock is not None
+        assert self._last is not None
+        assert self._clock is not None
         last = self._last
         if block.index < last.index and block.start_time < last.start_time:
             return True
@@ -232,7 +233,8 @@ class VibrationTimeline:
         self._last = block
 
     def _continue(self, block: SampleBlock) -> None:
-        assert self._last is not None and self._clock is not None
+        assert self._last is not None
+        assert self._clock is not None
         expected = self._last.end_index
         deviation = block.start_time - self._clock.time_of(block.index)
         if abs(deviation) * block.sample_rate > 0.5:

@@ -126,8 +126,12 @@ class MonitoringNode(Node):
 
 
 def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
-    """Spin one node until SIGINT or SIGTERM; 0, or 2 with one line on unusable parameters."""
-    rclpy.init(args=args)
+    """Spin one node until SIGINT or SIGTERM; 0, or 2 with one line on unusable arguments."""
+    try:
+        rclpy.init(args=args)
+    except RuntimeError as error:  # rcl could not read the command line or a parameter file
+        print(f'error: {error}', file=sys.stderr)
+        return 2
     node = None
     try:
         node = node_class()

@@ -187,17 +187,20 @@ class SampleDecoder:
 
     `kind` is a key of `SAMPLE_TYPES`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz) and
     `start_time` (s) serve where the message does not carry them. Messages without header are
-    counted from `start_time`; `counted` tells that this happened. Raises `MessageError` on a
-    malformed message.
+    counted from `start_time`; `counted` tells that this happened. Raises `ParameterError` for
+    other axes, `MessageError` on a malformed message.
     """
 
     def __init__(self, kind: str, *, sample_rate: float, start_time: float = 0.0,
                  imu_axis: str = 'z') -> None:
+        if not imu_axis or not set(imu_axis) <= set('xyz') or len(set(imu_axis)) < len(imu_axis):
+            raise ParameterError(f'imu_axis is {imu_axis!r}: give different ones of x, y and z')
         self._decode = dict(zip(SAMPLE_TYPES, (self._float64, self._float32, self._imu)))[kind]
         self._rate, self._start_time = sample_rate, start_time
         self._axes = tuple(imu_axis)
         self._next_index = 0
         self._imu_start: float | None = None
+        self._imu_last: tuple[float, ...] = ()
         self.counted = False
 
     def decode(self, message: Float64MultiArray | Float32MultiArray | Imu) -> SampleBlock:
@@ -246,11 +249,14 @@ class SampleDecoder:
             self._imu_start, self._next_index = time, 0  # the clock ran back: a restart
         elif skipped > 0:
             self._next_index += skipped
+        vector = message.linear_acceleration
+        values = tuple(float(getattr(vector, axis)) for axis in self._axes)
+        if (time, *values) == self._imu_last:  # a repeat keeps its index
+            self._next_index -= 1
+        self._imu_last = time, *values
         index = self._next_index
         self._next_index += 1
-        vector = message.linear_acceleration
-        samples = np.array([[getattr(vector, axis)] for axis in self._axes], dtype=np.float64)
-        return SampleBlock(samples, time, rate, index)
+        return SampleBlock(np.array(values)[:, None], time, rate, index)
 
 
 def encode_samples(block: SampleBlock) -> Float64MultiArray:
