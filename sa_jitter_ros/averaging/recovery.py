@@ -1,0 +1,187 @@
+"""
+Recovery of the keyphasor's pulse errors from the vibration, after which they can be corrected.
+
+Where the vibration holds synchronous orders above the noise, every trigger cycle tells by how much
+its two pulses are wrong: it differs from the average by the derivative of the average times hat
+functions of the pulse errors (`pulse_error_model`). All channels and orders make one least-squares
+problem whose normal matrix is tridiagonal, so that a Gauss-Newton step costs as much as there are
+pulses.
+
+What keeps it honest: only orders that stand above the noise take part, each channel and order with
+the weight of its own noise; an order of which the errors may turn the phase by half a cycle waits
+until lower orders have pinned them; and a recovery whose standard error is not below the declared
+jitter is refused, because aligning noise to itself raises amplitudes. A delay that all pulses
+share cannot be seen: the errors have mean zero.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from sa_jitter_ros.averaging.pulse_error_fit import PulseErrorFit, PulseErrorProblem
+from sa_jitter_ros.averaging.pulse_error_model import ComplexArray, compress, FloatArray, nodes_for
+from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
+from sa_jitter_ros.errors import ParameterError, SignalError
+
+# The width of a uniform distribution in its standard deviations.
+_UNIFORM_WIDTH = float(np.sqrt(12.0))
+# Turns that errors across their whole width may give an order: to be safe, and at most.
+_SAFE_TURNS, _MOST_TURNS = 0.5, 1.1
+# Width of the interval that a fitted error is expected in, in its standard errors.
+_CERTAIN = 5.0
+# The last fit expects errors of this many declared standard deviations: no bias to speak of.
+_WEAK_PRIOR = 3.0
+# Largest standard error, in declared standard deviations, that is worth correcting with.
+_WORTHWHILE = 0.7
+# Amplitudes below this share of a channel's RMS are rounding errors.
+_ROUNDING = 1e-9
+_STAGES = 8
+
+
+@dataclass(frozen=True)
+class PulseErrorRecovery:
+    """
+    Errors of the pulses of one average, recovered from its vibration.
+
+    `errors` (pulse,) are measured minus true times (s) with mean zero, all zero where they were
+    not `accepted`, and `reason` says why; `standard_errors` (pulse,) are theirs (s, NaN where
+    nothing could be fitted). `orders` are those that were used; `amplitudes` (channel, order)
+    their complex peak amplitudes with the errors taken out, at angle 0; `attenuation` (order,)
+    what the errors leave of a unit amplitude (Camerini et al. 2019, Eq. 26 with N_i = r); `noise`
+    (channel, order) the standard deviation of one cycle's complex amplitude. `ripple` (cycle,) is
+    the factor of u (1 - u) in the error inside a cycle (s), zero unless it was asked for.
+    """
+
+    errors: FloatArray
+    standard_errors: FloatArray
+    accepted: bool
+    reason: str
+    orders: FloatArray
+    amplitudes: ComplexArray
+    attenuation: FloatArray
+    noise: FloatArray
+    ripple: FloatArray
+    iterations: int
+
+
+def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: float,
+                         declared_standard_deviation: float, first_angle: float = 0.0,
+                         orders: Sequence[float] = (), most_orders: int = 12,
+                         with_ripple: bool = False) -> PulseErrorRecovery:
+    """
+    Recover the pulse errors of one average from its vibration.
+
+    `cycles` (cycle, sample, channel) are its trigger cycles, sample i at the fraction u = i /
+    samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
+    times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
+    pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
+    pulse error. `orders` restricts the recovery to these; without it, the at most `most_orders`
+    integer orders are taken that stand out most. `with_ripple` fits a speed ripple u (1 - u) of
+    every cycle jointly.
+
+    Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
+    ratio or standard deviation that is not positive.
+    """
+    cycles, periods = _validated(cycles, periods, ratio, declared_standard_deviation)
+    declared = declared_standard_deviation * ratio / float(np.mean(periods))
+    fit, reason = _staged_fit(cycles, ratio=ratio, first_angle=first_angle, orders=orders,
+                              most_orders=most_orders, declared=declared, with_ripple=with_ripple)
+    if fit is None:
+        count, _, channels = cycles.shape
+        return PulseErrorRecovery(
+            np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.empty(0),
+            np.empty((channels, 0), np.complex128), np.empty(0), np.empty((channels, 0)),
+            np.zeros(count), 0)
+
+    errors = fit.errors * float(np.mean(periods)) / ratio
+    for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
+        seconds = np.convolve(periods - np.diff(errors), (0.5, 0.5)) / ratio
+        seconds[[0, -1]] *= 2.0
+        errors = fit.errors * seconds
+    errors -= errors.mean()
+    standard_errors = fit.standard_errors * seconds
+    reason = _refusal(errors, standard_errors, periods, declared_standard_deviation)
+    turns = np.multiply.outer(fit.orders, fit.errors)
+    gains = np.exp(1j * pi * (turns[:, :-1] + turns[:, 1:])) * np.sinc(np.diff(turns))
+    return PulseErrorRecovery(
+        np.zeros_like(errors) if reason else errors, standard_errors, not reason, reason,
+        fit.orders, fit.amplitudes.T, np.abs(gains.mean(axis=1)), fit.noise.T,
+        fit.ripple * periods / ratio, fit.iterations)
+
+
+def _validated(cycles: FloatArray, periods: FloatArray, ratio: float, declared: float
+               ) -> tuple[FloatArray, FloatArray]:
+    cycles, periods = np.asarray(cycles, np.float64), np.asarray(periods, np.float64)
+    if cycles.ndim != 3 or len(cycles) < 2 or not cycles.size or periods.shape != cycles.shape[:1]:
+        raise SignalError(f'cycles of shape {cycles.shape} with periods of shape {periods.shape}: '
+                          'give (cycle, sample, channel) of at least 2 cycles, a period for each')
+    if not (np.isfinite(cycles).all() and np.isfinite(periods).all() and np.all(periods > 0.0)):
+        raise SignalError('cycles or periods are not finite, or a period is not positive: drop '
+                          'the trigger cycles that hold such values')
+    for name, value in (('ratio', ratio), ('declared_standard_deviation', declared)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise ParameterError(f'{name} is {value}: give a positive number')
+    return cycles, periods
+
+
+def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArray,
+             declared: float) -> str:
+    """Say why errors should not be corrected; empty if they should."""
+    typical = float(np.sqrt(np.mean(standard_errors**2)))
+    if not typical < _WORTHWHILE * declared:
+        return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
+                f'{_WORTHWHILE:g} of the declared jitter, {declared:.3g} s: correcting would '
+                'align noise to itself')
+    if np.any(np.diff(errors) >= periods):
+        return 'the recovered errors would swap pulses: check ratio and pulses'
+    return ''
+
+
+def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders: Sequence[float],
+                most_orders: int, declared: float, with_ripple: bool
+                ) -> tuple[PulseErrorFit | None, str]:
+    """Fit low orders first and higher ones as the errors become known; or say why it cannot be."""
+    samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
+    given = np.unique([g for g in orders if 0.0 < g * ratio <= 0.5 * len(samples)])
+    search = None if len(orders) else LineSearch.of(samples, ratio)
+    rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
+    known = given if search is None else search.orders
+    width = _UNIFORM_WIDTH * declared  # of the interval that an error is still expected in
+    spread = 1.5 * width  # the largest difference between neighbours
+    errors, used = np.zeros(len(cycles) + 1), np.empty(0)
+    problem = None
+    for _ in range(_STAGES):
+        reach = _MOST_TURNS / width
+        candidates = (given[given <= reach] if search is None
+                      else search.strongest(errors, most_orders, below=reach))
+        # no more unknowns than half of what a cycle has samples
+        room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
+        candidates = candidates[room]
+        if not len(candidates):
+            break
+        model = compress(samples, ratio=ratio, first_angle=first_angle, orders=candidates,
+                         spread=spread)
+        significant = significant_orders(model, errors, tests=len(known), least=rounding)
+        found = np.flatnonzero(significant.any(axis=1))
+        chosen = found[candidates[found] * width <= _SAFE_TURNS]
+        if np.array_equal(candidates[chosen], used):  # nothing new is safe: dare one more
+            chosen = found[:len(chosen) + 1]
+        if not len(chosen) or np.array_equal(candidates[chosen], used):
+            break
+        first, used = problem is None, candidates[chosen]
+        problem = PulseErrorProblem(model, chosen, significant[chosen], with_ripple)
+        if first and used[-1] * width > _SAFE_TURNS:
+            errors = problem.scan(width)
+        fit = problem.solve(errors, expected=declared)
+        errors = fit.errors
+        complete = known[-1] * width <= _SAFE_TURNS
+        width = min(width, _CERTAIN * float(np.max(fit.standard_errors)))
+        spread = max(1.2 * float(np.max(np.abs(np.diff(errors)))), width)
+        if complete:
+            break
+    if problem is None:
+        return None, ('no synchronous order stands above the noise up to '
+                      f'{_MOST_TURNS / width:.4g}, from where the declared jitter leaves phases '
+                      'ambiguous')
+    return problem.solve(errors, expected=_WEAK_PRIOR * declared), ''

@@ -1,0 +1,121 @@
+"""
+Which orders of a channel are synchronous: coherent from cycle to cycle, and above the noise.
+
+Pulse errors that are known already are taken out of the phases first, so that an order which
+jitter has averaged away is still seen. `LineSearch` finds where to look, cheaply;
+`significant_orders` tests.
+"""
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.pulse_error_model import CompressedCycles, real_parts
+from scipy import stats
+from scipy.fft import rfft
+from scipy.ndimage import median_filter
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Chance that noise alone, in all orders and channels together, passes for a synchronous order.
+_FALSE_ALARM = 1e-3
+# Share of an order's power that must be coherent from cycle to cycle.
+_COHERENCE = 0.15
+# More cycles than these show no order that could tell anything of a single pulse.
+_SEARCHED_CYCLES = 32
+_NEIGHBOURHOOD = 41
+_MAIN_LOBE = 3
+
+
+@dataclass(frozen=True)
+class LineSearch:
+    """
+    Hann-windowed spectra (line, cycle, channel) of some consecutive cycles.
+
+    They begin with cycle `first`; `orders` are the integer orders below 0.4 of the sampling rate.
+    """
+
+    spectra: ComplexArray
+    orders: FloatArray
+    ratio: float
+    first: int
+
+    @classmethod
+    def of(cls, samples: FloatArray, ratio: float) -> 'LineSearch':
+        """Prepare the search in `samples` (sample, cycle, channel) of trigger cycles."""
+        points, count, _ = samples.shape
+        first = max(count - _SEARCHED_CYCLES, 0) // 2
+        part = samples[:, first:first + _SEARCHED_CYCLES]
+        part = part - part.mean(axis=(0, 1))
+        window = np.sin(pi * np.arange(points) / points) ** 2
+        # A taper over the cycles keeps strong orders from showing at their neighbours.
+        taper = np.sin(pi * (np.arange(part.shape[1]) + 0.5) / part.shape[1]) ** 2
+        spectra = rfft(part * np.multiply.outer(window, taper)[:, :, None], axis=0)
+        return cls(spectra, np.arange(1.0, 0.4 * points / ratio + 1.0), ratio, first)
+
+    def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
+        """
+        Orders up to `below` that stand out most from their neighbourhood, at most `most` of them.
+
+        `errors` (pulse,) of the average, in fundamental cycles, are taken out of the phases.
+        """
+        count = self.spectra.shape[1]
+        g = self.orders[self.orders <= below]
+        if not len(g):
+            return g
+        errors = errors[self.first:self.first + count + 1]
+        angle = self.ratio * (self.first + np.arange(count)) + errors[:-1]
+        position = np.outer(g, self.ratio + np.diff(errors))
+        nearest = np.rint(g * self.ratio).astype(np.intp)
+        phase = np.exp(-2j * pi * np.outer(g, angle))
+        line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
+        for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
+            bins = nearest + offset
+            x = position - bins[:, None]
+            lobe = 0.5 * np.sinc(x) + 0.25 * (np.sinc(x - 1.0) + np.sinc(x + 1.0))
+            weight = phase * lobe * np.exp(-1j * pi * x)
+            weight[bins < 0] = 0.0
+            line += np.einsum('gk,gkc->gc', weight, self.spectra[np.abs(bins)])
+        power = np.abs(line) ** 2
+        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
+        contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
+        return np.asarray(np.sort(g[np.argsort(contrast)[-most:]]))
+
+
+def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
+    """Amplitudes (order, channel) that fit all cycles best (`Response.signal`)."""
+    f = signal.reshape(-1, signal.shape[2])
+    parts = np.linalg.lstsq(f.T @ f, f.T @ coefficients.reshape(len(f), -1), rcond=None)[0]
+    half = len(parts) // 2
+    return np.asarray(parts[:half] + 1j * parts[half:])
+
+
+def deviations(signal: FloatArray, residual: FloatArray) -> ComplexArray:
+    """Deviation of every cycle's amplitude (cycle, order, channel) that a residual amounts to."""
+    parts = np.matmul(signal.transpose(0, 2, 1), residual)
+    parts /= np.sum(signal * signal, axis=1)[:, :, None]
+    half = signal.shape[2] // 2
+    return np.asarray(parts[:, :half] + 1j * parts[:, half:])
+
+
+def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: int,
+                       least: FloatArray) -> NDArray[np.bool_]:
+    """
+    Tell which orders (row) stand above the noise in which channels (column).
+
+    The mean amplitude over the cycles, with pulse `errors` taken out, against its scatter: an F
+    test whose level is shared by `tests` orders and all channels. Amplitudes below `least`
+    (channel,) are not significant.
+    """
+    count, _, channels = model.coefficients.shape
+    everything = np.arange(len(model.orders))
+    signal = model.response(errors, np.zeros(count), everything).signal
+    amplitudes = least_squares(signal, model.coefficients)
+    residual = model.coefficients - signal @ real_parts(amplitudes)
+    power = np.abs(amplitudes) ** 2
+    scatter = np.sum(np.abs(deviations(signal, residual)) ** 2, axis=0) / (count - 1)
+    limit = stats.f.isf(_FALSE_ALARM / (tests * channels), 2, 2 * (count - 1))
+    return np.asarray((count * power > limit * scatter) & (np.sqrt(power) > least)
+                      & (power > _COHERENCE * (power + scatter)))
