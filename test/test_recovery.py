@@ -22,7 +22,8 @@ def simulate(rng, errors, lines, *, samples=512, ratio=RATIO, noise=0.0, ripple=
     """
     Trigger cycles (cycle, sample, channel) between the wrong pulses, and these pulses.
 
-    `lines` maps orders to the amplitudes of the channels; `noise` is per sample, `ripple` (cycle,) s.
+    `lines` maps orders to the amplitudes of the channels; `noise` is per sample, `ripple` (cycle,)
+    in seconds.
     """
     count = len(errors) - 1
     periods = PERIOD * (1.0 + 2e-4 * rng.standard_normal(count + 2))
