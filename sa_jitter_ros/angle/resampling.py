@@ -130,8 +130,8 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
     base = np.floor(positions)
     powers = np.ones((DEGREE + 1, len(positions)))
     np.subtract(2.0 * (positions - base), 1.0, out=powers[1])
-    for lower, power in zip(powers[1:], powers[2:]):
-        np.multiply(lower, powers[1], out=power)
+    for k in range(2, DEGREE + 1):
+        np.multiply(powers[k - 1], powers[1], out=powers[k])
     weights = powers.T @ polynomials
 
     first, last = int(low) - half + 1, int(high) + half
