@@ -62,7 +62,7 @@ def make_parser() -> Parser:
                          help='law of the pulse error, as wide as the keyphasor rate makes it '
                          '(uniform)')
     machine.add_argument('--noise-std', type=float, default=0.0, metavar='X',
-                         help="standard deviation of white noise per vibration sample, in units "
+                         help='standard deviation of white noise per vibration sample, in units '
                          "of the component's amplitude (0)")
     machine.add_argument('--sample-rate', type=float, default=0.0, metavar='HZ',
                          help='sampling rate of the vibration, Hz; needed with --noise-std')

@@ -1,0 +1,37 @@
+"""What the figures of the reproduction have in common."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+COLOURS = ('tab:red', 'tab:green', 'tab:purple', 'tab:blue')
+_POINTS = 400
+
+
+def panels(columns: int, rows: int = 1, *, height: float = 4.0) -> tuple[Figure, list[Axes]]:
+    """Return a figure and its axes, row by row, without the state of pyplot."""
+    figure = Figure(figsize=(4.6 * columns, height * rows), dpi=110, layout='constrained')
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, list(axes.ravel())
+
+
+def distribution(axes: Axes, sample: Array, **style: Any) -> None:
+    """Draw the distribution function of a sample."""
+    ordered = np.sort(sample)
+    share = np.arange(1, ordered.size + 1) / ordered.size
+    if ordered.size > _POINTS:
+        keep = np.unique(np.linspace(0, ordered.size - 1, _POINTS).astype(int))
+        ordered, share = ordered[keep], share[keep]
+    axes.step(ordered, share, where='post', **style)
+
+
+def panel_titles(axes: list[Axes], titles: list[str]) -> None:
+    """Letter the panels as the paper does."""
+    for letter, one, title in zip('abcdef', axes, titles):
+        one.set_title(f'({letter}) {title}', fontsize=10)
+        one.grid(alpha=0.3)
