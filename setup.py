@@ -12,7 +12,7 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('demo', 'design')
+COMMANDS = ('demo', 'design', 'reproduce')
 
 setup(
     name=NAME,
