@@ -4,6 +4,10 @@ Which orders of a channel are synchronous: coherent from cycle to cycle, and abo
 Pulse errors that are known already are taken out of the phases first, so that an order which
 jitter has averaged away is still seen. `LineSearch` finds where to look, cheaply;
 `significant_orders` tests.
+
+One average cannot tell everything: random vibration that rings on for many cycles, from a resonance
+right at an order, is nearly as coherent as the order would be, and passes more often than the level
+of the test says (with a quality factor of 500 at order 19, in 7 % of averages of 100 cycles).
 """
 
 from dataclasses import dataclass
@@ -107,7 +111,9 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
 
     The mean amplitude over the cycles, with pulse `errors` taken out, against its scatter: an F
     test whose level is shared by `tests` orders and all channels. Amplitudes below `least`
-    (channel,) are not significant.
+    (channel,) are not significant. A lightly damped resonance rings on from cycle to cycle: its
+    scatter counts with its autocorrelation. That is seen in phase with the mean, where errors of
+    the pulses, which may be correlated as well, do not show to first order.
     """
     count, _, channels = model.coefficients.shape
     everything = np.arange(len(model.orders))
@@ -115,7 +121,20 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     amplitudes = least_squares(signal, model.coefficients)
     residual = model.coefficients - signal @ real_parts(amplitudes)
     power = np.abs(amplitudes) ** 2
-    scatter = np.sum(np.abs(deviations(signal, residual)) ** 2, axis=0) / (count - 1)
+    deviation = deviations(signal, residual)
+    scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
+    in_phase = (deviation * np.exp(-1j * np.angle(amplitudes))).real
+    ringing = np.maximum(scatter, 2.0 * _long_run_variance(in_phase))
     limit = stats.f.isf(_FALSE_ALARM / (tests * channels), 2, 2 * (count - 1))
-    return np.asarray((count * power > limit * scatter) & (np.sqrt(power) > least)
+    return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
+
+
+def _long_run_variance(series: FloatArray) -> FloatArray:
+    """Count times the variance of a mean over the first axis (Newey and West 1987)."""
+    count = len(series)
+    lags = count // 4
+    total = np.sum(series**2, axis=0)
+    for lag in range(1, lags + 1):
+        total += 2.0 * (1.0 - lag / (lags + 1.0)) * np.sum(series[lag:] * series[:-lag], axis=0)
+    return np.asarray(total / (count - 1))
