@@ -5,9 +5,10 @@ Pulse errors that are known already are taken out of the phases first, so that a
 jitter has averaged away is still seen. `LineSearch` finds where to look, cheaply;
 `significant_orders` tests.
 
-One average cannot tell everything: random vibration that rings on for many cycles, from a resonance
-right at an order, is nearly as coherent as the order would be, and passes more often than the level
-of the test says (with a quality factor of 500 at order 19, in 7 % of averages of 100 cycles).
+One average cannot tell everything: random vibration that rings on for many cycles, from a
+resonance right at an order, is nearly as coherent as the order would be, and passes more often
+than the level of the test says (with a quality factor of 500 at order 19, in 7 % of averages of
+100 cycles).
 """
 
 from dataclasses import dataclass
