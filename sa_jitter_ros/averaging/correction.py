@@ -79,7 +79,7 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
 
     `cycles` are the trigger cycles of `raw`, `settings` those it was made with.
     """
-    law = angle_law(settings.law)
+    law = angle_law('linear')  # whose error inside a cycle the recovery knows
     points = grid_points(max(cycle.period for cycle in cycles), cycles[0].rate)
     u = np.arange(points) / points
     grid = np.stack([cycle.at(law, u, method=settings.interpolation) for cycle in cycles])
