@@ -1,7 +1,9 @@
 """The command `design`: its table keeps the limits, its figure is a figure, bad input one line."""
 
 import os
+from pathlib import Path
 import re
+import shlex
 import subprocess
 import sys
 
@@ -11,6 +13,7 @@ from sa_jitter_ros.commands import design
 from sa_jitter_ros.statistics.design import assess
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'choosing_keyphasor_and_revolutions.md'
 BENCH = ['--orders', '19', '38', '--trigger-speed', '41.5', '--ratio', '2.40789']
 
 
@@ -64,6 +67,16 @@ def test_given_settings_are_assessed(tmp_path, capsys):
     assert '41 revolutions of the tach shaft, 0.988 s' in text
     svg = output.read_text(encoding='utf-8')
     assert svg.count('<path') > 20
+
+
+def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
+    examples = re.findall(r'^    \$ ros2 run sa_jitter_ros design (.*)\n((?:    .*\n|\n)+)',
+                          PAGE.read_text(encoding='utf-8'), re.MULTILINE)
+    assert len(examples) == 2
+    for arguments, printed in examples:
+        assert design.main([*shlex.split(arguments), '--output', str(tmp_path / 'a.png')]) == 0
+        lines = capsys.readouterr().out.splitlines()[:-2]  # without the name of the figure
+        assert [line.removeprefix('    ') for line in printed.strip('\n').splitlines()] == lines
 
 
 @pytest.mark.parametrize('orders', [['0.001'], ['38', '400']])
