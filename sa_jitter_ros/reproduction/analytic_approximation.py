@@ -169,6 +169,6 @@ def _eighth_figure(samples: dict[tuple[int, float], Array]) -> Figure:
         one.plot([], [], color='black', linestyle='dashed', label='exact numerical model')
         one.set_xlabel('squared amplitude (1 without jitter)')
         one.set_ylabel('distribution function')
-        one.legend(fontsize=8, loc='upper left')
+    axes[0].legend(fontsize=8, loc='upper left')
     panel_titles(axes, [f'N_t = {cycles}' for cycles in CYCLES])
     return figure

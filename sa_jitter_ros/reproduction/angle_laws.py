@@ -167,9 +167,8 @@ def _figure(ratios: dict[str, Array], predicted: Array) -> Figure:
             for s, sensor in enumerate(SENSORS):
                 distribution(one, ratios[law][:, s, h], color=COLOURS[s], linestyle='dashed',
                              label=sensor)
-            low = min(float(values[:, :, h].min()) for values in ratios.values())
-            high = max(float(values[:, :, h].max()) for values in ratios.values())
-            one.set_xlim(low, high)
+            shown = [predicted[:, h], *(values[:, :, h] for values in ratios.values())]
+            one.set_xlim(min(part.min() for part in shown), max(part.max() for part in shown))
             one.set_xlabel('amplitude ratio, slow over fast keyphasor')
             one.set_ylabel('distribution function')
             titles.append(f'{law} law, order {order}')

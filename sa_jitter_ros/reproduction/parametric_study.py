@@ -22,6 +22,8 @@ NOISE = np.linspace(0.0, 0.5, 24)
 WIDTH = 0.2  # of Fig. 10
 FEW, MANY = 20, 100  # revolutions of Fig. 11
 
+_LABELS = ('$E|X|^2$', r'$\log_{10} Var|X|^2$')
+
 #: N_t, width and noise variance of the points that Monte Carlo checks.
 CHECKS = ((20, 0.2, 0.0), (20, 0.4, 0.0), (100, 0.4, 0.0), (20, 0.2, 0.5), (100, 0.2, 0.5))
 
@@ -170,7 +172,7 @@ def _figure(values: list[Array], across: list[Array], up: list[Array], xlabel: s
     for k, one in enumerate(axes):
         shown = values[k] if k % 2 == 0 else np.log10(values[k])
         filled = one.contourf(across[k], up[k], shown, levels=14, cmap='viridis')
-        figure.colorbar(filled, ax=one, label='E|X|^2' if k % 2 == 0 else 'log10 Var|X|^2')
+        figure.colorbar(filled, ax=one, label=_LABELS[k % 2])
         one.set_xlabel(xlabel)
         one.set_ylabel(ylabel)
         if ylabel.startswith('averages'):

@@ -32,7 +32,7 @@ class Effort:
 
 
 FULL = Effort(iterations=100_000, simulations=200, acquisitions=36, realisations=50)
-QUICK = Effort(iterations=3_000, simulations=4, acquisitions=4, realisations=4)
+QUICK = Effort(iterations=3_000, simulations=3, acquisitions=3, realisations=3)
 
 
 @dataclass(frozen=True)
