@@ -21,7 +21,7 @@ class NodeBench:
     """
 
     def __init__(self, context, executor_for, node_class, *, inputs, outputs, qos=INPUT_QOS,
-                 overrides=(), **parameters):
+                 result_qos=RESULT_QOS, overrides=(), **parameters):
         overrides = [*overrides, *(Parameter(name.replace('__', '.'), value=value)
                                    for name, value in parameters.items())]
         self.node = node_class(context=context, parameter_overrides=overrides)
@@ -36,7 +36,7 @@ class NodeBench:
         self.received = {}
         for topic, kind in {**outputs, '/diagnostics': DiagnosticArray}.items():
             self.received[topic] = []
-            self.bench.create_subscription(kind, topic, self.received[topic].append, RESULT_QOS)
+            self.bench.create_subscription(kind, topic, self.received[topic].append, result_qos)
         self.spin = executor_for(self.node, self.bench)
         self.matched = self.spin(
             lambda: all(item.get_subscription_count() for item in self.publishers.values())

@@ -93,6 +93,6 @@ def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) ->
     """
     first = max(cycle - law.before, 0)
     near = pulses[first:cycle + 2 + (law.after if cycle else law.after_first)]
-    if np.any(np.diff(near) <= 0.0):
+    if not np.all(np.diff(near) > 0.0):
         raise SignalError(f'pulse times {near.tolist()} do not increase: validate pulses first')
     return law.fraction_times(near, cycle - first, u)

@@ -216,9 +216,7 @@ class VibrationTimeline:
 
     def _new_run(self, block: SampleBlock) -> None:
         self._close()
-        if self._last is not None and (
-                block.start_time <= self.end_time
-                    or not _alike(self.layout, (len(block.samples), block.sample_rate))):
+        if block.start_time <= self.end_time:
             # Samples in the latest gap tell that it was the jump ahead which was wrong.
             index, before = self._gap
             gap = block.index >= index and block.start_time > before
@@ -227,6 +225,10 @@ class VibrationTimeline:
             self.counts.restarts += 1
             self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
                                  f'{block.index}')
+        elif self.layout and not _alike(self.layout, (len(block.samples), block.sample_rate)):
+            self.counts.gaps += 1
+            self.messages.append(f'source goes on at {block.start_time:.6g} s with '
+                                 f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = Clock(block.start_time, block.index, block.sample_rate)
         self._gap = 0, np.inf
         self._store(block.samples, block.index)
