@@ -86,7 +86,7 @@ def angle_law(name: str) -> AngleLaw:
 
 def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     """
-    Times (s) at fractions `u` of one trigger cycle in a run of pulses.
+    Return the times (s) at fractions `u` of one trigger cycle in a run of pulses.
 
     Reads no more pulses around the cycle than the law says, so that the result does not depend on
     how much of the run is at hand. Raises `SignalError` unless the pulse times increase.

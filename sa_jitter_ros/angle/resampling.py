@@ -86,14 +86,14 @@ def _known(method: str) -> str:
 
 
 def margin(method: str, *, cutoff: float = 1.0) -> int:
-    """Samples that interpolation needs on either side of a position."""
+    """Return how many samples interpolation needs on either side of a position."""
     _, half, stretch = _stretch(method, cutoff)
     return math.ceil(half / stretch)
 
 
 def gain(method: str, frequency: FloatArray) -> FloatArray:
     """
-    Gain of an interpolator at `frequency` in units of the sampling rate.
+    Return the gain of an interpolator at `frequency` in units of the sampling rate.
 
     It is the Fourier transform of the kernel: sinc^2 for linear, 3 sinc^4 / (2 + cos 2 pi f) for
     the cubic spline.
@@ -107,7 +107,7 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
 def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'band_limited',
                 cutoff: float = 1.0) -> FloatArray:
     """
-    Values of `samples` (n, channels) at `positions` (m,), counted in samples from the first.
+    Return `samples` (n, channels) at `positions` (m,), counted in samples from the first.
 
     Positions must lie within [0, n - 1]; towards either end the signal is continued by point
     reflection. `cutoff` in (0, 1] is the band that survives, as a fraction of half the sampling

@@ -56,7 +56,7 @@ class CorrectingAverager:
         return self._shaft.change(settings)
 
     def margin(self, period: float, rate: float) -> int:
-        """Samples that a cycle of `period` s at `rate` Hz needs on either side."""
+        """Return how many samples a cycle of `period` s at `rate` Hz needs on either side."""
         reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
         return self._shaft.margin(period, rate) + reach
 

@@ -8,8 +8,8 @@ wherever those fall between the pulses: a fundamental cycle that straddles a pul
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 from fractions import Fraction
+from functools import lru_cache
 import math
 
 import numpy as np
@@ -85,7 +85,7 @@ def waveform_cutoff(points: int, cycles: float, period: float, rate: float) -> f
 
 
 def needed_margin(method: str, cutoff: float) -> int:
-    """Samples needed on either side of a cycle."""
+    """Return how many samples are needed on either side of a cycle."""
     return max(margin(method), margin(method, cutoff=cutoff)) + 1
 
 

@@ -26,8 +26,9 @@ _FLOOR = 2e-4
 @dataclass(frozen=True)
 class PulseErrorFit:
     """
-    Fitted `errors` (pulse,) with their `standard_errors` and `ripple` (cycle,), in fundamental
-    cycles.
+    What was fitted, in fundamental cycles.
+
+    `errors` (pulse,) with their `standard_errors`, `ripple` (cycle,).
 
     `amplitudes` (order, channel) are those without the errors, `noise` (order, channel) the
     standard deviation of one cycle's complex amplitude.
@@ -167,7 +168,7 @@ def _solve(diagonal: FloatArray, beside: FloatArray, right: FloatArray) -> Float
 
 
 def _standard_errors(diagonal: FloatArray, beside: FloatArray) -> FloatArray:
-    """Standard errors from a tridiagonal normal matrix, with the mean of the errors fixed at 0."""
+    """Return standard errors from a tridiagonal normal matrix, the errors' mean being 0."""
     count = len(diagonal)
     down, up = diagonal.copy(), diagonal.copy()  # pivots of elimination from either end
     square = beside**2

@@ -106,8 +106,9 @@ class CompressedCycles:
 def compress(samples: FloatArray, *, ratio: float, first_angle: float, orders: FloatArray,
              spread: float) -> CompressedCycles:
     """
-    Compress `samples` (sample, cycle, channel) of trigger cycles, sample i at u = i /
-    len(samples).
+    Compress `samples` (sample, cycle, channel) of trigger cycles.
+
+    Sample i is at u = i / len(samples).
 
     `spread` is the largest difference to follow between errors of neighbouring pulses, in
     fundamental cycles. The mean of every cycle is left out, and with it offset and drift.

@@ -72,7 +72,7 @@ def shaft_parameters(name: str) -> tuple[Parameter, ...]:
 
 
 def shaft_settings(values: Values, name: str) -> AverageSettings:
-    """Settings of one shaft's average; raises `ParameterError`."""
+    """Return the settings of one shaft's average; raises `ParameterError`."""
     teeth = values[f'{name}.ratio_teeth']
     ratio = values[f'{name}.ratio']
     if teeth:
@@ -102,7 +102,7 @@ def trigger_share(values: Values) -> float:
 
 
 def pulse_validator(values: Values) -> PulseValidator:
-    """Validator of the tach pulses; raises `ParameterError`."""
+    """Return the validator of the tach pulses; raises `ParameterError`."""
     return PulseValidator(
         pulses_per_revolution=values['pulses_per_revolution'],
         pulses_per_trigger=values['pulses_per_trigger'] or None,

@@ -87,7 +87,7 @@ class MonitoringNode(Node):
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
-        """Publisher of a result."""
+        """Return the publisher of a result."""
         return self.create_publisher(
             kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
@@ -143,6 +143,9 @@ def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) 
     except (SaJitterError, InvalidParameterValueException) as error:
         print(f'error: {error}', file=sys.stderr)
         return 2
+    except Exception:
+        if rclpy.ok():  # else a callback met the shutdown
+            raise
     finally:
         if node is not None:
             node.destroy_node()

@@ -129,9 +129,9 @@ def encode_array(values: FloatArray, labels: tuple[str, ...],
 def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[str, ...],
                  header_size: int) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """
-    Decode an array: header elements, values shaped as the layout says, names of the last
-    dimension.
+    Decode an array.
 
+    Returns header elements, values shaped as the layout says, names of the last dimension.
     Raises `MessageError` where label, number of dimensions, size or offset do not fit.
     """
     layout, data = message.layout, np.asarray(message.data)

@@ -49,7 +49,7 @@ class Parameter:
         return isinstance(self.default, list)
 
     @property
-    def type(self) -> type:
+    def kind(self) -> type:
         """Type of the value, or of a list's elements."""
         if self.is_list:
             return type(self.default[0]) if self.default else self.element
@@ -60,12 +60,12 @@ class Parameter:
         if self.is_list:
             if isinstance(value, (str, bytes)) or not hasattr(value, '__len__'):
                 raise ParameterError(f'{self.name} is {value!r}: give a list of '
-                                     f'{self.type.__name__}')
+                                     f'{self.kind.__name__}')
             return [self._convert_one(item) for item in value]
         return self._convert_one(value)
 
     def _convert_one(self, value: Any) -> Any:
-        kind = self.type
+        kind = self.kind
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if type(value) is not kind:
@@ -104,10 +104,10 @@ class Parameter:
         if self.minimum is not None or self.maximum is not None:
             low = -math.inf if self.minimum is None else self.minimum
             high = math.inf if self.maximum is None else self.maximum
-            if self.type is float:
+            if self.kind is float:
                 descriptor.floating_point_range = [FloatingPointRange(
                     from_value=max(low, -1.7e308), to_value=min(high, 1.7e308))]
-            elif self.type is int:
+            elif self.kind is int:
                 descriptor.integer_range = [IntegerRange(
                     from_value=int(max(low, -2**63)), to_value=int(min(high, 2**63 - 1)))]
         return descriptor
@@ -141,7 +141,7 @@ class ParameterSet:
             self._node.declare_parameter(
                 item.name, value, item.descriptor(), ignore_override=True)
             if value == [] and not item.read_only:  # rclpy takes an empty list for bytes
-                self._node.set_parameters([as_ros_parameter(item.name, value, item.type)])
+                self._node.set_parameters([as_ros_parameter(item.name, value, item.kind)])
             self._specifications[item.name] = item
 
     def values(self) -> Values:
@@ -175,7 +175,7 @@ class ParameterSet:
             if item is not None:
                 try:
                     parameter = as_ros_parameter(
-                        parameter.name, item.convert(parameter.value), item.type)
+                        parameter.name, item.convert(parameter.value), item.kind)
                 except ParameterError:
                     pass
             converted.append(parameter)
