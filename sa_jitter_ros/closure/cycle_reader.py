@@ -1,0 +1,103 @@
+"""Trigger cycles of a recording: reading them, their amplitudes, and the errors of their pulses."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.resampling import interpolate, margin
+from sa_jitter_ros.averaging.cycle import grid_points, project
+from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Errors of this many declared standard deviations are tried again as if more had been declared: an
+# effect may be larger than the declared jitter, and orders may have slipped a cycle.
+_SUSPICIOUS, _WIDER = 1.3, 4.0
+_LEAST = 1e-9
+
+
+@dataclass(frozen=True)
+class CycleReader:
+    """Reads trigger cycles (cycle, point, channel) of samples (sample, channel)."""
+
+    samples: FloatArray
+    start_time: float
+    rate: float
+    method: str
+
+    def inside(self, times: FloatArray) -> bool:
+        """Tell whether cycles between these pulses can be read."""
+        reach = margin(self.method) + 1
+        position = (times[[0, -1]] - self.start_time) * self.rate
+        return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
+
+    def cycles(self, pulses: FloatArray, points: int, *, ends: bool = False,
+               ripple: FloatArray | None = None) -> FloatArray:
+        """Return the cycles between pulses, with both `ends` or without the last point."""
+        u = np.arange(points + ends) / points
+        times = pulses[:-1, None] + np.diff(pulses)[:, None] * u
+        if ripple is not None:
+            times = times - ripple[:, None] * u * (1.0 - u)
+        position = np.clip((times.ravel() - self.start_time) * self.rate, 0.0,
+                           len(self.samples) - 1.0)
+        low = max(int(position.min()) - 40, 0)
+        high = int(position.max()) + 42
+        values = interpolate(self.samples[low:high], position - low, method=self.method)
+        return values.reshape(len(pulses) - 1, len(u), -1)
+
+
+def repaired(times: FloatArray, missing: NDArray[np.int64]
+              ) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Return pulses with the missing ones put evenly between, and where the measured ones are."""
+    index = np.concatenate(([0], np.cumsum(1 + missing)))
+    return np.interp(np.arange(index[-1] + 1), index, times), np.asarray(index, np.intp)
+
+
+def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...], *,
+             with_ripple: bool) -> PulseErrorRecovery:
+    """Recover pulse errors from the channels `rows`, of the declared size or larger."""
+    periods = np.diff(pulses)
+    grid = reader.cycles(pulses, grid_points(float(periods.max()), reader.rate))[:, :, list(rows)]
+    declared = max(float(np.sqrt(model.distribution.variance)), _LEAST)
+
+    def attempt(expected: float) -> PulseErrorRecovery:
+        return recover_pulse_errors(
+            grid, periods=periods, ratio=model.cycle_length,
+            declared_standard_deviation=expected * declared, with_ripple=with_ripple)
+
+    found = attempt(1.0)
+    if found.accepted and found.errors.std() < _SUSPICIOUS * declared:
+        return found
+    wider = attempt(_WIDER)
+    if not found.accepted or (wider.accepted and _strength(wider) > _strength(found)):
+        return wider
+    return found
+
+
+def _strength(recovery: PulseErrorRecovery) -> float:
+    """Return how much power of how high an order the recovered errors bring back."""
+    return float(np.sum((recovery.orders * np.abs(recovery.amplitudes)) ** 2))
+
+
+def amplitudes(grid: FloatArray, cycles: float, orders: tuple[float, ...]) -> ComplexArray:
+    """Return complex peak amplitudes (cycle, channel, order) of cycles, both ends included."""
+    count, points, channels = grid.shape
+    flat = grid.transpose(1, 0, 2).reshape(points, count * channels)
+    parts = project(flat, cycles, orders, 0.0).reshape(count, channels, len(orders))
+    turn = np.exp(-2j * np.pi * cycles * np.multiply.outer(np.arange(count), orders))
+    return np.asarray(parts * turn[:, None, :])
+
+
+def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
+    """
+    Return the standard error of the ripple (s) that the noise of the recovered orders leaves.
+
+    u (1 - u) less what pulse errors can follow has the mean square 1/180.
+    """
+    with np.errstate(divide='ignore', invalid='ignore'):
+        signal = (2.0 * np.pi * recovery.orders * np.abs(recovery.amplitudes)) ** 2
+        information = np.nansum(2.0 * signal / recovery.noise**2) / 180.0
+    cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
+    return float(cycles / model.fundamental_frequency)

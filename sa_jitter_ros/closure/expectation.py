@@ -1,0 +1,177 @@
+"""
+Expectation: what declared model and effects predict for every acquisition and line.
+
+A line is one order on one channel. What effects know of an acquisition's own pulses (the grid of a
+clock, the marks of a target, a gap) enters the prediction of that acquisition; orders leak into
+each other with the amplitudes that the channel has.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.closure.observation import Acquisition, Observation
+from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
+from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
+from sa_jitter_ros.statistics.angle_error import (
+    AngleErrorProcess, joint_characteristic, unit_nodes)
+from sa_jitter_ros.statistics.moments import AverageMoments, cycle_moments, noise_line_variance
+
+Array = NDArray[Any]
+
+_NODES, _MOST_NODES = 32, 800
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines that are compared: rows of (channel, order index)."""
+
+    channel: NDArray[np.intp]
+    order: NDArray[np.intp]
+
+    def of(self, values: Array) -> Array:
+        """Return (..., line) of an array (..., channel, order)."""
+        return np.asarray(values[..., self.channel, self.order])
+
+    @property
+    def count(self) -> int:
+        """Return the number of lines."""
+        return int(self.channel.size)
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """
+    Predicted laws of the lines, arrays (acquisition, line).
+
+    `attenuation` and `attenuation_variance` are those of raw over corrected amplitude, without
+    noise; `amplitude` and `amplitude_variance` those of the raw amplitude over its level, noise
+    included, of which `law` (flattened) is the distribution.
+    """
+
+    attenuation: Array
+    attenuation_variance: Array
+    amplitude: Array
+    amplitude_variance: Array
+    law: AmplitudeLaw
+
+
+def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Effect],
+           pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int]) -> Expectation:
+    """
+    Predict the `chosen` acquisitions.
+
+    `level` (line,) are mean amplitudes, which noise is compared with; `pulses[a][i]` is what is
+    known of the pulses of acquisition a for the channels whose `group` (channel,) is i.
+    """
+    model = observation.model
+    processes = jitter_processes(model, effects)
+    gain = np.ones(len(model.orders))
+    added = np.zeros(len(model.orders))
+    for effect in effects:
+        gain = gain * effect.gain(model)
+        added = added + effect.line_variance(model)
+    if model.noise_std:
+        added = added + noise_line_variance(model.noise_std, observation.sample_rate,
+                                            model.duration)
+    noise = added[lines.order] / level**2
+    shared: tuple[AverageMoments, Array] | None = None
+    means, variances, pseudos = [], [], []
+    for a in chosen:
+        item = observation.acquisitions[a]
+        rows = []
+        for each in pulses[a]:
+            errors = known_errors(model, effects, each)
+            if errors is None:
+                shared = shared or (_unknown(observation, effects, processes),
+                                    _leakage(observation, processes, None))
+                rows.append(shared)
+            else:
+                rows.append((_known(observation, processes, errors),
+                             _leakage(observation, processes, errors)))
+        mean, variance, pseudo = _of_lines(item, lines, rows, group)
+        means.append(mean)
+        variances.append(variance)
+        pseudos.append(pseudo)
+    moments = AverageMoments(np.concatenate(means), np.concatenate(variances),
+                             np.concatenate(pseudos)).scaled(
+        np.tile(gain[lines.order], len(means)))
+    shape = (len(means), lines.count)
+    bare = normal_law(moments)
+    full = normal_law(moments.with_noise(np.tile(noise, len(means))))
+    return Expectation(bare.mean.reshape(shape), bare.variance.reshape(shape),
+                       full.mean.reshape(shape), full.variance.reshape(shape), full)
+
+
+@lru_cache(maxsize=8)
+def _nodes(count: int) -> tuple[Array, Array]:
+    return unit_nodes(count)
+
+
+def _unknown(observation: Observation, effects: Sequence[Effect],
+             processes: Sequence[AngleErrorProcess]) -> AverageMoments:
+    """Return the moments (order,) where nothing is known of the pulses of one acquisition."""
+    model = observation.model
+    known = [item for item in (effect.scenarios(model) for effect in effects) if item is not None]
+    if known:
+        each = scenario_moments(model, processes, known[0])
+        mean = each.mean.mean(axis=0)
+        spread = each.mean - mean
+        size = np.mean(np.abs(each.mean), axis=0)  # the phase of an average does not count
+        variance = np.mean(each.variance + np.abs(spread) ** 2, axis=0) + np.abs(mean)**2 - size**2
+        return AverageMoments(size.astype(complex), np.maximum(variance, 0.0),
+                              np.mean(each.pseudo_variance, axis=0))
+    return cycle_moments(model.orders, processes, nodes=_NODES).averaged(model.trigger_cycles)
+
+
+def _known(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
+           ) -> AverageMoments:
+    """Return the moments (order,) with known pulse errors (s)."""
+    each = scenario_moments(observation.model, processes, errors[None])
+    return AverageMoments(each.mean[0], each.variance[0], each.pseudo_variance[0])
+
+
+def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
+             errors: Array | None) -> Array:
+    """Return the mean amplitude (order, source) that each unit source shows at each order."""
+    model, sources = observation.model, observation.sources
+    r, count = model.cycle_length, model.trigger_cycles
+    turns = r * float(np.ptp(np.append(sources, observation.orders)))
+    u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
+    e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
+    if np.any(np.abs(np.diff(e)) > 0.5):
+        return np.zeros((observation.orders.size, sources.size))
+    offset = e[:-1, None] + np.diff(e)[:, None] * u
+    cycle = np.arange(count)[:, None]
+    table = np.zeros((observation.orders.size, sources.size), complex)
+    for s, source in enumerate(sources):
+        first = joint_characteristic(processes, [np.array([source])], [u], [0]) * np.ones(u.size)
+        wave = np.exp(2j * np.pi * source * offset) * first * w
+        shift = 2j * np.pi * r * (source - observation.orders)
+        table[:, s] = np.mean((wave @ np.exp(shift * u[:, None])) * np.exp(shift * cycle), axis=0)
+    return table
+
+
+def _of_lines(item: Acquisition, lines: Lines, rows: Sequence[tuple[AverageMoments, Array]],
+              group: Array) -> tuple[Array, Array, Array]:
+    """Return mean, variance and pseudo-variance (line,) of unit components, with leakage."""
+    mean = np.zeros(lines.count, complex)
+    variance = np.zeros(lines.count)
+    pseudo = np.zeros(lines.count, complex)
+    for i, (moments, leakage) in enumerate(rows):
+        amplitude = item.corrected
+        own = leakage.shape[0]
+        foreign = leakage - np.where(np.eye(*leakage.shape, dtype=np.bool_), leakage, 0.0)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            extra = (amplitude @ foreign.T) / amplitude[:, :own]
+        extra = np.where(np.isfinite(extra), extra, 0.0)
+        here = np.flatnonzero(group[lines.channel] == i)
+        channel, order = lines.channel[here], lines.order[here]
+        mean[here] = moments.mean[order] + extra[channel, order]
+        variance[here] = moments.variance[order]
+        pseudo[here] = moments.pseudo_variance[order]
+    return mean, variance, pseudo

@@ -1,0 +1,202 @@
+"""Gathering: the evidence that effects look at, from the acquisitions that a fit may use."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.closure.expectation import Lines
+from sa_jitter_ros.closure.observation import Observation, recovered_again
+from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
+from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
+from sa_jitter_ros.effects.prediction import known_errors
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.recordings.recording import Recording
+from scipy import stats
+
+Array = NDArray[Any]
+
+_STRONG, _COHERENT = 0.2, 0.9
+_PRECISE = 0.25
+_GROUPS = 3
+# A clock this much faster than the declared one is no cause of anything.
+_FINE = 50.0
+
+
+def choose_lines(observation: Observation) -> Lines:
+    """
+    Return the lines worth comparing.
+
+    They have at least 20 % of their order's strongest channel and the same phase in both halves of
+    an acquisition (coherence 0.9). Raises SignalError where there is none.
+    """
+    orders = observation.orders.size
+    cycles = _cycles(observation)
+    half = cycles.shape[1] // 2
+    early, late = cycles[:, :half].mean(axis=1), cycles[:, half:].mean(axis=1)
+    if half == 0:
+        early, late = cycles[:-1, 0], cycles[1:, 0]
+    level = np.abs(observation.stacked('corrected')[..., :orders]).mean(axis=0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        coherence = np.abs(np.sum(early.conj() * late, axis=0)) ** 2 / (
+            np.sum(np.abs(early) ** 2, axis=0) * np.sum(np.abs(late) ** 2, axis=0))
+    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (coherence >= _COHERENT)
+    channel, order = np.nonzero(good)
+    if channel.size == 0:
+        raise SignalError(
+            f'no declared order ({", ".join(f"{g:g}" for g in observation.orders)}) is coherent '
+            'from cycle to cycle on any channel: declare orders that the vibration holds')
+    return Lines(channel, order)
+
+
+def channel_groups(observation: Observation) -> Array:
+    """
+    Return groups of channels (channel,), each of which can be predicted by the others.
+
+    The channels that tell most of the pulse errors are dealt out to the groups one by one.
+    """
+    corrected = np.abs(observation.stacked('corrected'))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        told = np.nanmean(observation.sources * corrected / observation.stacked('noise'), axis=0)
+    information = np.nansum(told**2, axis=1)
+    rank = np.argsort(np.argsort(-information))
+    return np.asarray(rank % min(_GROUPS, rank.size))
+
+
+def gather_pulses(recording: Recording, observation: Observation, group: Array
+                  ) -> tuple[Clock, float, Sequence[Sequence[Pulses]]]:
+    """
+    Return the clock, the period's standard deviation by it, and what is known of the pulses.
+
+    On a grid, the errors are those of the smoothest motion that it allows; where other channels
+    recover the motion better than a quarter of a tick, those of that motion.
+    """
+    model, pulses = observation.model, observation.pulses
+    found = find_clock(pulses.times)
+    clock = found.rate
+    usable = 0.0 < clock < _FINE * model.keyphasor_rate
+    smooth = smooth_on_grid(pulses.times, clock) if usable else None
+    period_std = float('nan')
+    if smooth is not None:
+        period_std = float(np.diff(pulses.times - smooth)[pulses.missing == 0].std(ddof=1))
+    again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
+    if usable and group.max() > 0:
+        again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
+                 for i in range(int(group.max()) + 1)]
+    known = []
+    for a, item in enumerate(observation.acquisitions):
+        grid = None if smooth is None else smooth[item.first:item.first + item.times.size]
+        rows = []
+        for motion in again:
+            errors = grid
+            precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
+            if motion is not None and precise and np.all(np.isfinite(motion[a])):
+                errors = _on_grid(motion[a], clock)
+            rows.append(Pulses(item.times, item.first, errors, item.missing))
+        known.append(rows)
+    return (found if usable else Clock(0.0, 0.0)), period_std, known
+
+
+def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
+           pulses: Sequence[Sequence[Pulses]], clock: Clock, period_std: float,
+           effects: Sequence[Effect], tone: LineEvidence) -> Evidence:
+    """Return the evidence of the `chosen` acquisitions, less what `effects` explain."""
+    model = observation.model
+    picked = [observation.acquisitions[a] for a in chosen]
+    usable = [a for a, item in zip(chosen, picked) if np.all(np.isfinite(item.errors))]
+    if len(usable) < 2:
+        raise SignalError('the pulse errors cannot be recovered from the vibration: '
+                          f'{picked[0].reason}; give reference_pulse_times or stronger orders')
+    errors = []
+    for a in usable:
+        item = observation.acquisitions[a]
+        known = known_errors(model, effects, pulses[a][0])
+        left = item.errors if known is None else item.errors - _without_gaps(
+            known, item.missing, item.times)
+        errors.append(left - left.mean())
+    items = [observation.acquisitions[a] for a in usable]
+    standard_errors = np.array([item.standard_errors for item in items])
+    if observation.against_reference:
+        standard_errors = np.zeros_like(standard_errors)
+    ripple = np.array([item.ripple for item in items])
+    return Evidence(
+        model=model, pulses=tuple(pulses[a][0] for a in usable), errors=np.array(errors),
+        standard_errors=standard_errors, ripple=ripple,
+        ripple_standard_error=float(np.sqrt(np.nanmean(
+            [item.ripple_standard_error**2 for item in items]))) if items else float('nan'),
+        against_reference=observation.against_reference,
+        record_times=observation.pulses.times, record_missing=observation.pulses.missing,
+        clock=clock, clock_period_std=period_std,
+        lines=replace(tone, radial=tone.radial[list(usable)]), explained=tuple(effects))
+
+
+def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
+    """Return how the amplitudes of the lines scatter, of all acquisitions."""
+    model = observation.model
+    cycles = lines.of(_cycles(observation))
+    shortest = cycles.shape[1]
+    mean = cycles.mean(axis=1, keepdims=True)
+    level = np.abs(mean).mean(axis=(0, 1))
+    along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
+    noise = np.sqrt(np.mean([radial_noise(row) ** 2 for row in cycles], axis=0))
+    density = noise * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
+    evidence = LineEvidence(
+        order=observation.orders[lines.order], channel=lines.channel, level=level,
+        noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
+    return _with_tone(evidence, cycles, observation)
+
+
+def _cycles(observation: Observation) -> Array:
+    """Return corrected amplitudes (acquisition, cycle, channel, order) of cycles that all have."""
+    shortest = min(len(item.cycles) for item in observation.acquisitions)
+    return np.array([item.cycles[:shortest, :, :observation.orders.size]
+                     for item in observation.acquisitions])
+
+
+def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) -> LineEvidence:
+    """Find the line that stands out most between the synchronous ones, order by order."""
+    model = observation.model
+    period = model.trigger_period
+    count = cycles.shape[1]
+    left = cycles - cycles.mean(axis=1, keepdims=True)
+    size = 4 * count
+    window = np.hanning(count + 2)[1:-1]
+    spectrum = np.mean(np.abs(np.fft.fft(left * window[None, :, None], size, axis=1)) ** 2, axis=0)
+    floor = np.median(spectrum, axis=0)
+    peak = spectrum.max(axis=0)
+    line = int(np.argmax(peak / floor))
+    bin_ = int(np.argmax(spectrum[:, line]))
+    turns = np.fft.fftfreq(size)[bin_]
+    rows = len(cycles)
+    tail = float(stats.gamma.sf(peak[line] / floor[line] * rows * 0.69, rows))
+    frequency = evidence.order[line] * model.fundamental_frequency + turns / period
+    passed = abs(np.sinc(turns))
+    amplitude = float(np.sqrt(peak[line]) / window.sum() / max(passed, 0.05))
+    return replace(
+        evidence, tone_frequency=float(frequency), tone_amplitude=amplitude,
+        tone_standard_error=amplitude * float(np.sqrt(floor[line] / peak[line] / rows)),
+        tone_frequency_error=0.1 / (period * count),
+        tone_p_value=min(1.0, tail * count * cycles.shape[2]))
+
+
+def _on_grid(errors: Array, clock: float) -> Array:
+    """Return errors that a clock of this rate can make: beyond half a tick, whole ticks go."""
+    tick = 1.0 / clock
+    offsets = np.linspace(-tick, tick, 201)
+    excess = np.maximum(np.abs(errors[None, :] + offsets[:, None]) - 0.5 * tick, 0.0)
+    cost = np.sum(excess**2, axis=1)
+    best = offsets[cost <= cost.min() + 1e-30].mean()
+    placed = errors + best
+    far = np.abs(placed) > 0.75 * tick
+    return np.asarray(np.where(far, placed - tick * np.rint(placed / tick), placed))
+
+
+def _without_gaps(known: Array, missing: Array, times: Array) -> Array:
+    """Return known errors less those of missing pulses, which the recovery repairs itself."""
+    if not missing.any():
+        return known
+    period = (times[-1] - times[0]) / (missing.size + missing.sum())
+    return np.asarray(known - period * np.concatenate(([0.0], np.cumsum(missing))))

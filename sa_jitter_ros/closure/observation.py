@@ -1,0 +1,269 @@
+"""
+Observation: what each acquisition of a recording shows of the attenuation of its lines.
+
+An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses;
+its corrected ones from the better keyphasor where there is one, else from pulses whose errors were
+recovered from the vibration. The attenuation is raw over corrected amplitude: what noise,
+modulation and interpolation do to both cancels in it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.cycle import grid_points
+from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.closure.cycle_reader import (
+    amplitudes, CycleReader, recover, repaired, ripple_error)
+from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, TriggerPulses
+from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
+from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Progress = Callable[[float], None]
+
+MOST_SAMPLES = 200_000_000
+_OTHER_MACHINE = 5.0
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """
+    One acquisition: N_t consecutive trigger cycles from trigger pulse `first` of the record on.
+
+    `times` (N_t + 1,) and `errors`, `standard_errors` (s) of its measured pulses, errors measured
+    minus true with mean 0 (NaN where nothing was recovered), `reference` their times on a better
+    keyphasor. `missing` (N_t,) pulses lack in each cycle. `raw` and `corrected` (channel, order)
+    are complex peak amplitudes; `cycles` (cycle, channel, order) the corrected ones of each cycle
+    at hand; `noise` (channel, order) the standard deviation of an amplitude along its radius.
+    `ripple` (cycle,) is the factor of u (1 - u) in the error inside a cycle (s).
+    """
+
+    first: int
+    times: FloatArray
+    missing: NDArray[np.int64]
+    errors: FloatArray
+    standard_errors: FloatArray
+    reference: FloatArray | None
+    raw: ComplexArray
+    corrected: ComplexArray
+    cycles: ComplexArray
+    noise: FloatArray
+    ripple: FloatArray
+    ripple_standard_error: float
+    recovered: bool
+    reason: str
+
+    @property
+    def attenuation(self) -> FloatArray:
+        """Return raw over corrected amplitude (channel, order)."""
+        with np.errstate(divide='ignore', invalid='ignore'):
+            return np.asarray(np.abs(self.raw) / np.abs(self.corrected))
+
+    @property
+    def attenuation_standard_error(self) -> FloatArray:
+        """Return its standard error; the noise of both amplitudes is correlated by it."""
+        with np.errstate(divide='ignore', invalid='ignore'):
+            share = np.sqrt(np.clip(1.0 - self.attenuation**2, 0.0, 1.0))
+            return np.asarray(self.noise / np.abs(self.corrected) * share)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """
+    All acquisitions of one recording; `orders` as declared, `sources` those that may leak in.
+
+    The amplitudes of an acquisition are those of `sources`, of which the first `len(orders)` are
+    the declared orders.
+    """
+
+    model: DeclaredModel
+    acquisitions: tuple[Acquisition, ...]
+    orders: FloatArray
+    sources: FloatArray
+    channel_names: tuple[str, ...]
+    pulses: TriggerPulses
+    sample_rate: float
+    against_reference: bool
+    name: str = ''
+
+    def stacked(self, field: str) -> NDArray[np.generic]:
+        """Return one field of all acquisitions as an array."""
+        return np.array([getattr(item, field) for item in self.acquisitions])
+
+
+def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 'band_limited',
+            sources: Sequence[float] = (), progress: Progress | None = None) -> Observation:
+    """
+    Observe a recording's acquisitions.
+
+    `sources` are the declared orders and after them others that may leak; without it they are
+    looked for.
+    Raises RecordingError where there is no whole acquisition, ModelError where the declared model
+    does not fit the recording, SignalError where no order of it stands above the noise.
+    """
+    if recording.samples * recording.channels > MOST_SAMPLES:
+        raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
+                             f'most {MOST_SAMPLES} values fit; cut the recording')
+    if model.sample_rate and abs(recording.sample_rate / model.sample_rate - 1.0) > 1e-3:
+        raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
+                         f'has {recording.sample_rate:g} Hz')
+    model = replace(model, sample_rate=recording.sample_rate)
+    pulses = trigger_pulses(recording, model)
+    samples = np.ascontiguousarray(recording.read().T)
+    if not np.all(np.isfinite(samples)):
+        raise RecordingError('vibration holds NaN or infinity: cut the recording at its gaps')
+    samples -= samples.mean(axis=0)
+    reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
+    starts = _starts(pulses, model.trigger_cycles, reader)
+    if not starts:
+        raise RecordingError(
+            f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
+            'trigger cycles inside the vibration: lower trigger_cycles or record longer')
+    rows = tuple(range(samples.shape[1]))
+    declared = tuple(float(g) for g in model.orders)
+    orders = np.array(sources if len(sources) else [
+        *declared, *_other_sources(reader, pulses, model, starts, rows, declared)])
+    found = []
+    for count, first in enumerate(starts):
+        found.append(_acquire(reader, pulses, model, first, orders, rows))
+        if progress is not None:
+            progress((count + 1) / len(starts))
+    return Observation(
+        model, tuple(found), np.array(declared), orders, recording.channel_names, pulses,
+        recording.sample_rate, pulses.reference is not None, recording.description)
+
+
+def together(observations: Sequence[Observation]) -> Observation:
+    """
+    Return the acquisitions of several recordings of one machine as one observation.
+
+    Raises ModelError for recordings of different machines: other channels, rate or amplitudes.
+    """
+    first = observations[0]
+    level = np.abs(first.stacked('corrected')).mean(axis=0)
+    for other in observations[1:]:
+        same = (other.sample_rate == first.sample_rate
+                and other.against_reference == first.against_reference
+                and len(other.channel_names) == len(first.channel_names))
+        if not same:
+            raise ModelError(f'recordings {first.name!r} and {other.name!r} differ in sample '
+                             'rate, channels or reference keyphasor: run the loop on each alone')
+        ratio = np.abs(other.stacked('corrected')).mean(axis=0) / level
+        strong = level > 0.2 * level.max()
+        if not np.all((ratio[strong] > 1.0 / _OTHER_MACHINE) & (ratio[strong] < _OTHER_MACHINE)):
+            raise ModelError(f'recordings {first.name!r} and {other.name!r} have amplitudes that '
+                             f'differ more than {_OTHER_MACHINE:g}-fold: these are different '
+                             'machines or loads; run the loop on each by itself')
+    pulses = TriggerPulses(
+        np.concatenate([item.pulses.times for item in observations]),
+        np.concatenate([item.pulses.missing for item in observations]), None)
+    return replace(first, acquisitions=tuple(
+        acquisition for item in observations for acquisition in item.acquisitions),
+        pulses=pulses if len(observations) > 1 else first.pulses)
+
+
+def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]
+                    ) -> FloatArray:
+    """Return pulse errors (acquisition, N_t + 1) that only some channels tell, NaN where none."""
+    samples = np.ascontiguousarray(recording.read().T)
+    reader = CycleReader(samples - samples.mean(axis=0), recording.start_time, recording.sample_rate,
+                     'band_limited')
+    rows = tuple(channels)
+    errors = []
+    for item in observation.acquisitions:
+        fixed, keep = repaired(item.times, item.missing)
+        recovery = recover(reader, fixed, observation.model, rows, with_ripple=False)
+        errors.append(recovery.errors[keep] if recovery.accepted
+                      else np.full(item.times.size, np.nan))
+    return np.array(errors)
+
+
+def _starts(pulses: TriggerPulses, cycles: int, reader: CycleReader) -> list[int]:
+    """Return the first pulse of every acquisition that lies inside the vibration."""
+    times, reference = pulses.times, pulses.reference
+    found, first = [], 0
+    while first + cycles < times.size:
+        part = slice(first, first + cycles + 1)
+        whole = reader.inside(times[part])
+        if reference is not None:
+            whole = whole and bool(np.all(np.isfinite(reference[part]))) and reader.inside(
+                reference[part])
+        if whole:
+            found.append(first)
+            first += cycles
+        else:
+            first += 1
+    return found
+
+
+def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, first: int,
+             sources: FloatArray, rows: tuple[int, ...]) -> Acquisition:
+    count = model.trigger_cycles
+    times = pulses.times[first:first + count + 1]
+    missing = pulses.missing[first:first + count]
+    fixed, keep = repaired(times, missing)
+    points = grid_points(float(np.diff(fixed).max()), reader.rate)
+    recovery = recover(reader, fixed, model, rows, with_ripple=True)
+    errors = np.full(times.size, np.nan)
+    standard_errors, ripple = errors.copy(), np.full(count, np.nan)
+    bend_error = float('nan')
+    better: FloatArray = fixed
+    if recovery.accepted:
+        errors, standard_errors = recovery.errors[keep], recovery.standard_errors[keep]
+        if not missing.any():
+            ripple = recovery.ripple
+        bend_error = ripple_error(recovery, model)
+        better = fixed - recovery.errors
+    reference = None
+    if pulses.reference is not None:
+        reference = pulses.reference[first:first + count + 1]
+        better = repaired(reference, missing)[0]
+        errors = times - reference
+    errors = errors - errors.mean()
+    orders = tuple(sources.tolist())
+    bend = None
+    if reference is None and recovery.accepted and np.mean(recovery.ripple**2) > (
+            3.0 * bend_error**2):
+        bend = recovery.ripple
+    raw = amplitudes(reader.cycles(times, points, ends=True), model.cycle_length, orders)
+    clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend),
+                        model.cycle_length, orders)
+    return Acquisition(
+        first, times, missing, errors, standard_errors, reference, raw.mean(axis=0),
+        clean.mean(axis=0), clean, radial_noise(clean), ripple, bend_error, recovery.accepted,
+        recovery.reason)
+
+
+def _other_sources(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel,
+                   starts: Sequence[int], rows: tuple[int, ...], declared: tuple[float, ...]
+                   ) -> Sequence[float]:
+    """Return strong orders beside the declared ones that may leak into them (integer r)."""
+    if abs(model.cycle_length - round(model.cycle_length)) > 1e-9:
+        return ()
+    for first in starts[:3]:
+        part = slice(first, first + model.trigger_cycles + 1)
+        times = pulses.times[part] if pulses.reference is None else pulses.reference[part]
+        if pulses.missing[first:first + model.trigger_cycles].any():
+            continue
+        recovery = recover(reader, times, model, rows, with_ripple=False)
+        if not recovery.accepted:
+            continue
+        points = grid_points(float(np.diff(times).max()), reader.rate)
+        mean = reader.cycles(times - recovery.errors, points).mean(axis=0)
+        spectrum = np.abs(np.fft.rfft(mean, axis=0)).max(axis=1)
+        order = np.arange(spectrum.size) / model.cycle_length
+        top = np.array([spectrum[round(g * model.cycle_length)] for g in declared
+                        if round(g * model.cycle_length) < spectrum.size])
+        if not top.size:
+            raise SignalError(f'orders {list(declared)} lie beyond half the sampling rate: '
+                              'declare lower ones')
+        strong = (spectrum > 0.3 * float(np.min(top))) & (order > 0.0) & (
+            order < 0.45 * points / model.cycle_length)
+        strong &= np.min(np.abs(order[:, None] - np.array(declared)), axis=1) > 1e-6
+        best = np.argsort(np.where(strong, spectrum, 0.0))[::-1][:8]
+        return [float(order[k]) for k in best if strong[k]]
+    return ()

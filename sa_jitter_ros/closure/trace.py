@@ -1,0 +1,275 @@
+"""
+The trace: which effect makes the residual, added one at a time while a significant one remains.
+
+Effects are fitted on one half of the acquisitions (every other one) and judged on the other. An
+effect is added when its own physical evidence speaks for it, nothing in its goodness of fit speaks
+against it, and the held-out acquisitions are predicted better with it; the one with the most
+specific evidence first. "None of these" is an answer.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.closure.expectation import expect, Expectation, Lines
+from sa_jitter_ros.closure.gathering import (
+    channel_groups, choose_lines, gather, gather_pulses, line_evidence)
+from sa_jitter_ros.closure.observation import Observation, together
+from sa_jitter_ros.closure.residual import Residual, residual
+from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.effect import Pulses
+from sa_jitter_ros.effects.evidence import Evidence, Finding, LineEvidence
+from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.errors import ModelError, SignalError
+from sa_jitter_ros.recordings.recording import Recording
+
+Array = NDArray[Any]
+Progress = Callable[[str], None]
+
+#: A residual with a smaller p value is no chance.
+SIGNIFICANT = 0.01
+_EVIDENCE = 1e-3
+_DECISIVE, _MATERIAL = 1e-6, 0.01
+_MOST_EFFECTS = 4
+_FEWEST = 4
+# Most specific evidence first: what one sees in the pulse times themselves, then in the order of
+# the pulse errors, then in their size, then in amplitudes.
+_TIERS = (
+    ('missing_pulses',), ('keyphasor_quantisation',), ('target_geometry', 'clock_skew'),
+    ('speed_fluctuation', 'phase_wander'), ('correlated_jitter',), ('excess_jitter',),
+    ('interpolation_loss',), ('amplitude_modulation', 'interfering_tone'), ('additive_noise',))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect in one round: its finding, its score on held-out acquisitions, its rejection."""
+
+    name: str
+    stage: int
+    finding: Finding
+    held_out_score: float | None
+    rejected_because: str
+
+
+@dataclass(frozen=True)
+class Trace:
+    """
+    What the trace found; `before` and `after` are residuals of held-out acquisitions.
+
+    `prediction_before` and `prediction_after` are those of all acquisitions (acquisition, line) of
+    the `lines`; `attenuation` and `amplitude` what was observed. `evidence` is that of the first
+    round, with nothing explained.
+    """
+
+    observation: Observation
+    declared: tuple[Effect, ...]
+    lines: Lines
+    level: Array
+    fit: tuple[int, ...]
+    held_out: tuple[int, ...]
+    findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    before: Residual
+    after: Residual
+    attenuation: Array
+    amplitude: Array
+    prediction_before: Expectation
+    prediction_after: Expectation
+    evidence: Evidence | None
+    verdict: str
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """Everything that scoring needs."""
+
+    observation: Observation
+    lines: Lines
+    level: Array
+    pulses: Sequence[Sequence[Pulses]]
+    clock: Clock
+    period_std: float
+    group: Array
+    scatter: LineEvidence
+    fit: tuple[int, ...]
+    held_out: tuple[int, ...]
+    declared: tuple[Effect, ...]
+
+    def expect(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Expectation:
+        """Predict some acquisitions."""
+        return expect(self.observation, self.lines, self.level, [*self.declared, *effects],
+                      self.pulses, self.group, chosen)
+
+    def observed(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Return attenuation, its variance and amplitude over level (acquisition, line)."""
+        items = [self.observation.acquisitions[a] for a in chosen]
+        orders = self.observation.orders.size
+
+        def of(name: str) -> Array:
+            return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
+
+        return (of('attenuation'), of('attenuation_standard_error') ** 2,
+                np.abs(of('raw')) / self.level)
+
+    def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Residual:
+        """Return the residual of the held-out acquisitions."""
+        attenuation, variance, amplitude = self.observed(self.held_out)
+        expected = self.expect(effects, self.held_out)
+        probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
+        base = expected.attenuation.mean(axis=0)
+        moved = []
+        for i, finding in enumerate(findings):
+            for shifted in _shifted(finding):
+                others = [*effects[:i], shifted, *effects[i + 1:]]
+                moved.append(self.expect(others, self.held_out).attenuation.mean(axis=0) - base)
+        return residual(
+            attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
+            expected.amplitude, expected.amplitude_variance, probability, sensitivities=moved)
+
+
+def trace(observations: Sequence[Observation], recordings: Sequence[Recording], *,
+          declared: Sequence[Effect] = (), progress: Progress | None = None) -> Trace:
+    """
+    Trace the residual of the observations of some recordings of one machine.
+
+    `declared` are effects that the declared model has already.
+
+    Raises ModelError for fewer than 4 acquisitions and SignalError where nothing can be compared.
+    """
+    observation = together(observations)
+    count = len(observation.acquisitions)
+    if count < _FEWEST:
+        raise ModelError(f'{count} acquisitions of {observation.model.trigger_cycles} trigger '
+                         f'cycles: fitting and scoring take at least {_FEWEST}; lower '
+                         'trigger_cycles or record longer')
+    bench = _bench(observation, observations, recordings, declared)
+    say = progress or (lambda text: None)
+    before = after = bench.score(())
+    chosen: list[Finding] = []
+    candidates: list[Candidate] = []
+    first_evidence: Evidence | None = None
+    reason = ''
+    while len(chosen) < _MOST_EFFECTS:
+        significant = after.p_value < SIGNIFICANT
+        effects = [finding.effect for finding in chosen if finding.effect is not None]
+        try:
+            evidence = gather(observation, bench.lines, bench.fit, bench.pulses, bench.clock,
+                              bench.period_std, [*declared, *effects], bench.scatter)
+        except SignalError as error:
+            reason = str(error)
+            break
+        first_evidence = first_evidence or evidence
+        say(f'round {len(chosen) + 1}: p = {after.p_value:.2g}, RMS residual {after.rms:.4f}')
+        round_ = _try_all(bench, evidence, chosen, after, significant)
+        winner = _best(round_)
+        if winner is None and not significant:
+            candidates += round_
+            break
+        candidates += [item if winner is None or item is winner or item.rejected_because
+                       else replace(item, rejected_because=f'{winner.name} has the more specific '
+                                    'evidence') for item in round_]
+        if winner is None:
+            break
+        chosen.append(winner.finding)
+        say(f'added {winner.name}: {winner.finding.evidence}')
+        after = bench.score([item.effect for item in chosen if item.effect is not None], chosen)
+    if reason and after.p_value < SIGNIFICANT:
+        candidates += [Candidate(name, 1, Finding(name, None, {}, 1.0, reason, reason), None,
+                                 reason) for name in EFFECTS]
+    effects = [finding.effect for finding in chosen if finding.effect is not None]
+    everything = range(count)
+    attenuation, _, amplitude = bench.observed(everything)
+    verdict = ('unexplained' if after.p_value < SIGNIFICANT else 'traced' if chosen else 'none')
+    return Trace(
+        observation, tuple(declared), bench.lines, bench.level, bench.fit, bench.held_out,
+        tuple(chosen), tuple(candidates), before, after, attenuation, amplitude,
+        bench.expect((), everything), bench.expect(effects, everything), first_evidence, verdict)
+
+
+def _bench(observation: Observation, observations: Sequence[Observation],
+           recordings: Sequence[Recording], declared: Sequence[Effect]) -> _Bench:
+    lines = choose_lines(observation)
+    count = len(observation.acquisitions)
+    fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
+    group = channel_groups(observation)
+    known = [gather_pulses(recording, item, group)
+             for recording, item in zip(recordings, observations)]
+    clock, period_std, _ = known[0]
+    orders = observation.orders.size
+    corrected = np.abs(observation.stacked('corrected')[..., :orders])
+    level = lines.of(corrected[list(fit)].mean(axis=0))
+    return _Bench(observation, lines, level, [row for _, _, rows in known for row in rows], clock,
+                  period_std, group, line_evidence(observation, lines), fit, held_out,
+                  tuple(declared))
+
+
+def _try_all(bench: _Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
+             significant: bool) -> list[Candidate]:
+    """Fit every effect that is not there yet and score it on the held-out acquisitions."""
+    effects = [finding.effect for finding in chosen if finding.effect is not None]
+    taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
+    number = len(chosen) + 1
+    unneeded = (f'not needed: nothing significant remains (p = {current.p_value:.2g})')
+    found = []
+    for name, kind in EFFECTS.items():
+        if name in taken:
+            continue
+        finding = kind.fit(evidence)
+        if finding.effect is None:
+            found.append(Candidate(name, number, finding, None,
+                                   finding.against if significant else unneeded))
+            continue
+        score = bench.score([*effects, finding.effect], [*chosen, finding])
+        rejected = finding.against
+        if not rejected and finding.p_value > _EVIDENCE:
+            rejected = f'its evidence may be chance: {finding.evidence}'
+        gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
+            kind.scatters) else ('attenuation', score.score, current.score)
+        p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
+        needed = p_value < SIGNIFICANT or (
+            not kind.scatters and _decisive(finding, current, score))
+        if not rejected and not needed:
+            rejected = (f'not needed: the {gained} leaves nothing significant '
+                        f'(p = {min(p_value, 1.0):.2g})')
+        if not rejected and not new > old:
+            rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
+                        f'{new:.3f} after {old:.3f}')
+        found.append(Candidate(name, number, finding, new, rejected))
+    return found
+
+
+def _best(candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the candidate of the first tier that has one, the best score within it."""
+    for tier in _TIERS:
+        left = [item for item in candidates if item.name in tier and not item.rejected_because]
+        if left:
+            return max(left, key=lambda item: item.held_out_score or 0.0)
+    left = [item for item in candidates if not item.rejected_because]
+    return max(left, key=lambda item: item.held_out_score or 0.0) if left else None
+
+
+def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
+    """
+    Tell whether an effect predicts what the declared model takes for chance.
+
+    Then it is there although the residual alone is not larger than the declared chance.
+    """
+    return (finding.p_value < _DECISIVE and before.rms > _MATERIAL
+            and after.rms < 0.5 * before.rms)
+
+
+def _shifted(finding: Finding) -> list[Effect]:
+    """Return the effect with each of its numbers one standard error larger."""
+    found: list[Effect] = []
+    if finding.effect is None or finding.effect.scatters:
+        return found
+    for name, error in finding.standard_errors.items():
+        value = finding.effect.values[name]
+        if isinstance(value, float) and isinstance(error, float) and np.isfinite(error):
+            try:
+                found.append(replace(finding.effect, **{name: value + error}))  # type: ignore
+            except ValueError:
+                continue
+    return found

@@ -1,0 +1,144 @@
+"""Trigger pulses of a recording: from the tach, matched with a better keyphasor, or made worse."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
+from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.statistics.distributions import PulseErrorDistribution
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_SPEED_TOLERANCE = 0.1
+_NEIGHBOURHOOD = 15
+
+
+@dataclass(frozen=True)
+class TriggerPulses:
+    """
+    Measured trigger pulses of a recording.
+
+    `times` (n,) in s; `missing` (n - 1,) is how many trigger pulses lack in each interval;
+    `reference` (n,) are the times of the same pulses on a better keyphasor (NaN where it has
+    none), None without one.
+    """
+
+    times: FloatArray
+    missing: IntArray
+    reference: FloatArray | None
+
+
+def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
+    """
+    Return the trigger pulses of a recording, unrepaired.
+
+    Raises ModelError where the recording contradicts the declared model and RecordingError where
+    it has no usable pulses.
+    """
+    if abs(recording.ratio / model.ratio - 1.0) > 1e-6 and recording.ratio != 1.0:
+        raise ModelError(f'ratio is declared as {model.ratio:g} but the recording says '
+                         f'{recording.ratio:g}: declare the ratio of this machine')
+    if recording.pulses_per_revolution not in (1, model.pulses_per_revolution):
+        raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
+                         f'the recording says {recording.pulses_per_revolution}')
+    step = model.pulses_per_trigger or model.pulses_per_revolution
+    times = _pulse_times(recording)
+    missing = missing_pulses(times)
+    if step > 1:
+        times, missing = _every(times, missing, step)
+    if times.size < 3:
+        raise RecordingError(f'{times.size} trigger pulses: a trigger cycle needs two, the loop '
+                             'several acquisitions')
+    speed = model.trigger_revolutions / float(np.median(np.diff(times)[missing == 0]))
+    if abs(speed / model.trigger_speed - 1.0) > _SPEED_TOLERANCE:
+        raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
+                         f'shaft turns at {speed:.4g} Hz: declare the speed and '
+                         'pulses_per_revolution of this recording')
+    reference = None
+    if recording.reference_pulse_times is not None:
+        better = recording.reference_pulse_times
+        if step > 1 and better.size > 0.6 * step * times.size:
+            better = _every(better, missing_pulses(better), step)[0] if step > 1 else better
+        reference = _matched(times, missing, better)
+    return TriggerPulses(times, missing, reference)
+
+
+def missing_pulses(times: FloatArray) -> IntArray:
+    """Return how many pulses lack in each interval (n - 1,), by the intervals around it."""
+    intervals = np.diff(times)
+    if intervals.size == 0:
+        return np.zeros(0, np.int64)
+    if np.any(intervals <= 0.0):
+        raise RecordingError('pulse times do not increase: sort them and drop repeated ones')
+    half = _NEIGHBOURHOOD // 2
+    around = np.pad(intervals, half, mode='symmetric' if intervals.size >= half else 'edge')
+    usual = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * half + 1), axis=1)
+    return np.asarray(np.maximum(np.rint(intervals / usual) - 1.0, 0.0), np.int64)
+
+
+def with_added_jitter(recording: Recording, law: PulseErrorDistribution, *, seed: int
+                      ) -> Recording:
+    """
+    Return the recording with random errors added to its pulses, which become the reference.
+
+    The procedure of Section 5.2 of Camerini et al. 2019.
+    """
+    times = _pulse_times(recording)
+    errors = law.draw(np.random.default_rng(seed), times.size)
+    return replace(recording, pulse_times=np.sort(times + errors), tach=None,
+                   reference_pulse_times=times)
+
+
+def with_slower_clock(recording: Recording, clock_rate: float) -> Recording:
+    """
+    Return the recording with its pulses timed by a clock of `clock_rate` Hz, rounded up.
+
+    The unrounded pulses become the reference. Section 5.1.2 of Camerini et al. 2019.
+    """
+    if not clock_rate > 0.0:
+        raise ModelError(f'clock_rate is {clock_rate} Hz: give a positive rate')
+    better = recording.reference_pulse_times
+    times = _pulse_times(recording) if better is None else better
+    return replace(recording, pulse_times=np.ceil(times * clock_rate) / clock_rate, tach=None,
+                   tach_rate=clock_rate, reference_pulse_times=times)
+
+
+def _pulse_times(recording: Recording) -> FloatArray:
+    """Return the tested keyphasor's pulses: those of the file, else of its waveform."""
+    if recording.pulse_times is not None:
+        return recording.pulse_times
+    if recording.tach is None or recording.tach_rate is None:
+        if recording.reference_pulse_times is not None:
+            return recording.reference_pulse_times
+        raise RecordingError('no pulse_times and no tach: the loop needs a keyphasor')
+    detector = KeyphasorDetector(interpolate=False)
+    found, index = [], 0
+    for block in recording.tach_blocks():
+        found.append(detector.update(
+            block[0], recording.start_time + index / recording.tach_rate, recording.tach_rate))
+        index += block.shape[1]
+    return np.concatenate(found)
+
+
+def _every(times: FloatArray, missing: IntArray, step: int) -> tuple[FloatArray, IntArray]:
+    """Return every `step`-th pulse as they come, and how many triggers lack between them."""
+    chosen = times[::step]
+    gaps = np.add.reduceat(missing, np.arange(0, missing.size, step))[:chosen.size - 1]
+    return chosen, np.asarray(np.rint(gaps / step), np.int64)
+
+
+def _matched(times: FloatArray, missing: IntArray, better: FloatArray) -> FloatArray:
+    """Return the pulse of the better keyphasor for each of `times`, NaN where it has none."""
+    count = np.concatenate(([0], np.cumsum(1 + missing)))
+    nearest = np.argmin(np.abs(better[:, None] - times[None, :_NEIGHBOURHOOD]), axis=0)
+    index = int(np.median(nearest - count[:nearest.size])) + count
+    inside = (index >= 0) & (index < better.size)
+    matched = np.where(inside, better[np.clip(index, 0, better.size - 1)], np.nan)
+    if inside.sum() < 0.5 * times.size:
+        raise RecordingError(f'reference_pulse_times cover {inside.mean():.0%} of the pulses: '
+                             'give the same stretch of time')
+    return np.asarray(matched)

@@ -1,0 +1,99 @@
+"""Amplitude modulation: the vibration of the shaft grows and shrinks with the load."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, unit_nodes
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy import stats
+
+_MEMORY = 60
+_SIGNIFICANT = 1e-3
+
+
+@dataclass(frozen=True)
+class SlowGain:
+    """A slow normal gain of mean 1 and variance `variance`, as a factor of the component."""
+
+    variance: float
+    correlation_length: int
+    band: tuple[float, float] = SLOW_BAND
+
+    def characteristic(
+        self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
+        cycles: Sequence[int],
+    ) -> Array:
+        """Return E prod a, which is 1 + the sum of the covariances of all pairs (3 points)."""
+        total: Array = np.ones(())
+        for (u, k), (v, m) in combinations(zip(positions, cycles), 2):
+            if abs(m - k) <= self.correlation_length:
+                lag = (m + np.asarray(v)) - (k + np.asarray(u))
+                total = total + self.variance * flat_band_correlation(lag, self.band)
+        return np.asarray(total)
+
+
+@dataclass(frozen=True)
+class AmplitudeModulation(Effect):
+    """A slow random gain of mean 1 and standard deviation `std`, common to a shaft's orders."""
+
+    name: ClassVar[str] = 'amplitude_modulation'
+    summary: ClassVar[str] = 'slow modulation of the amplitude'
+    scatters: ClassVar[bool] = True
+    std: float = parameter(0.0, 'standard deviation of the gain', '1', minimum=0.0, maximum=1.0)
+    band: tuple[float, float] = SLOW_BAND
+
+    def processes(self, model: DeclaredModel) -> Sequence[Any]:
+        """Return the gain, band-limited below half the trigger rate."""
+        length = min(_MEMORY, model.trigger_cycles)
+        processes: Sequence[AngleErrorProcess] = (SlowGain(self.std**2, length, self.band),)
+        return processes
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit what is common to the amplitudes of all lines, cycle by cycle."""
+        radial = evidence.lines.radial
+        known = sum(effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
+        weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
+        if radial.shape[2] < 2:
+            return absent(cls.name, 'one line alone does not tell modulation from noise')
+        common = radial @ weight
+        own = radial**2 @ weight**2
+        pairs = weight.sum() ** 2 - np.sum(weight**2)
+        product = (common**2 - own) / pairs  # mean product of different lines, each cycle
+        rows = product.mean(axis=1)
+        variance, error = float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(len(rows)))
+        p_value = float(stats.t.sf(variance / max(error, 1e-300), len(rows) - 1))
+        within = _variance_of_mean(1, SLOW_BAND)
+        variance, error = variance / within - known, error / within
+        if variance <= 0.0 or p_value > _SIGNIFICANT:
+            return absent(cls.name, 'the amplitudes of the lines do not move together: '
+                          f'p = {p_value:.2g}', p_value=p_value)
+        std = float(np.sqrt(variance))
+        text = (f'the amplitudes of all lines grow and shrink together by {std:.2%}, '
+                f'p = {p_value:.2g}')
+        slow = np.mean((common.mean(axis=1) / weight.sum()) ** 2) / variance
+        return Finding(cls.name, cls(std, _band_of(float(slow), radial.shape[1])),
+                       {'std': error / (2.0 * std)}, p_value, text)
+
+
+def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
+    """Return the variance of the mean over some cycles of a unit modulation."""
+    u, w = unit_nodes(64)
+    lag = cycles * np.subtract.outer(u, u)
+    return float(w @ flat_band_correlation(lag, band) @ w)
+
+
+def _band_of(slow: float, cycles: int) -> tuple[float, float]:
+    """Return the band that leaves a share `slow` of the variance in averages of some cycles."""
+    if _variance_of_mean(cycles, SLOW_BAND) >= slow:
+        return SLOW_BAND
+    tops = np.geomspace(SLOW_BAND[1], 1e-4, 40)
+    shares = np.array([_variance_of_mean(cycles, (0.0, top)) for top in tops])
+    return 0.0, float(tops[np.argmin(np.abs(shares - slow))])

@@ -1,0 +1,66 @@
+"""Correlated jitter: normal pulse errors that remember each other (a wandering trigger level)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.pulse_covariance import (
+    fit_covariance, goodness_of_fit, require_tach_side, white)
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+_FORGOTTEN = 1e-3
+_SIGNIFICANT = 1e-4
+
+
+@dataclass(frozen=True)
+class CorrelatedJitter(Effect):
+    """Normal errors of `std` s, pulses k apart correlated by `correlation`^k."""
+
+    name: ClassVar[str] = 'correlated_jitter'
+    summary: ClassVar[str] = 'normal pulse errors with memory'
+    std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
+    correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
+                                   minimum=-0.999, maximum=0.999)
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """Return the first-order autoregressive pulse errors, seen through the linear law."""
+        variance = (self.std * model.fundamental_frequency) ** 2
+        rho = abs(self.correlation)
+        memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))
+
+        def covariance(u: Array, v: Array, lag: int) -> Array:
+            def at(k: int) -> float:
+                return float(variance * self.correlation ** abs(k))
+            return np.asarray(((1.0 - u) * (1.0 - v) + u * v) * at(lag)
+                              + (1.0 - u) * v * at(lag + 1) + u * (1.0 - v) * at(lag - 1))
+
+        return (GaussianAngleError(covariance, min(memory, model.trigger_cycles)),)
+
+    def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
+        """Return std^2 correlation^|lag|."""
+        return np.asarray(self.std**2 * self.correlation ** np.abs(lags))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit variance and memory of the pulse errors; white ones are another effect's."""
+        plain = fit_covariance(evidence, white)
+        fit = fit_covariance(evidence, lambda lags, rho: rho ** np.abs(lags),
+                             bounds=(-0.98, 0.98))
+        std = float(np.sqrt(fit.variance))
+        if std == 0.0:
+            return absent(cls.name, 'the pulse errors vary no more than declared')
+        p_value = fit.p_value_over(plain)
+        text = (f'pulse errors of {std:.3g} s correlated by {fit.shape:.2f} from pulse to pulse, '
+                f'p = {p_value:.2g} against independent ones')
+        if p_value > _SIGNIFICANT:
+            return absent(cls.name, f'the pulse errors do not remember each other: {text}',
+                          p_value=p_value)
+        against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
+        return Finding(cls.name, cls(std, fit.shape),
+                       {'std': fit.variance_error / (2.0 * std), 'correlation': fit.shape_error},
+                       min(p_value, fit.p_value), text, against)

@@ -1,0 +1,147 @@
+"""
+What an effect is: parameters with ranges, what it does to an average, and how it is fitted.
+
+An effect is one frozen dataclass whose fields are its parameters. It overrides the hooks it needs;
+what it leaves alone has no influence. Any number of effects combine, because each only names its
+independent contribution to the one angle error (THEORY, section 1).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+import math
+from typing import Any, ClassVar, TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+if TYPE_CHECKING:
+    from sa_jitter_ros.effects.evidence import Evidence, Finding
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ParameterRange:
+    """Description, SI unit and range of one parameter; `choices` are those of a text."""
+
+    description: str
+    unit: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+    above: float = -math.inf
+    choices: tuple[str, ...] = ()
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise ParameterError unless the value, or every one of a list, is in range."""
+        if self.choices:
+            if value not in self.choices:
+                raise ParameterError(f'{name} is {value!r}: give one of {", ".join(self.choices)}')
+            return
+        for number in value if isinstance(value, tuple) else (value,):
+            if not (isinstance(number, (int, float)) and math.isfinite(number)
+                    and self.minimum <= number <= self.maximum and number > self.above):
+                limits = [f'at least {self.minimum:g}'] if math.isfinite(self.minimum) else []
+                limits += [f'more than {self.above:g}'] if math.isfinite(self.above) else []
+                limits += [f'at most {self.maximum:g}'] if math.isfinite(self.maximum) else []
+                raise ParameterError(f'{name} is {number} {self.unit}: give a finite number'
+                                     + ''.join(f', {limit}' for limit in limits))
+
+
+def parameter(default: Any, description: str, unit: str, **limits: Any) -> Any:
+    """Return the dataclass field of a parameter; `limits` are those of `ParameterRange`."""
+    return field(default=default, metadata={'range': ParameterRange(description, unit, **limits)})
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """
+    The measured trigger pulses of one average.
+
+    `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` is the
+    index of the first of them in the recording; `errors` (N_t + 1,) in s holds what the grid of a
+    clock says about each (`keyphasor_quantisation`), None where it says nothing; `missing` (N_t,)
+    is how many pulses lack within each cycle.
+    """
+
+    times: Array
+    first: int = 0
+    errors: Array | None = None
+    missing: Array | None = None
+
+
+class Effect:
+    """
+    An effect that does nothing: the base of all.
+
+    Pulse errors are in s, measured minus true time; `name` is the one of the contract.
+    """
+
+    name: ClassVar[str]
+    summary: ClassVar[str]
+    #: Whether amplitudes scatter while the attenuation, raw over corrected, stays as it is.
+    scatters: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        """Check every parameter."""
+        for name, limits in parameter_ranges(type(self)).items():
+            limits.check(f'{self.name}.{name}', getattr(self, name))
+
+    # --- forward model ---
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """Return random angle errors, or random gains, that are stationary over the cycles."""
+        return ()
+
+    def scenarios(self, model: DeclaredModel) -> Array | None:
+        """
+        Return equally likely pulse errors (scenario, N_t + 1) in s of an average.
+
+        They are what is known of the pulses up to a few numbers that nobody knows in advance.
+        """
+        return None
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """Return the pulse errors (N_t + 1,) in s of one average whose pulses were measured."""
+        return None
+
+    def gain(self, model: DeclaredModel) -> Array:
+        """Return the factor (order,) on the component alone."""
+        return np.ones(len(model.orders))
+
+    def line_variance(self, model: DeclaredModel) -> Array:
+        """Return the mean square (order,) of what is added to each complex peak amplitude."""
+        return np.zeros(len(model.orders))
+
+    def replaces_jitter(self, model: DeclaredModel) -> bool:
+        """Tell whether the effect takes the place of the declared jitter."""
+        return False
+
+    def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
+        """Return the autocovariance in s^2 that the random errors of the pulses show at `lags`."""
+        return np.zeros(np.shape(lags))
+
+    # --- evidence ---
+
+    @classmethod
+    def fit(cls, evidence: 'Evidence') -> 'Finding':
+        """Return the effect that fits the evidence best, with what speaks for or against it."""
+        raise NotImplementedError
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """Return the parameters by name."""
+        return {name: getattr(self, name) for name in parameter_ranges(type(self))}
+
+
+def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:
+    """Return the ranges of an effect's parameters by name, in their order."""
+    return {item.name: item.metadata['range'] for item in fields(kind)
+            if 'range' in item.metadata}
+
+
+def parameter_defaults(kind: type) -> Mapping[str, Any]:
+    """Return the defaults of an effect's parameters by name, in their order."""
+    return {item.name: item.default for item in fields(kind) if 'range' in item.metadata}

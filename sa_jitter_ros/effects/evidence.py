@@ -1,0 +1,120 @@
+"""
+What the effects look at: pulse errors, ripple and amplitudes of the acquisitions of one record.
+
+`Evidence` is plain data that the loop gathers from the acquisitions it fits on; whatever effects
+were added before are taken out of it (`explained`). A `Finding` is what an effect makes of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class LineEvidence:
+    """
+    How the amplitudes of the lines (an order on a channel) scatter, pulse errors taken out.
+
+    `order` and `channel` (line,); `level` (line,) mean peak amplitudes; `noise_density` (line,)
+    the standard deviation per sample of white noise that makes the line's noise, in the units of
+    the recording; `radial` (acquisition, cycle, line) each cycle's amplitude over `level`, less 1,
+    and `radial_noise` (line,) its standard deviation by noise alone. `tone_frequency` (Hz) and
+    `tone_amplitude` are those of the line that stands out most between the synchronous ones.
+    """
+
+    order: Array
+    channel: Array
+    level: Array
+    noise_density: Array
+    radial: Array
+    radial_noise: Array
+    tone_frequency: float = float('nan')
+    tone_amplitude: float = 0.0
+    tone_standard_error: float = float('nan')
+    tone_frequency_error: float = float('nan')
+    tone_p_value: float = 1.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """
+    What is known of the acquisitions that a fit may use.
+
+    `errors` and `standard_errors` (acquisition, N_t + 1) are pulse errors in s, of mean 0 in each
+    acquisition, less the patterns of the effects in `explained`; they were measured
+    `against_reference`, a better keyphasor, or else recovered from the vibration. `ripple`
+    (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
+    `record_times` are all pulses of the record and `record_missing` (interval,) is how many pulses
+    lack in each interval of the record; `clock` is the one on whose ticks all pulse times lie, if
+    any, and `clock_period_std` what it says of the trigger period's standard deviation in s.
+    """
+
+    model: DeclaredModel
+    pulses: tuple[Pulses, ...]
+    errors: Array
+    standard_errors: Array
+    ripple: Array
+    ripple_standard_error: float
+    against_reference: bool
+    record_times: Array
+    record_missing: Array
+    clock: Clock
+    clock_period_std: float
+    lines: LineEvidence
+    explained: tuple[Effect, ...] = ()
+
+    @property
+    def period(self) -> float:
+        """Return the mean trigger period in s."""
+        times = np.array([pulses.times for pulses in self.pulses])
+        cycles = times.shape[1] - 1 + np.array([0 if pulses.missing is None else
+                                                pulses.missing.sum() for pulses in self.pulses])
+        return float(np.mean((times[:, -1] - times[:, 0]) / cycles))
+
+    @property
+    def times(self) -> Array:
+        """Return when the pulses were measured (acquisition, N_t + 1), in s."""
+        return np.array([pulses.times for pulses in self.pulses])
+
+    def expected_autocovariance(self, lags: Array) -> Array:
+        """Return what declared jitter and added effects explain at `lags`, in s^2."""
+        total = np.zeros(lags.shape)
+        if not any(effect.replaces_jitter(self.model) for effect in self.explained):
+            total = np.where(lags == 0, self.model.distribution.variance, 0.0)
+        for effect in self.explained:
+            total = total + effect.pulse_autocovariance(self.model, lags)
+        return np.asarray(total)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    What an effect makes of the evidence.
+
+    `effect` with the fitted parameters, None where nothing could be fitted; `standard_errors` by
+    parameter; `p_value` of the physical evidence under "this effect is absent"; `against` says why
+    the effect is not the one, '' where nothing speaks against it; `rivals` are effects that this
+    evidence cannot tell from it, `decider` the measurement that could.
+    """
+
+    name: str
+    effect: Effect | None
+    standard_errors: Mapping[str, Any]
+    p_value: float
+    evidence: str
+    against: str = ''
+    rivals: Sequence[str] = ()
+    decider: str = ''
+
+
+def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:
+    """Return the finding of an effect that is not there."""
+    return Finding(name, None, {}, p_value, reason, against=reason)

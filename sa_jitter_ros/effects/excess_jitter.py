@@ -1,0 +1,45 @@
+"""Excess jitter: independent normal pulse errors beyond the declared ones (electrical noise)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.pulse_covariance import (
+    fit_covariance, goodness_of_fit, require_tach_side, white)
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.statistics.distributions import Normal
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+
+@dataclass(frozen=True)
+class ExcessJitter(Effect):
+    """Independent normal errors of `std` s on top of the declared jitter."""
+
+    name: ClassVar[str] = 'excess_jitter'
+    summary: ClassVar[str] = 'independent normal pulse errors'
+    std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
+                           minimum=0.0)
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """Return the independent pulse errors."""
+        return (IndependentPulseJitter(Normal(self.std), model.fundamental_frequency),)
+
+    def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
+        """Return std^2 at lag 0."""
+        return np.asarray(np.where(np.asarray(lags) == 0, self.std**2, 0.0))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit the variance that the pulse errors have beyond the expected one."""
+        fit = fit_covariance(evidence, white)
+        std = float(np.sqrt(fit.variance))
+        if std == 0.0:
+            return absent(cls.name, 'the pulse errors vary no more than declared')
+        error = fit.variance_error / (2.0 * std)
+        text = (f'the pulse errors have {fit.observed_std:.3g} s where '
+                f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
+        against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
+        return Finding(cls.name, cls(std), {'std': error}, fit.p_value, text, against)

@@ -1,0 +1,43 @@
+"""Interfering tone: a line that no shaft makes, of which the average's comb lets some through."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+_SIGNIFICANT = 1e-4
+
+
+@dataclass(frozen=True)
+class InterferingTone(Effect):
+    """A tone of `frequency` Hz and peak `amplitude` on every channel."""
+
+    name: ClassVar[str] = 'interfering_tone'
+    summary: ClassVar[str] = 'a tone that no shaft makes'
+    scatters: ClassVar[bool] = True
+    frequency: float = parameter(50.0, 'frequency of the tone', 'Hz', above=0.0)
+    amplitude: float = parameter(0.0, "peak amplitude in units of the component's", '1',
+                                 minimum=0.0)
+
+    def line_variance(self, model: DeclaredModel) -> Array:
+        """Return the power that the comb filter of the average passes (Eq. 8)."""
+        line = np.asarray(model.orders) * model.fundamental_frequency
+        passed = (np.sinc((self.frequency - line) * model.duration) ** 2
+                  + np.sinc((self.frequency + line) * model.duration) ** 2)
+        return np.asarray(self.amplitude**2 * passed)
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Take the strongest line of the spectrum that is not synchronous."""
+        lines = evidence.lines
+        if not lines.tone_p_value < _SIGNIFICANT:
+            return absent(cls.name, 'no line stands out between the synchronous ones',
+                          p_value=lines.tone_p_value)
+        text = (f'a line of amplitude {lines.tone_amplitude:.3g} at {lines.tone_frequency:.6g} Hz '
+                'that is no order of the shaft')
+        return Finding(cls.name, cls(lines.tone_frequency, lines.tone_amplitude),
+                       {'frequency': lines.tone_frequency_error,
+                        'amplitude': lines.tone_standard_error}, lines.tone_p_value, text)

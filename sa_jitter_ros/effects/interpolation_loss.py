@@ -1,0 +1,35 @@
+"""Interpolation loss: samples read between samples by a rule that damps high frequencies."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.angle.resampling import gain as interpolator_gain
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+METHODS = ('band_limited', 'linear', 'cubic', 'spline')
+
+
+@dataclass(frozen=True)
+class InterpolationLoss(Effect):
+    """The samples were interpolated by `method`, at places that are even between the samples."""
+
+    name: ClassVar[str] = 'interpolation_loss'
+    summary: ClassVar[str] = 'interpolation of the samples'
+    method: str = parameter('linear', 'interpolator of the samples', '', choices=METHODS)
+
+    def gain(self, model: DeclaredModel) -> Array:
+        """Return the mean gain of the interpolator; raise ModelError without a sample rate."""
+        if not model.sample_rate > 0.0:
+            raise ModelError('sample_rate is 0: interpolation_loss depends on frequency over '
+                             'sample rate, so declare sample_rate')
+        frequency = np.asarray(model.orders) * model.fundamental_frequency / model.sample_rate
+        return interpolator_gain(self.method, np.minimum(frequency, 0.5))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Compare with a second interpolator."""
+        return absent(cls.name, 'a second interpolator gives the same amplitudes')

@@ -1,0 +1,73 @@
+"""
+Keyphasor quantisation: pulse times on the grid of a clock, to which their errors are locked.
+
+A clock of the declared keyphasor rate IS the declared jitter, seen rightly: its errors take the
+place of the independent ones. A clock of another rate comes on top. Errors of a steady machine
+repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases need not be what one
+average shows: where pulses were measured, the prediction is made for their own phases.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy import stats
+
+_PHASES, _SEED = 128, 6
+_SAME_RATE = 0.01
+_SIGNIFICANT = 1e-4
+
+
+@dataclass(frozen=True)
+class KeyphasorQuantisation(Effect):
+    """Pulse times rounded up to a clock of `clock_rate` Hz, the period varying by `period_std`."""
+
+    name: ClassVar[str] = 'keyphasor_quantisation'
+    summary: ClassVar[str] = 'pulse times on the grid of a clock'
+    clock_rate: float = parameter(10000.0, 'rate of the clock that times the pulses', 'Hz',
+                                  above=0.0)
+    period_std: float = parameter(0.0, 'standard deviation of the trigger period', 's',
+                                  minimum=0.0)
+
+    def scenarios(self, model: DeclaredModel) -> Array | None:
+        """Return the errors for evenly spread phases of the first pulse on the grid."""
+        rng = np.random.default_rng(_SEED)
+        periods = model.trigger_period + self.period_std * rng.standard_normal(
+            (_PHASES, model.trigger_cycles))
+        ticks = self.clock_rate * np.concatenate(
+            (np.zeros((_PHASES, 1)), np.cumsum(periods, axis=1)), axis=1)
+        ticks += (np.arange(_PHASES)[:, None] + 0.5) / _PHASES
+        return np.asarray((np.ceil(ticks) - ticks - 0.5) / self.clock_rate)
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """Return the errors that the measured times themselves tell."""
+        return pulses.errors
+
+    def replaces_jitter(self, model: DeclaredModel) -> bool:
+        """Tell whether this clock is the declared one."""
+        return abs(self.clock_rate / model.keyphasor_rate - 1.0) < _SAME_RATE
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Look whether the errors are those that the grid of the pulse times imposes."""
+        clock = evidence.clock.rate
+        if not clock > 0.0:
+            return absent(cls.name, 'the pulse times lie on no grid of a clock')
+        known = np.array([pulses.errors for pulses in evidence.pulses], dtype=float)
+        errors, known = evidence.errors.ravel(), known - known.mean(axis=1, keepdims=True)
+        correlation, p_value = stats.pearsonr(errors, known.ravel())
+        slope = float(errors @ known.ravel() / np.sum(known**2))
+        std = evidence.clock_period_std
+        text = (f'the pulse times lie on a grid of {clock:.6g} Hz, and the errors that the grid '
+                f'imposes on a smooth motion are the recovered ones: correlation '
+                f'{correlation:.3f}, slope {slope:.2f}, p = {p_value:.2g}')
+        if p_value > _SIGNIFICANT or correlation < 0.5:
+            return absent(cls.name, f'the pulse times lie on a grid of {clock:.6g} Hz, but their '
+                          f'errors are others: correlation {correlation:.3f}', p_value=p_value)
+        return Finding(cls.name, cls(clock, std),
+                       {'clock_rate': evidence.clock.standard_error,
+                        'period_std': std / np.sqrt(2.0 * evidence.record_missing.size)},
+                       float(p_value), text)

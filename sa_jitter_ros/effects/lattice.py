@@ -1,0 +1,110 @@
+"""The grid of a clock in pulse times: finding it, and what it says about each pulse."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+Array = NDArray[Any]
+
+_TOLERANCE = 0.02  # of a tick
+_STEPS = 3000
+
+
+@dataclass(frozen=True)
+class Clock:
+    """A clock of `rate` Hz (0 where there is none) with its standard error."""
+
+    rate: float
+    standard_error: float
+
+
+def find_clock(times: Array) -> Clock:
+    """
+    Find the clock whose ticks are all pulse `times` (n,) in s.
+
+    On a grid all differences of intervals are whole ticks, so their smallest one is one tick. A
+    machine whose intervals never repeat to within the rounding of its clock shows no grid.
+    """
+    none = Clock(0.0, 0.0)
+    intervals = np.sort(np.diff(times))
+    if intervals.size < 8:
+        return none
+    resolution = 4.0 * np.spacing(np.max(np.abs(times)))
+    gaps = np.diff(intervals)
+    steps = gaps[gaps > max(resolution, 1e-3 * float(np.max(gaps)), 1e-12)]
+    if steps.size == 0:
+        return none
+    tick = float(np.min(steps))
+    if np.count_nonzero(gaps <= 0.05 * tick) < 0.5 * gaps.size:
+        return none
+    elapsed = times - times[0]
+    count = 1
+    while count < times.size:  # lengthen the base over which the ticks are counted
+        count = min(2 * count, times.size - 1)
+        ticks = np.rint(elapsed[:count + 1] / tick)
+        if np.max(np.abs(elapsed[:count + 1] / tick - ticks)) > 0.35 or ticks[-1] < 1.0:
+            return none
+        tick = float(elapsed[:count + 1] @ ticks / (ticks @ ticks))
+        if count == times.size - 1:
+            break
+    ticks = np.rint(elapsed / tick)
+    misfit = elapsed / tick - ticks
+    scatter = float(np.sqrt(np.mean(misfit**2)))
+    if scatter > _TOLERANCE or np.gcd.reduce(ticks.astype(np.int64)) > 1:
+        return none
+    error = max(scatter, resolution / tick) / float(np.sqrt(ticks @ ticks)) / tick
+    return Clock(1.0 / tick, error)
+
+
+def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Array:
+    """
+    Return the errors (n,) in s, less half a tick, of `times` rounded up to a clock.
+
+    The true times are those of the smoothest motion that lies within one tick of the measured
+    ones: the least sum of squared second differences under these bounds, by the alternating
+    direction method of multipliers. `slack` in s widens the bounds for jitter in front of the
+    clock.
+    """
+    n = times.size
+    half = 0.5 + slack * clock_rate
+    index = np.arange(n)
+    trend = np.polynomial.Polynomial.fit(index, times, 1)(index)
+    middle = (times - trend) * clock_rate  # ticks; the true time lies within `half` of it
+    if n < 3:
+        return np.zeros(n)
+    penalty = _squared_second_difference(n)
+    mass = 0.02
+    factors = {}
+    x, z, y = middle.copy(), middle.copy(), np.zeros(n)
+    for step in range(_STEPS):
+        if mass not in factors:
+            matrix = penalty.copy()
+            matrix[-1] += mass
+            factors[mass] = cholesky_banded(matrix)
+        x = cho_solve_banded((factors[mass], False), mass * (z - y))
+        relaxed = 1.6 * x - 0.6 * z
+        before = z
+        z = np.clip(relaxed + y, middle - half, middle + half)
+        y = y + relaxed - z
+        primal, dual = np.max(np.abs(x - z)), np.max(np.abs(z - before))
+        if primal < 1e-3 and dual < 1e-4:
+            break
+        if step % 50 == 49 and step < 1000:  # balance the two residuals
+            factor = 2.0 if primal > 10.0 * dual else 0.5 if dual > 10.0 * primal else 1.0
+            mass, y = mass * factor, y / factor
+    true = np.clip(x, middle - half, middle + half)
+    return np.asarray((middle - true) / clock_rate)
+
+
+def _squared_second_difference(n: int) -> Array:
+    """Return D'D of the second difference, upper banded form (3, n)."""
+    bands = np.zeros((3, n))
+    for shift, weight in ((0, 1.0), (1, -2.0), (2, 1.0)):
+        for other, factor in ((0, 1.0), (1, -2.0), (2, 1.0)):
+            if other >= shift:
+                k = other - shift
+                bands[2 - k, other:n - 2 + other] += weight * factor
+    return bands

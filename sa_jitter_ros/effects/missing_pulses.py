@@ -1,0 +1,51 @@
+"""Missing pulses that nobody repairs: from each one on the angle is short of a trigger cycle."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+_SCENARIOS, _SEED = 256, 4
+
+
+@dataclass(frozen=True)
+class MissingPulses(Effect):
+    """Every trigger pulse is lost with `probability`."""
+
+    name: ClassVar[str] = 'missing_pulses'
+    summary: ClassVar[str] = 'pulses that are lost and not repaired'
+    probability: float = parameter(0.0, 'probability that a pulse is lost', '1', minimum=0.0,
+                                   maximum=0.9)
+
+    def scenarios(self, model: DeclaredModel) -> Array | None:
+        """Return how far the counted angle is behind, as a delay, for some draws of losses."""
+        if self.probability == 0.0:
+            return None
+        rng = np.random.default_rng(_SEED)
+        lost = rng.geometric(1.0 - self.probability, (_SCENARIOS, model.trigger_cycles)) - 1
+        return np.asarray(model.trigger_period * np.concatenate(
+            (np.zeros((_SCENARIOS, 1)), np.cumsum(lost, axis=1)), axis=1))
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """Return how far the counted angle is behind in the average at hand."""
+        if pulses.missing is None or not pulses.missing.any():
+            return None
+        period = (pulses.times[-1] - pulses.times[0]) / (
+            pulses.missing.size + pulses.missing.sum())
+        return np.asarray(period * np.concatenate(([0.0], np.cumsum(pulses.missing))))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Count intervals that are whole multiples of the period."""
+        missing = evidence.record_missing
+        lost, seen = int(missing.sum()), missing.size
+        if lost == 0:
+            return absent(cls.name, f'none of {seen} pulse intervals is a multiple of the period')
+        probability = lost / (lost + seen)
+        error = float(np.sqrt(probability * (1.0 - probability) / (lost + seen)))
+        return Finding(cls.name, cls(probability), {'probability': error}, 1e-12,
+                       f'{np.count_nonzero(missing)} of {seen} pulse intervals are multiples of '
+                       f'the period: {lost} pulses are missing')

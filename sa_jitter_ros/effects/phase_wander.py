@@ -1,0 +1,63 @@
+"""Phase wander: the source moves against the tach shaft (torsion, a changing transfer path)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.pulse_covariance import fit_covariance, slope_test
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+_MEMORY = 40
+
+
+@dataclass(frozen=True)
+class PhaseWander(Effect):
+    """Slow random angle of `std` rad between the shaft of interest and its vibration."""
+
+    name: ClassVar[str] = 'phase_wander'
+    summary: ClassVar[str] = 'slow motion of the source against the tach shaft'
+    std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
+                           minimum=0.0)
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """Return the wander, band-limited below half the trigger rate."""
+        variance = (self.std / (2.0 * np.pi)) ** 2
+
+        def covariance(u: Array, v: Array, lag: int) -> Array:
+            return np.asarray(variance * flat_band_correlation(lag + v - u, SLOW_BAND))
+
+        return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
+
+    def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
+        """Return what the wander looks like when it is taken for pulse errors."""
+        seconds = self.std / (2.0 * np.pi * model.fundamental_frequency)
+        return np.asarray(seconds**2 * flat_band_correlation(lags, SLOW_BAND))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit slow errors that the measured pulse times do not have."""
+        if evidence.against_reference:
+            return absent(cls.name, 'against a better keyphasor the source cannot move')
+        fit = fit_covariance(evidence, lambda lags, _: flat_band_correlation(lags, SLOW_BAND))
+        if fit.variance == 0.0:
+            return absent(cls.name, 'the pulse errors vary no more than declared')
+        slope = slope_test(evidence)
+        seconds = float(np.sqrt(fit.variance))
+        rad = 2.0 * np.pi * evidence.model.fundamental_frequency
+        text = (f'the vibration moves by {seconds:.3g} s against the pulses and the pulse times '
+                f'follow with slope {slope.slope:.2f} +- {slope.standard_error:.2f} only, '
+                f'p = {slope.p_value:.2g}')
+        if slope.tach_side:
+            return absent(cls.name, 'the pulse times move as the recovered errors do: slope '
+                          f'{slope.slope:.2f} +- {slope.standard_error:.2f}',
+                          p_value=slope.p_value)
+        rivals = () if slope.decided else ('correlated_jitter',)
+        return Finding(cls.name, cls(rad * seconds),
+                       {'std': rad * fit.variance_error / (2.0 * seconds)},
+                       max(fit.p_value, 1e-300), text, rivals=rivals,
+                       decider='a second keyphasor, or a steadier speed' if rivals else '')

@@ -1,0 +1,230 @@
+"""
+Fits of the autocovariance of pulse errors, and tests of what such a fit leaves.
+
+Errors have mean 0 in every acquisition, so they are compared through contrasts that a common delay
+does not change. The likelihood is normal; for the uniform declared jitter that errs on the safe
+side, because its variance scatters less than a normal one's.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.evidence import Evidence
+from scipy import optimize, stats
+from scipy.linalg import cho_factor, cho_solve, solve_triangular, toeplitz
+from scipy.special import ndtr
+
+Array = NDArray[Any]
+#: Autocorrelation at integer lags for a shape parameter.
+Correlation = Callable[[Array, float], Array]
+
+_MOST_PULSES = 200
+_GOOD = 1e-3
+
+
+def white(lags: Array, _: float) -> Array:
+    """Return the autocorrelation of independent errors."""
+    return np.where(lags == 0, 1.0, 0.0)
+
+
+@dataclass(frozen=True)
+class CovarianceFit:
+    """
+    A component `variance` (s^2) of the pulse errors beyond the expected ones, with its errors.
+
+    `shape` is the parameter of its autocorrelation. `gain` is twice the log-likelihood gained;
+    `p_value` that of no such component. `innovations` (acquisition, n) are the errors whitened by
+    the whole covariance.
+    """
+
+    variance: float
+    variance_error: float
+    shape: float
+    shape_error: float
+    gain: float
+    p_value: float
+    observed_std: float
+    expected_std: float
+    innovations: Array
+
+    def p_value_over(self, simpler: 'CovarianceFit') -> float:
+        """Return the p value of this fit's one more parameter."""
+        return float(stats.chi2.sf(max(self.gain - simpler.gain, 0.0), 1))
+
+
+@dataclass(frozen=True)
+class SlopeTest:
+    """
+    Whose error is it: regression of the pulse times on the recovered errors, second differences.
+
+    Slope 1: the tach is wrong; less: the vibration side moves. `p_value` is that of slope 1;
+    `decided` says whether the steady enough speed lets the slope tell the two apart.
+    """
+
+    slope: float
+    standard_error: float
+    p_value: float
+    decided: bool
+    tach_side: bool
+
+
+def fit_covariance(evidence: Evidence, correlation: Correlation, *,
+                   bounds: tuple[float, float] = (0.0, 0.0)) -> CovarianceFit:
+    """Fit the size, and within `bounds` the shape, of one more component of the pulse errors."""
+    errors = evidence.errors[:, :_MOST_PULSES]
+    count = errors.shape[1]
+    lags = np.arange(count)
+    noise = np.mean(evidence.standard_errors[:, :_MOST_PULSES] ** 2, axis=0)
+    noise = np.where(np.isfinite(noise), noise, 0.0)
+    known = toeplitz(evidence.expected_autocovariance(lags)) + np.diag(noise)
+    contrast = np.diff(np.eye(count), axis=0)
+    scale = float(np.mean(np.diff(errors, axis=1) ** 2)) or 1e-24
+    data = np.diff(errors, axis=1) / np.sqrt(scale)
+    base = contrast @ known @ contrast.T / scale + 1e-9 * np.eye(count - 1)
+
+    def added(shape: float) -> Array:
+        return np.asarray(contrast @ toeplitz(correlation(lags, shape)) @ contrast.T)
+
+    def deviance(variance: float, part: Array) -> float:
+        factor = cho_factor(base + variance * part, lower=True)
+        return float(len(data) * 2.0 * np.sum(np.log(np.diag(factor[0])))
+                     + np.sum(data * cho_solve(factor, data.T).T))
+
+    def best(shape: float) -> tuple[float, float]:
+        part = added(shape)
+        top = 4.0 * float(np.mean(data**2)) / float(np.mean(np.diag(part)))
+        found = optimize.minimize_scalar(
+            lambda root: deviance(root**2, part), bounds=(0.0, np.sqrt(top)), method='bounded',
+            options={'xatol': 1e-5})
+        return float(found.x**2), float(found.fun)
+
+    shape, shape_error = 0.0, 0.0
+    low, high = bounds
+    if high > low:
+        grid = np.linspace(low, high, 15)
+        start = grid[int(np.argmin([best(x)[1] for x in grid]))]
+        step = (high - low) / 14.0
+        shape = float(optimize.minimize_scalar(
+            lambda x: best(x)[1], bounds=(max(low, start - step), min(high, start + step)),
+            method='bounded', options={'xatol': 1e-4}).x)
+        width = 0.02
+        bend = (best(min(shape + width, high))[1] - 2.0 * best(shape)[1]
+                + best(max(shape - width, low))[1]) / width**2
+        shape_error = float(np.sqrt(2.0 / max(bend, 1e-6)))
+    part = added(shape)
+    variance, value = best(shape)
+    nothing = deviance(0.0, part)
+    gain = max(nothing - value, 0.0)
+    step = max(0.02 * variance, 1e-6)
+    bend = (deviance(variance + step, part) - 2.0 * deviance(variance, part)
+            + deviance(max(variance - step, 0.0), part)) / step**2
+    error = float(np.sqrt(2.0 / bend)) if bend > 0.0 else float('inf')
+    if gain < 1e-6:
+        variance = 0.0
+    factor = cho_factor(base + variance * part, lower=True)[0]
+    innovations = solve_triangular(factor, data.T, lower=True).T
+    return CovarianceFit(
+        variance * scale, error * scale, shape, shape_error, gain,
+        0.5 * float(stats.chi2.sf(gain, 1)), float(np.sqrt(np.mean(errors**2))),
+        float(np.sqrt((np.trace(known) - known.sum() / count) / count)), innovations)
+
+
+def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
+    """Say what speaks against a fit, by what it leaves; '' if nothing does."""
+    white_left = fit.innovations[:, 1:]
+    rows, count = white_left.shape
+    total, used = 0.0, 0
+    for lag in range(1, min(12, count // 2) + 1):
+        product = white_left[:, lag:] * white_left[:, :-lag]
+        total += product.sum() ** 2 / np.sum(white_left[:, lag:] ** 2 * white_left[:, :-lag] ** 2)
+        used += 1
+    p_memory = float(stats.chi2.sf(total, used))
+    if p_memory < _GOOD:
+        return f'the errors keep a memory that it does not have: p = {p_memory:.2g}'
+    spectrum = np.mean(np.abs(np.fft.rfft(white_left, axis=1)[:, 1:]) ** 2, axis=0)
+    peak = float(spectrum.max() / spectrum.mean())
+    p_line = float(min(1.0, spectrum.size * stats.gamma.sf(peak * rows, rows)))
+    if p_line < _GOOD:
+        return f'the errors hold a line spectrum that it does not have: p = {p_line:.2g}'
+    p_law = _law_p_value(evidence, fit)
+    if p_law < _GOOD:
+        return f'the law of the errors is not the one it has: p = {p_law:.2g}'
+    power = np.mean(white_left**2, axis=1)
+    if rows >= 4:
+        kurtosis = float(np.mean(white_left**4) / np.mean(white_left**2) ** 2)
+        spread = float(power.std(ddof=1) / power.mean())
+        expected = np.sqrt(max(kurtosis - 1.0, 0.2) / count)
+        ratio = float((rows - 1) * (spread / expected) ** 2)
+        p_steady = float(stats.chi2.sf(ratio, rows - 1))
+        if p_steady < _GOOD:
+            return f'the size of the errors is not steady over the record: p = {p_steady:.2g}'
+    return ''
+
+
+def _law_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
+    """Compare the errors with the declared law plus a normal one of the fitted variance."""
+    errors = evidence.errors.ravel()
+    jitter = evidence.model.distribution
+    count = evidence.errors.shape[1]
+    known = evidence.expected_autocovariance(np.zeros(1, int))[0] - jitter.variance
+    noise = float(np.nanmean(evidence.standard_errors**2))
+    normal = max(fit.variance + max(known, 0.0) + noise, 1e-30)
+    shrink = np.sqrt(1.0 + jitter.variance / (count * normal))
+    rng = np.random.default_rng(1)
+    draws = np.sort(jitter.draw(rng, 20000)) if known > -0.5 * jitter.variance else np.zeros(1)
+    draws = draws[:: max(1, draws.size // 400)]
+
+    def cdf(x: Array) -> Array:
+        return np.asarray(ndtr((x[:, None] - draws) / np.sqrt(normal)).mean(axis=1))
+
+    memory = max(1.0, _effective_repeats(evidence.errors))
+    distance = float(stats.kstest(errors * min(shrink, 1.02), cdf).statistic)
+    return float(stats.kstwobign.sf(distance * np.sqrt(errors.size / memory)))
+
+
+def _effective_repeats(errors: Array) -> float:
+    """Return how many neighbouring errors count as one."""
+    power = float(np.mean(errors**2)) or 1.0
+    total = 1.0
+    for lag in range(1, min(20, errors.shape[1] // 2)):
+        r = float(np.mean(errors[:, lag:] * errors[:, :-lag])) / power
+        if abs(r) < 0.1:
+            break
+        total += 2.0 * abs(r)
+    return total
+
+
+def slope_test(evidence: Evidence) -> SlopeTest:
+    """Regress the second differences of the pulse times on those of the recovered errors."""
+    y = np.diff(evidence.errors, 2, axis=1)
+    x = np.diff(evidence.times, 2, axis=1)
+    if any(pulses.missing is not None and pulses.missing.any() for pulses in evidence.pulses):
+        period = evidence.period
+        x = (x + 0.5 * period) % period - 0.5 * period
+    noise = 6.0 * float(np.nanmean(evidence.standard_errors**2))
+    power = max(float(np.mean(y**2)) - noise, 1e-30)
+    rows = np.mean(x * y, axis=1)
+    slope = float(rows.mean()) / power
+    left = x - slope * y
+    error = float(np.sqrt(np.mean(left**2) / power / (y.size / 3.0)))
+    lags = np.arange(3)
+    white_part = float(np.dot(evidence.expected_autocovariance(lags), (6.0, -8.0, 2.0)))
+    vibration_slope = min(1.0, max(white_part, 0.0) / power)
+    p_value = float(2.0 * stats.norm.sf(abs(slope - 1.0) / max(error, 1e-12)))
+    decided = (1.0 - vibration_slope) > 4.0 * error
+    tach_side = decided and slope > 0.5 * (1.0 + vibration_slope)
+    return SlopeTest(slope, error, p_value, decided, tach_side)
+
+
+def require_tach_side(evidence: Evidence) -> str:
+    """Say that the vibration side moves, where it does; '' where the pulses are wrong."""
+    if evidence.against_reference:
+        return ''
+    test = slope_test(evidence)
+    if test.decided and not test.tach_side:
+        return (f'the pulse times do not move with the recovered errors: slope {test.slope:.2f} '
+                f'+- {test.standard_error:.2f}')
+    return ''

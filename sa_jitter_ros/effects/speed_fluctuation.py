@@ -1,0 +1,77 @@
+"""Speed fluctuation: an acceleration that the linear angle law cannot follow inside a cycle."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.band import ACCELERATION_BAND, flat_band_correlation
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy import stats
+
+_SIGNIFICANT = 1e-4
+_MEMORY = 20
+
+
+@dataclass(frozen=True)
+class SpeedFluctuation(Effect):
+    """
+    Random acceleration of the tach shaft, nearly constant within a trigger cycle.
+
+    The linear law then errs by -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing at the
+    pulses, most in the middle.
+    """
+
+    name: ClassVar[str] = 'speed_fluctuation'
+    summary: ClassVar[str] = 'acceleration inside a trigger cycle'
+    acceleration_std: float = parameter(
+        0.0, 'standard deviation of the acceleration of the tach shaft', 'rad/s^2', minimum=0.0)
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """Return the error of the linear law."""
+        size = 0.5 * _cycles(model, self.acceleration_std) * model.trigger_period**2
+        variance = (size * model.cycle_length) ** 2
+
+        def covariance(u: Array, v: Array, lag: int) -> Array:
+            keep = float(flat_band_correlation(lag, ACCELERATION_BAND))
+            return np.asarray(variance * keep * u * (1.0 - u) * v * (1.0 - v))
+
+        return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit the ripple inside the cycles, which the true pulse times must show as well."""
+        model = evidence.model
+        curve = np.diff(evidence.times - evidence.errors, 2, axis=1)
+        expected = 0.25 * (curve[:, :-1] + curve[:, 1:])  # s, at all cycles but the outer two
+        ripple = evidence.ripple[:, 1:-1]
+        if not np.all(np.isfinite(ripple)) or expected.size < 12:
+            return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
+        noise = evidence.ripple_standard_error**2
+        variance = float(np.mean(evidence.ripple**2) - noise)
+        slope, _, r, p_value, slope_error = stats.linregress(expected.ravel(), ripple.ravel())
+        cycles = 2.0 * np.sqrt(max(variance, 0.0)) / model.trigger_period**3
+        std = cycles * 2.0 * np.pi * model.trigger_revolutions
+        rows = np.mean(evidence.ripple**2, axis=1)
+        error = float(rows.std(ddof=1) / np.sqrt(len(rows)) / max(variance, 1e-300) * 0.5 * std)
+        text = (f'an error u (1 - u) of {np.sqrt(max(variance, 0.0)):.3g} s inside the cycles '
+                f'follows the acceleration between the pulses with slope {slope:.2f} +- '
+                f'{slope_error:.2f}, p = {p_value:.2g}')
+        if variance <= 0.0 or p_value > _SIGNIFICANT or slope <= 0.0:
+            return absent(cls.name, 'the error inside the cycles does not follow the acceleration '
+                          f'between the pulses: slope {slope:.2f}, p = {p_value:.2g}',
+                          p_value=float(p_value))
+        against = ''
+        if r**2 * (1.0 + noise / variance) < 0.4:
+            against = (f'the acceleration between the pulses explains {r**2:.0%} of the error '
+                       'inside the cycles: something faster moves')
+        return Finding(cls.name, cls(std), {'acceleration_std': error}, float(p_value), text,
+                       against)
+
+
+def _cycles(model: DeclaredModel, acceleration: float) -> float:
+    """Return an acceleration in rad/s^2 of the tach shaft in trigger cycles/s^2."""
+    return acceleration / (2.0 * np.pi * model.trigger_revolutions)

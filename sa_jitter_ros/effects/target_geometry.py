@@ -1,0 +1,93 @@
+"""Target geometry: marks off their even places, an error that repeats with the pulse index."""
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar
+
+import numpy as np
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy import stats
+
+_LONGEST = 24
+_SIGNIFICANT = 1e-4
+# In favour of the number of marks that the target has.
+_KNOWN = math.log(100.0)
+
+
+@dataclass(frozen=True)
+class TargetGeometry(Effect):
+    """Pulse k comes late by `pulse_angles`[k mod n] rad of the tach shaft."""
+
+    name: ClassVar[str] = 'target_geometry'
+    summary: ClassVar[str] = 'marks of the target off their even places'
+    pulse_angles: tuple[float, ...] = parameter(
+        (), 'angle by which each mark of the target is late', 'rad')
+
+    def _at(self, model: DeclaredModel, first: int) -> Array:
+        """Return the errors (N_t + 1,) in s of the trigger pulses from the `first` on."""
+        step = model.pulses_per_trigger or model.pulses_per_revolution
+        index = (first + np.arange(model.trigger_cycles + 1)) * step
+        angles = np.asarray(self.pulse_angles)[index % len(self.pulse_angles)]
+        return np.asarray(angles / (2.0 * np.pi * model.trigger_speed))
+
+    def scenarios(self, model: DeclaredModel) -> Array | None:
+        """Return the errors for every mark that an average may begin with."""
+        if not self.pulse_angles:
+            return None
+        return np.array([self._at(model, first) for first in range(len(self.pulse_angles))])
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """Return the errors of the pulses at hand."""
+        return self._at(model, pulses.first) if self.pulse_angles else None
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fold the pulse errors by the pulse index, with every period that fits several times."""
+        model = evidence.model
+        count = evidence.errors.shape[1]
+        marks = model.pulses_per_revolution
+        step = model.pulses_per_trigger or marks
+        own = marks // math.gcd(marks, step)
+        periods = {own, *range(2, min(_LONGEST, count // 2) + 1)} & set(range(2, count))
+        if len(evidence.errors) < 3 or not periods:
+            return absent(cls.name, 'too few pulses to fold by the pulse index')
+        folds = {p: _folded(evidence, evidence.errors, p) for p in sorted(periods)}
+        best = min(folds, key=lambda p: folds[p][1] - (_KNOWN if p == own else 0.0))
+        for longer in sorted(p for p in folds if p > best and p % best == 0):
+            phase = [(pulses.first + np.arange(count)) % best for pulses in evidence.pulses]
+            left = evidence.errors - folds[best][0][np.array(phase)]
+            if _folded(evidence, left, longer)[1] < math.log(_SIGNIFICANT / len(folds)):
+                best = longer
+        mean, log_p_value, error = folds[best]
+        p_value = min(1.0, math.exp(max(log_p_value, -690.0)) * len(folds))
+        size = float(np.sqrt(np.mean(mean**2)))
+        text = (f'the pulse errors repeat every {best} trigger pulses with {size:.3g} s, '
+                f'p = {p_value:.2g}')
+        if p_value > _SIGNIFICANT:
+            return absent(cls.name, 'the pulse errors do not repeat with the pulse index: best '
+                          f'period {best}, p = {p_value:.2g}', p_value=p_value)
+        length = marks if best == own and own * step >= marks and marks > 1 else best * step
+        angles, errors = np.zeros(length), np.zeros(length)
+        places = (np.arange(best) * step) % length
+        angles[places] = 2.0 * np.pi * model.trigger_speed * mean
+        errors[places] = 2.0 * np.pi * model.trigger_speed * error
+        return Finding(cls.name, cls(tuple(angles.tolist())),
+                       {'pulse_angles': errors.tolist()}, p_value, text)
+
+
+def _folded(evidence: Evidence, errors: Array, period: int) -> tuple[Array, float, float]:
+    """Return each phase's mean error, the log p value of the repeating, and its standard error."""
+    table = []
+    for row, pulses in zip(errors, evidence.pulses):
+        phase = (pulses.first + np.arange(row.size)) % period
+        folded = np.bincount(phase, row, period) / np.bincount(phase, minlength=period)
+        table.append(folded - folded.mean())
+    rows = np.array(table)
+    count = len(rows)
+    mean = rows.mean(axis=0)
+    between = np.sum((rows - mean) ** 2) / ((count - 1) * (period - 1))
+    ratio = count * np.sum(mean**2) / (period - 1) / max(between, 1e-300)
+    log_p_value = float(stats.f.logsf(ratio, period - 1, (count - 1) * (period - 1)))
+    return mean, log_p_value, float(np.sqrt(between * (period - 1) / period / count))
