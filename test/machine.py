@@ -41,7 +41,7 @@ class Machine:
 
     def amplitudes(self, pulses, orders, *, cycles=1.0, angle=0.0):
         """
-        Return the exact complex amplitudes (order,) of channel 0 over these trigger cycles.
+        Return the exact complex amplitudes of channel 0 over these trigger cycles.
 
         The piecewise-linear law reads the pulses as they are; `cycles` is r, `angle` that of the
         first pulse. The cosine's other half, and all other components, leak in as they must.

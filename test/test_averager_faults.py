@@ -210,8 +210,7 @@ def test_node_goes_on_after_nonsense_of_every_kind(ros_context, executor_for):
         np.testing.assert_allclose(average.values[0, :2, 1], [1.0, 0.7], atol=5e-3)
 
 
-def test_memory_of_the_node_is_bounded_without_pulses_and_without_vibration(ros_context,
-                                                                           executor_for):
+def test_memory_is_bounded_without_pulses_and_without_vibration(ros_context, executor_for):
     b = AveragerBench(ros_context, executor_for, buffer_seconds=0.5, trigger_cycles=CYCLES,
                       shaft__orders=ORDERS)
     machine = machine_of(0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.averaging import means
 from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, SlidingMean
-from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 
 VALUES = st.lists(st.complex_numbers(max_magnitude=1e6), min_size=1, max_size=40)
 
@@ -124,6 +124,23 @@ def test_radial_noise_leaves_out_turning_and_lines(rng):
     leaking = 0.5 * np.exp(2j * np.pi * 0.2 * k)  # 8 whole periods
     assert np.mean(radial_noise(turned + noise) ** 2) * 40 < 2.0 * 0.01**2
     assert np.mean(radial_noise(1.0 + noise + leaking) ** 2) * 40 < 1.3 * 0.01**2
+
+
+@pytest.mark.parametrize('length', [1.0, 2.40789, 0.4137])
+def test_leakage_between_orders_is_taken_out(length):
+    orders, amplitudes = np.array([2.0, 3.0, 7.5]), np.array([[1.0, 0.5j, -0.3]])
+    angles = 5.0 + length * np.arange(1500)
+    u = (np.arange(500) + 0.5) / 500
+    cycles = []
+    for angle in angles:
+        theta = angle + length * u
+        wave = (amplitudes @ np.exp(2j * np.pi * np.multiply.outer(orders, theta))).real
+        cycles.append(2.0 * wave @ np.exp(-2j * np.pi * np.multiply.outer(theta, orders)) / 500)
+    cycles = np.array(cycles)
+    clean = without_leakage(cycles, tuple(orders), length, angles)
+    np.testing.assert_allclose(clean, np.broadcast_to(amplitudes, clean.shape), atol=2e-3)
+    cycles[0, 0, 1] = np.nan  # an undefined order leaves the others
+    assert np.isfinite(without_leakage(cycles, tuple(orders), length, angles)[1:, 0, ::2]).all()
 
 
 def test_radial_noise_of_too_little_is_undefined():

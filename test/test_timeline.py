@@ -26,7 +26,7 @@ def timeline_of(*blocks, **options):
 
 
 def held(timeline):
-    """Return the samples held (channel 0), as (epoch, first, last) of every stretch."""
+    """Return epoch, first and last sample of every stretch."""
     found = []
     for stretch in timeline.stretches:
         values = stretch.samples[:, 0]

@@ -18,7 +18,7 @@ from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleS
                                            first_point, grid_points, needed_margin, on_grid,
                                            project, waveform_cutoff)
 from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, RunningMean, SlidingMean
-from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ class ShaftAverager:
         return lost
 
     def margin(self, period: float, rate: float) -> int:
-        """Samples that a cycle of `period` s at `rate` Hz needs on either side."""
+        """Return how many samples a cycle of `period` s at `rate` Hz needs on either side."""
         points = self._points or self._chosen(period, rate)
         return needed_margin(self.settings.interpolation,
                              waveform_cutoff(points, self.settings.cycles, period, rate))
@@ -272,12 +272,16 @@ class ShaftAverager:
             waveform, error = self._wave_mean.mean, self._wave_mean.standard_error
         if settings.averaging == 'exponential':
             count = min(count, int(settings.trigger_cycles * settings.cycles))
+        cycles = np.array(self._amplitudes)
+        angles = settings.cycles * (self._cycle - np.arange(len(cycles), 0, -1))
         average = SynchronousAverage(
             start_time=self._pulses[0], end_time=self._pulses[-1], sequence=self._sequence,
             trigger_cycles=settings.trigger_cycles, fundamental_cycles=count,
             waveform=waveform.T, standard_error=error.T, orders=np.array(settings.orders),
-            amplitudes=self._amplitude_mean.mean, noise=radial_noise(np.array(self._amplitudes)),
-            angle=settings.cycles * (self._cycle - settings.trigger_cycles),
+            amplitudes=self._amplitude_mean.mean,
+            noise=radial_noise(without_leakage(
+                cycles, settings.orders, settings.cycles, angles)),
+            angle=float(angles[0]),
             pulses=np.array(self._pulses))
         self._sequence += 1
         return average

@@ -1,10 +1,10 @@
 """
 The on-line average: samples and trigger pulses in, in any cut and order of arrival, averages out.
 
-A trigger cycle is handed to the shafts as soon as both its pulses, the pulses that the angle law reads
-and the samples around it are there. The result depends on the data alone: not on how they were cut
-into messages, nor on whether pulses arrive before or after their samples. A cycle that cannot be had
-is discarded and counted; the unfinished averages end with it.
+A trigger cycle is handed to the shafts as soon as both its pulses, the pulses that the angle law
+reads and the samples around it are there. The result depends on the data alone: not on how they
+were cut into messages, nor on whether pulses arrive before or after their samples. A cycle that
+cannot be had is discarded and counted; the unfinished averages end with it.
 """
 
 from dataclasses import dataclass, replace
@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.angle.laws import angle_law
 from sa_jitter_ros.angle.pulses import PulseValidator, TriggerPulses
+from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
-from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, SynchronousAverage
+from sa_jitter_ros.averaging.shaft import AverageSettings, SynchronousAverage
 from sa_jitter_ros.averaging.stretch import Stretch
 from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -63,7 +64,7 @@ class StreamingAverager:
             raise ParameterError('no shaft to average: name at least one')
         self.timeline, self.validator = timeline, validator
         self.counts = StreamCounts()
-        self.shafts = {name: ShaftAverager(settings) for name, settings in shafts.items()}
+        self.shafts = {name: CorrectingAverager(settings) for name, settings in shafts.items()}
         self._law = angle_law(next(iter(shafts.values())).law)
         self._triggers: list[Trigger] = []  # of which the next cycle begins at _next
         self._next = 0
@@ -95,7 +96,7 @@ class StreamingAverager:
         return averages
 
     def change(self, shafts: dict[str, AverageSettings]) -> None:
-        """Go on with other settings of the same shafts; unfinished averages are lost and counted."""
+        """Go on with other settings of the same shafts; unfinished averages are lost, counted."""
         lost = [self.shafts[name].change(settings) for name, settings in shafts.items()]
         self.counts.averages_dropped += sum(lost)
         self._law = angle_law(next(iter(shafts.values())).law)
@@ -133,7 +134,7 @@ class StreamingAverager:
                                           last.elapsed + max(time - last.time, 0.0)))
 
     def _bound_pulses(self) -> None:
-        """Drop and count the oldest pulses that wait longer than the buffer for their vibration."""
+        """Drop and count the oldest pulses that wait for vibration longer than the buffer."""
         limit = self.timeline.buffer_seconds
         waiting = self._triggers[self._next:]
         if not waiting or waiting[-1].elapsed - waiting[0].elapsed <= limit:
@@ -195,7 +196,7 @@ class StreamingAverager:
         for stretch in timeline.stretches:
             if stretch.epoch != start.epoch or not len(stretch.samples):
                 continue
-            low, high = stretch.position(np.array([start.time, end.time]))
+            low, high = stretch.position(start.time), stretch.position(end.time)
             last = len(stretch.samples) - 1
             ahead = low > last
             if low < -1e-6 or ahead:
@@ -228,7 +229,7 @@ class StreamingAverager:
             stop += 1
         pulses = np.array([item.time for item in self._triggers[begin:stop]])
         first = self._next - begin
-        low, high = stretch.position(pulses[first:first + 2])
+        low, high = (stretch.position(float(pulse)) for pulse in pulses[first:first + 2])
         averages, failed = [], ''
         self._lead = 0.0
         for name, shaft in self.shafts.items():
