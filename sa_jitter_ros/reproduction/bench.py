@@ -36,12 +36,12 @@ def machine(
     """
     Return one acquisition of the bench.
 
-    `load` scales the mesh, `chip` is the amplitude of the broken tooth's burst; first and second
-    mesh harmonic have amplitudes 1 and 0.6 at load 1.
+    `load` scales everything but the noise; at load 1 the first two mesh harmonics have amplitudes
+    1 and 0.6 and the burst of a broken tooth has `chip`.
     """
-    gains = np.asarray(channel_gains, float)
-    pinion = mesh('pinion', TEETH, harmonics=(load, 0.6 * load, 0.2 * load),
-                  channel_gains=gains.tolist(), sidebands={1.0: 0.08, 2.0: 0.04}, seed=1)
+    gains = load * np.asarray(channel_gains, float)
+    pinion = mesh('pinion', TEETH, harmonics=(1.0, 0.6, 0.2), channel_gains=gains.tolist(),
+                  sidebands={1.0: 0.08, 2.0: 0.04}, seed=1)
     others = tuple(
         Component('bevel', order, tuple(size * gains), (0.3 * order,) * gains.size)
         for order, size in ((1.0, 0.1), (29.0, 0.4), (58.0, 0.2)))

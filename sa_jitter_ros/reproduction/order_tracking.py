@@ -60,10 +60,13 @@ class Simulated:
     """
     Amplitudes of order 1 from full simulations, and the pulse errors behind them.
 
-    `amplitudes` (n,) are complex; `errors` (n, trigger_cycles + 1) in fundamental cycles.
+    `amplitudes` (n,) are those of the averaged waveform, over whole fundamental cycles, as in the
+    paper; `order_amplitudes` (n,) those over whole trigger cycles; both complex. `errors`
+    (n, trigger_cycles + 1) in fundamental cycles.
     """
 
     amplitudes: Array
+    order_amplitudes: Array
     errors: Array
 
 
@@ -75,17 +78,22 @@ def simulate(case: HarmonicCase, count: int, *, seed: int, progress: Progress) -
     settings = AverageSettings(
         cycles=case.cycle_length, trigger_cycles=case.trigger_cycles, orders=(1.0,),
         samples_per_revolution=case.samples_per_revolution, interpolation=case.interpolation)
-    amplitudes = np.empty(count, complex)
+    amplitudes, order_amplitudes = np.empty((2, count), complex)
     errors = np.empty((count, case.trigger_cycles + 1))
     for k in range(count):
         # the first pulse is due after a quarter of a trigger cycle
         pulses = case.machine(seed + k).pulses(0.0, stop - 0.25 * period)
         average = synchronous_average(vibration, case.sample_rate, pulses.times, settings)
-        cosine, sine = fourier_lines(average, [1])[:, 0]
-        amplitudes[k] = 0.5 * (cosine + 1j * sine)
+        amplitudes[k] = _complex_harmonic(fourier_lines(average, [1]))
+        order_amplitudes[k] = _complex_harmonic(average.amplitudes)
         errors[k] = pulses.errors * case.fundamental
         progress((k + 1.0) / count)
-    return Simulated(amplitudes, errors)
+    return Simulated(amplitudes, order_amplitudes, errors)
+
+
+def _complex_harmonic(peaks: Array) -> complex:
+    """Return the amplitude of cosine + j sine from the peak amplitudes of both, shape (2, 1)."""
+    return complex(0.5 * (peaks[0, 0] + 1j * peaks[1, 0]))
 
 
 def as_in_table_1(case: HarmonicCase) -> HarmonicCase:

@@ -62,7 +62,8 @@ def page(results: Sequence[Results], command: str) -> str:
             lines.append('Settings that differ from the paper or are not in its text:\n')
             lines += [f'* {choice}' for choice in group.choices]
             lines.append('')
-        lines += [f'![{group.title}](figures/validation-{stem}.png)\n' for stem in group.figures]
+        lines += [f'![{stem} of: {group.title}](figures/validation-{stem}.png)\n'
+                  for stem in group.figures]
     return '\n'.join(lines)
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.reproduction.order_tracking import as_in_table_1, HarmonicCase, simulate
 from sa_jitter_ros.reproduction.plots import COLOURS, distribution, panel_titles, panels
 from sa_jitter_ros.reproduction.results import (
-    agreement, compare, Comparison, Effort, Finding, one_law, Progress, Results, stage, summary)
+    agreement, compare, Comparison, Effort, Finding, one_law, Progress, Results, SIGNIFICANCE,
+    stage, summary)
 from sa_jitter_ros.statistics.distributions import Uniform
 from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
 from scipy.stats import kstest
@@ -32,7 +33,8 @@ class Samples:
     """
     Amplitudes of one case: full simulation, exact and approximate model.
 
-    `gap` is the largest difference between simulation and exact model under the same errors.
+    `gap` is the largest difference between simulation and exact model under the same errors,
+    `order_gap` that of the amplitudes over whole trigger cycles.
     """
 
     case: HarmonicCase
@@ -40,6 +42,7 @@ class Samples:
     exact: Array
     approximate: Array
     gap: float
+    order_gap: float
 
     @property
     def simulation_test(self) -> Comparison:
@@ -68,9 +71,10 @@ def sample(case: HarmonicCase, effort: Effort, seed: int, progress: Progress) ->
     exact, approximate = (
         monte_carlo(model, Uniform(case.width), case.trigger_cycles, effort.iterations, seed=seed)
         for model in (signal.whole_fundamental_cycles, signal.majority_assignment))
-    gap = np.abs(simulated.amplitudes - signal.whole_fundamental_cycles(simulated.errors)).max()
+    gaps = (simulated.amplitudes - signal.whole_fundamental_cycles(simulated.errors),
+            simulated.order_amplitudes - signal.whole_trigger_cycles(simulated.errors))
     return Samples(case, np.abs(simulated.amplitudes), np.abs(exact), np.abs(approximate),
-                   float(gap))
+                   *(float(np.abs(gap).max()) for gap in gaps))
 
 
 def report(samples: Samples) -> dict[str, Any]:
@@ -83,7 +87,8 @@ def report(samples: Samples) -> dict[str, Any]:
         'approximate': summary(samples.approximate),
         'simulated_against_exact': asdict(samples.simulation_test),
         'approximate_against_exact': asdict(samples.approximation_test),
-        'largest_difference_under_the_same_errors': samples.gap}
+        'largest_difference_under_the_same_errors': samples.gap,
+        'largest_difference_over_whole_trigger_cycles': samples.order_gap}
 
 
 def draw(axes: Any, curves: list[tuple[str, Samples]]) -> None:
@@ -124,6 +129,9 @@ def run(effort: Effort, progress: Progress) -> Results:
         (f'Full simulations are run {effort.simulations} times a case (Table 1: 1E4) and the '
          f'numerical models {effort.iterations} times (Table 2: 1E6); `--simulations` and '
          '`--iterations` raise both.',
+         'Amplitudes are Fourier lines of the averaged waveform, so over whole fundamental cycles, '
+         'as in the paper. `order_amplitude` integrates over whole trigger cycles, where r has no '
+         'influence at all on a single harmonic.',
          'The vibration is sampled at 2048 Hz (simulation 12: 256 Hz and 32 angular samples) and '
          'interpolated band-limited, not at 16384 Hz with a spline. With the same pulse errors, '
          f'simulation 8 then differs from that of Table 1 by at most {sampling_gap:.1e}.'),
@@ -147,6 +155,7 @@ def _table_3(cases: dict[int, Samples]) -> tuple[tuple[str, ...], ...]:
 def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Finding, ...]:
     tests = [item.simulation_test for item in cases.values()]
     gap = max(item.gap for item in cases.values())
+    order_gap = max(item.order_gap for item in cases.values())
     pooled = numbers['pooled']
     integer = [cases[k] for k in (1, 2, 3, 4)]
     coincidence = max(float(np.abs(item.exact - item.approximate).max()) for item in integer)
@@ -171,8 +180,10 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
                 f'{tests[0].sizes[1]}: smallest p {min(item.p_value for item in tests):.3f}; '
                 f'pooled over {pooled["size"]}: D = {pooled["distance"]:.4f}, p = '
                 f'{pooled["p_value"]:.3f}; with the same pulse errors the amplitudes differ by at '
-                f'most {gap:.1e}',
-                agreement(one_law(tests), pooled['p_value'] > 0.01, gap < _EXACT_ENOUGH)),
+                f'most {gap:.1e} (waveform) and {order_gap:.1e} (`order_amplitude`, whole trigger '
+                'cycles)',
+                agreement(one_law(tests), pooled['p_value'] > SIGNIFICANCE,
+                          max(gap, order_gap) < _EXACT_ENOUGH)),
         Finding('Fig. 4a', 'for integer r the approximate model coincides with the exact one',
                 f'largest difference under the same errors {coincidence:.1e}',
                 agreement(coincidence < 1e-10)),
