@@ -152,8 +152,8 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 'loss of orders 19 and 38 (near sensors): '
                 + '; '.join(f'{law} {listed(values)}' for law, values in losses.items())
                 + '; sign tests of linear against quadratic '
-                f'{chance(tests["quadratic"])}, against spline {chance(tests["spline"])}; smallest '
-                'advantage of the mean over all sensors and both harmonics '
+                f'{chance(tests["quadratic"])}, against spline {chance(tests["spline"])}; '
+                'smallest advantage of the mean over all sensors and both harmonics '
                 f'{advantage["quadratic"]:.4f} and {advantage["spline"]:.4f}',
                 agreement(*(value < SIGNIFICANCE for value in tests.values()),
                           min(advantage.values()) > 0.0),

@@ -1,6 +1,6 @@
 """Figures 17 to 19: what pulse jitter does to residual kurtosis and to fault detection."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -120,11 +120,15 @@ def kurtosis(averages: list[Array], acquisitions: int) -> Array:
     return np.asarray(values.reshape(acquisitions, -1))
 
 
-def run(effort: Effort, progress: Progress) -> Results:
-    """Reproduce Figs. 17 to 19."""
-    counts = {'healthy': effort.acquisitions, 'faulty': max(effort.acquisitions // 2, 2)}
-    exact: dict[tuple[str, str], list[Array]] = {}
-    jittered: dict[tuple[str, str], list[Array]] = {}
+def measure(
+    counts: Mapping[str, int], realisations: int, progress: Progress,
+) -> dict[tuple[str, str, str], list[Array]]:
+    """
+    Return averaged waveforms by figure, state and kind of pulses.
+
+    One of each acquisition for exact pulses, `realisations` of each for jittered ones.
+    """
+    found: dict[tuple[str, str, str], list[Array]] = {}
     rng = np.random.default_rng(17)
     done = 0
     for state, count in counts.items():
@@ -135,16 +139,21 @@ def run(effort: Effort, progress: Progress) -> Results:
             pulses = np.ceil(pulses * FAST) / FAST
             for case in CASES:
                 samples = resample_poly(vibration, 1, case.reduction)
-                exact.setdefault((case.figure, state), []).append(
+                errors = rng.uniform(-0.5, 0.5, (realisations, pulses.size)) * case.width
+                found.setdefault((case.figure, state, 'exact'), []).append(
                     waveform(samples, pulses, case))
-                jittered.setdefault((case.figure, state), []).extend(
-                    waveform(samples, pulses + case.width * rng.uniform(-0.5, 0.5, pulses.size),
-                             case) for _ in range(effort.realisations))
+                found.setdefault((case.figure, state, 'jittered'), []).extend(
+                    waveform(samples, pulses + error, case) for error in errors)
             done += 1
             progress(done / sum(counts.values()))
-    values = {(case.figure, state, kind): kurtosis(averages[case.figure, state], counts[state])
-              for case in CASES for state in STATES
-              for kind, averages in (('exact', exact), ('jittered', jittered))}
+    return found
+
+
+def run(effort: Effort, progress: Progress) -> Results:
+    """Reproduce Figs. 17 to 19."""
+    counts = {'healthy': effort.acquisitions, 'faulty': max(effort.acquisitions // 2, 2)}
+    waveforms = measure(counts, effort.realisations, progress)
+    values = {key: kurtosis(averages, counts[key[1]]) for key, averages in waveforms.items()}
     detections = {(case.figure, kind): detection(values[case.figure, 'healthy', kind],
                                                  values[case.figure, 'faulty', kind])
                   for case in CASES for kind in ('exact', 'jittered')}
@@ -156,7 +165,8 @@ def run(effort: Effort, progress: Progress) -> Results:
         'kurtosis': {', '.join(key): summary(value) for key, value in values.items()},
         'detection': {', '.join(key): asdict(value) for key, value in detections.items()},
         'separation_factor': {figure: asdict(factor) for figure, factor in factors.items()}}
-    shown = {state: separate(exact['Fig. 19', state][0], _GEAR).residual for state in STATES}
+    shown = {state: separate(waveforms['Fig. 19', state, 'exact'][0], _GEAR).residual
+             for state in STATES}
     return Results(
         'Residual kurtosis and fault detection: Figs. 17 to 19', numbers,
         _findings(values, detections, factors),
@@ -212,7 +222,8 @@ def _findings(
             'tell apart, though not impossible',
             f'separation {exact.separation:.1f} to {jittered.separation:.1f}, a factor of '
             f'{factor.value:.2f} ({factor.low:.2f} to {factor.high:.2f} at 95 %); '
-            f'detection {exact.detection:.3f} to {jittered.detection:.3f}, area {exact.area:.4f} to {jittered.area:.4f}; medians '
+            f'detection {exact.detection:.3f} to {jittered.detection:.3f}, area '
+            f'{exact.area:.4f} to {jittered.area:.4f}; medians '
             f'{jittered.healthy_median:.2f} and {jittered.faulty_median:.2f}',
             agreement(factor.low > 1.0, 0.5 < jittered.area <= exact.area)))
     areas = [detections[case.figure, 'jittered'].area for case in CASES]

@@ -129,9 +129,9 @@ def run(effort: Effort, progress: Progress) -> Results:
         (f'Full simulations are run {effort.simulations} times a case (Table 1: 1E4) and the '
          f'numerical models {effort.iterations} times (Table 2: 1E6); `--simulations` and '
          '`--iterations` raise both.',
-         'Amplitudes are Fourier lines of the averaged waveform, so over whole fundamental cycles, '
-         'as in the paper. `order_amplitude` integrates over whole trigger cycles, where r has no '
-         'influence at all on a single harmonic.',
+         'Amplitudes are Fourier lines of the averaged waveform, so over whole fundamental '
+         'cycles, as in the paper. `order_amplitude` integrates over whole trigger cycles, where '
+         'r has no influence at all on a single harmonic.',
          'The vibration is sampled at 2048 Hz (simulation 12: 256 Hz and 32 angular samples) and '
          'interpolated band-limited, not at 16384 Hz with a spline. With the same pulse errors, '
          f'simulation 8 then differs from that of Table 1 by at most {sampling_gap:.1e}.'),
