@@ -1,0 +1,346 @@
+"""Figures of the evidence: pulse errors, the trigger cycle, amplitudes; expected and seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
+from sa_jitter_ros.effects.effect import Effect
+from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, predict_with
+from sa_jitter_ros.statistics.angle_error import joint_characteristic
+from scipy.linalg import toeplitz
+
+Array = NDArray[Any]
+
+_MICRO = 1e6
+_MOST_POINTS = 3000
+_MOST_LAGS = 25
+_STEPS = 16  # places in a trigger cycle
+_DRAWS, _SEED = 20_000, 3
+
+
+@dataclass(frozen=True)
+class _Version:
+    """
+    What one model expects of the pulse errors; times in s.
+
+    `autocovariance` (lag,) of errors of mean 0 in each acquisition, `std` their size, `draws` of
+    them, `profile` (u,) the RMS angle error over the trigger cycle, `patterns` (acquisition,
+    N_t + 1) what is known of each pulse.
+    """
+
+    label: str
+    colour: str
+    effects: tuple[Effect, ...]
+    autocovariance: Array
+    std: float
+    draws: Array
+    profile: Array
+    patterns: Array
+
+
+def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+    """Draw the pulse errors: over time, their law, memory, lattice, origin and steadiness."""
+    versions = _versions(evidence, effects)
+    figure, axes = panels(8, columns=4)
+    _over_time(axes[0], evidence, versions[-1])
+    _law(axes[1], evidence, versions)
+    _autocorrelation(axes[2], evidence, versions)
+    _return_map(axes[3], evidence)
+    _lattice(axes[4], evidence)
+    _origin(axes[5], evidence)
+    _steadiness(axes[6], evidence, versions)
+    _intervals(axes[7], evidence)
+    return figure
+
+
+def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+    """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
+    versions = _versions(evidence, effects)
+    figure, axes = panels(3, columns=3)
+    _profile(axes[0], evidence, versions)
+    _dependence_on_cycles(axes[1], evidence, versions)
+    _folded(axes[2], evidence, versions[-1])
+    return figure
+
+
+def amplitudes(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+    """Draw how the amplitudes of the strongest lines move: over time, together, their spectrum."""
+    lines = evidence.lines
+    figure, axes = panels(3, columns=3)
+    strongest = np.argsort(lines.radial_noise)[:4]
+    names = [f'order {lines.order[k]:g}, channel {lines.channel[k]}' for k in strongest]
+    moves = lines.radial[..., strongest]
+    cycles = moves.shape[1]
+    for move, name in zip(moves.reshape(-1, len(names)).T, names):
+        axes[0].plot(move, linewidth=0.6, alpha=0.8, label=name)
+    axes[0].set(title='cycle by cycle', xlabel='trigger cycle of the fitted acquisitions',
+                ylabel='amplitude over its level, less 1')
+    axes[0].legend(fontsize='x-small')
+    for other in range(1, len(names)):
+        axes[1].plot(_thinned(moves[..., 0]), _thinned(moves[..., other]), '.', markersize=2,
+                     color=f'C{other}', label=names[other])
+    axes[1].set(title='do they move together?', xlabel=f'less 1: {names[0]}',
+                ylabel='less 1: other lines')
+    if len(names) > 1:
+        axes[1].legend(fontsize='x-small')
+    power = np.mean(np.abs(np.fft.rfft(moves, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
+    axes[2].semilogy(np.fft.rfftfreq(cycles)[1:], power, linewidth=0.9)
+    axes[2].set(title='spectrum', xlabel='frequency in cycles per trigger cycle',
+                ylabel='density')
+    return figure
+
+
+# --- expectations --------------------------------------------------------------------------------
+
+def _versions(evidence: Evidence, effects: Sequence[Effect]) -> list[_Version]:
+    """Return what declared model and, if there are any, added effects expect."""
+    found = [_version('declared model', BEFORE, evidence, ())]
+    if effects:
+        names = ', '.join(effect.name for effect in effects)
+        found.append(_version(f'with {names}', AFTER, evidence, tuple(effects)))
+    return found
+
+
+def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect, ...]) -> _Version:
+    model = evidence.model
+    count = evidence.errors.shape[1]
+    # The recovery repairs gaps itself, so that its errors do not hold them.
+    timing = [effect for effect in effects if effect.name != 'missing_pulses']
+    patterns = np.zeros(evidence.errors.shape)
+    for row, pulses in zip(patterns, evidence.pulses):
+        known = known_errors(model, timing, pulses)
+        if known is not None:
+            row += known - known.mean()
+    random = replace(evidence, explained=effects).expected_autocovariance(np.arange(count))
+    noise = _noise(evidence)
+    covariance = toeplitz(random) + noise**2 * np.eye(count)
+    centred = covariance - covariance.mean(axis=0) - covariance.mean(axis=1)[:, None]
+    centred += covariance.mean() + patterns.T @ patterns / len(patterns)
+    total = np.array([np.trace(centred, lag) / (count - lag) for lag in range(_lags(evidence))])
+    rng = np.random.default_rng(_SEED)
+    replaced = any(effect.replaces_jitter(model) for effect in effects)
+    jitter = np.zeros(_DRAWS) if replaced else model.distribution.draw(rng, _DRAWS)
+    rest = max(random[0] - (0.0 if replaced else model.distribution.variance), 0.0) + noise**2
+    draws = jitter + np.sqrt(rest) * rng.standard_normal(_DRAWS)
+    draws += rng.choice(patterns.ravel(), _DRAWS)
+    u = _places()
+    small = 1e-2 / max(np.sqrt(random[0]) * model.fundamental_frequency, 1e-12)
+    first = np.abs(joint_characteristic(jitter_processes(model, effects), [small], [u], [0]))
+    variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
+    path = patterns[:, :-1, None] * (1.0 - u) + patterns[:, 1:, None] * u
+    profile = np.sqrt(np.maximum(variance, 0.0) + np.mean(path**2, axis=(0, 1)))
+    return _Version(label, colour, effects, total, float(np.sqrt(total[0])), draws, profile,
+                    patterns)
+
+
+def _noise(evidence: Evidence) -> float:
+    """Return the mean standard error of the pulse errors, 0 where it is unknown."""
+    known = evidence.standard_errors[np.isfinite(evidence.standard_errors)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else 0.0
+
+
+def _lags(evidence: Evidence) -> int:
+    return min(_MOST_LAGS + 1, int(evidence.errors.shape[1]) // 2 + 1)
+
+
+def _places() -> Array:
+    return np.linspace(0.0, 1.0, 41)
+
+
+# --- panels of pulse errors ----------------------------------------------------------------------
+
+def _over_time(axes: Axes, evidence: Evidence, version: _Version) -> None:
+    """Draw the errors over the length of an acquisition: what they have in common is a trend."""
+    times = evidence.times - evidence.times[:, :1]
+    for row in range(min(len(times), 8)):
+        axes.plot(times[row], _MICRO * evidence.errors[row], color='0.7', linewidth=0.6,
+                  label='single acquisitions' if row == 0 else None)
+    axes.plot(times.mean(axis=0), _MICRO * evidence.errors.mean(axis=0), color=MEASURED,
+              label='mean of all')
+    if version.patterns.any():
+        axes.plot(times[0], _MICRO * version.patterns[0], color=version.colour, linewidth=0.9,
+                  label='known of the first')
+    axes.set(title='over an acquisition', xlabel='time since its start [s]',
+             ylabel='pulse error [µs]')
+    axes.legend(fontsize='x-small')
+
+
+def _law(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+    """Draw the histogram of the errors against the expected laws."""
+    errors = _MICRO * evidence.errors.ravel()
+    top = max(np.abs(errors).max(), *(_MICRO * np.quantile(np.abs(item.draws), 0.999)
+                                      for item in versions))
+    edges = np.linspace(-top, top, 41).tolist()
+    axes.hist(errors, edges, density=True, color='0.8', label='recovered')
+    for item in versions:
+        axes.hist(_MICRO * item.draws, edges, density=True, histtype='step', color=item.colour,
+                  label=item.label)
+    axes.set(title='law', xlabel='pulse error [µs]', ylabel='density [1/µs]')
+    axes.legend(fontsize='x-small')
+
+
+def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+    """Draw the autocorrelation of the errors with its standard error."""
+    errors = evidence.errors
+    lags = np.arange(_lags(evidence))
+    rows = np.array([[np.mean(row[:row.size - k] * row[k:]) for k in lags] for row in errors])
+    scale = rows[:, 0].mean()
+    error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows)) / scale
+    for item in versions:
+        axes.plot(lags, item.autocovariance / item.autocovariance[0], color=item.colour,
+                  marker='_', label=item.label)
+    axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o', markersize=3,
+                  capsize=2, color=MEASURED, label='recovered')
+    axes.set(title='autocorrelation', xlabel='lag [trigger pulses]', ylabel='correlation')
+    axes.legend(fontsize='x-small')
+
+
+def _return_map(axes: Axes, evidence: Evidence) -> None:
+    """Draw each error over the one before: a cloud, an ellipse, lines or spots."""
+    errors = _MICRO * evidence.errors
+    axes.plot(_thinned(errors[:, :-1]), _thinned(errors[:, 1:]), '.', color=MEASURED, markersize=2)
+    axes.set(title='from pulse to pulse', xlabel='pulse error [µs]',
+             ylabel='error of the next pulse [µs]')
+
+
+def _lattice(axes: Axes, evidence: Evidence) -> None:
+    """Draw the errors against the ticks of a clock: that of the pulse times, else the declared."""
+    errors = _MICRO * evidence.errors
+    known = [pulses.errors for pulses in evidence.pulses if pulses.errors is not None]
+    if len(known) == len(errors):
+        grid = np.array(known)
+        grid = _MICRO * (grid - grid.mean(axis=1, keepdims=True))
+        axes.plot(_thinned(grid), _thinned(errors), '.', color=MEASURED, markersize=2)
+        axes.plot(*2 * [[grid.min(), grid.max()]], color=AFTER, linewidth=0.9, label='slope 1')
+        axes.set(title=f'clock of the pulse times, {evidence.clock.rate:.6g} Hz',
+                 xlabel='error that its ticks impose [µs]', ylabel='recovered pulse error [µs]')
+        axes.legend(fontsize='x-small')
+        return
+    rate = evidence.model.keyphasor_rate
+    ticks = ((evidence.times - evidence.errors) * rate) % 1.0
+    axes.plot(_thinned(ticks), _thinned(errors), '.', color=MEASURED, markersize=2)
+    axes.set(title=f'declared clock, {rate:.6g} Hz', xlabel='pulse time x clock mod 1',
+             ylabel='pulse error [µs]')
+
+
+def _origin(axes: Axes, evidence: Evidence) -> None:
+    """Draw whose error it is: do the pulse times move as the recovered errors do."""
+    x = _MICRO * np.diff(evidence.errors, 2, axis=1)
+    y = np.diff(evidence.times, 2, axis=1)
+    half = 0.5 * evidence.period
+    y = _MICRO * ((y + half) % (2.0 * half) - half)
+    axes.plot(_thinned(x), _thinned(y), '.', color=MEASURED, markersize=2)
+    ends = np.array([x.min(), x.max()])
+    axes.plot(ends, ends, color=AFTER, linewidth=0.9, label='the tach is wrong')
+    axes.plot(ends, 0.0 * ends, color=BEFORE, linewidth=0.9, label='the vibration moves')
+    axes.set(title='whose error: second differences', xlabel='of the pulse errors [µs]',
+             ylabel='of the pulse times [µs]')
+    axes.legend(fontsize='x-small')
+
+
+def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+    """Draw the size of the errors over the record."""
+    size = np.sqrt(np.mean(evidence.errors**2, axis=1))
+    axes.plot(evidence.times.mean(axis=1), _MICRO * size, 'o', markersize=3, color=MEASURED,
+              label='acquisitions')
+    for item in versions:
+        axes.axhline(_MICRO * item.std, color=item.colour, linewidth=0.9, label=item.label)
+    axes.set(title='size over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize='x-small')
+
+
+def _intervals(axes: Axes, evidence: Evidence) -> None:
+    """Draw how long the pulse intervals are."""
+    intervals = np.diff(evidence.record_times)
+    axes.hist(intervals / np.median(intervals), 60, color='0.6')
+    axes.set_yscale('log')
+    axes.set(title='pulse intervals', xlabel='interval over their median', ylabel='number')
+
+
+# --- panels of the trigger cycle -----------------------------------------------------------------
+
+def _profile(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+    """Draw the RMS angle error over the trigger cycle: large at its ends or in the middle."""
+    u = _places()
+    for item in versions:
+        axes.plot(u, _MICRO * item.profile, color=item.colour, label=item.label)
+    size = np.sqrt(np.mean(_angle_errors(evidence, u) ** 2, axis=(0, 1)))
+    axes.plot(u, _MICRO * size, color=MEASURED, linewidth=0.0, marker='.', label='recovered')
+    axes.set(title='over the trigger cycle', xlabel='u, position in the trigger cycle',
+             ylabel='RMS angle error [µs]')
+    axes.set_ylim(bottom=0.0)
+    axes.legend(fontsize='x-small')
+
+
+def _angle_errors(evidence: Evidence, u: Array) -> Array:
+    """Return the angle error (acquisition, cycle, u) in s: pulse errors and ripple."""
+    start, end = evidence.errors[:, :-1, None], evidence.errors[:, 1:, None]
+    ripple = np.where(np.isfinite(evidence.ripple), evidence.ripple, 0.0)[:, :, None]
+    return np.asarray(start * (1.0 - u) + end * u + ripple * u * (1.0 - u))
+
+
+def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+    """Draw the attenuation that the pulse errors make in averages of fewer cycles."""
+    model = evidence.model
+    counts = np.unique(np.geomspace(1, model.trigger_cycles, 7).astype(int))
+    path = _angle_errors(evidence, np.arange(_STEPS) / _STEPS + 0.5 / _STEPS)
+    turns = 2j * np.pi * model.fundamental_frequency * path
+    single = np.array([np.abs(np.exp(g * turns).mean()) for g in model.orders])
+    g = model.orders[int(np.argmin(np.abs(single - 0.7)))]
+    gain = np.exp(g * turns).mean(axis=2)
+    means, spreads = [], []
+    for n in counts:
+        whole = gain.shape[1] // n
+        each = np.abs(gain[:, :whole * n].reshape(len(gain), whole, n).mean(axis=2)).mean(axis=1)
+        means.append(each.mean())
+        spreads.append(each.std(ddof=1) / np.sqrt(len(each)))
+    axes.errorbar(counts, means, yerr=spreads, fmt='o', color=MEASURED, markersize=4, capsize=2,
+                  label='of the recovered errors')
+    for item in versions:
+        curve = [predict_with(replace(model, trigger_cycles=int(n), noise_std=0.0, orders=(g,)),
+                              item.effects).mean_attenuation[0] for n in counts]
+        axes.plot(counts, curve, color=item.colour, label=item.label)
+    axes.set_xscale('log')
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.set_xticks([], minor=True)
+    axes.set(title=f'order {g:g} over the number of cycles', xlabel='averaged trigger cycles',
+             ylabel='attenuation')
+    axes.legend(fontsize='x-small')
+
+
+def _folded(axes: Axes, evidence: Evidence, version: _Version) -> None:
+    """Draw the mean error over the pulse index, folded by the target or a few pulses."""
+    model = evidence.model
+    step = model.pulses_per_trigger or model.pulses_per_revolution
+    angles = [effect.values['pulse_angles'] for effect in version.effects
+              if effect.name == 'target_geometry']
+    marks = len(angles[0]) if angles else 1
+    period = marks // int(np.gcd(marks, step)) if marks > 1 else 12
+    period = min(period, evidence.errors.shape[1])
+    index = np.array([pulses.first + np.arange(evidence.errors.shape[1])
+                      for pulses in evidence.pulses]) % period
+    places = np.arange(period)
+    mean = np.array([evidence.errors[index == k].mean() for k in places])
+    error = np.array([evidence.errors[index == k].std() / np.sqrt((index == k).sum())
+                      for k in places])
+    axes.errorbar(places, _MICRO * mean, yerr=_MICRO * error, fmt='o', color=MEASURED, capsize=2,
+                  markersize=4, label='recovered, mean')
+    if angles:
+        known = np.array([version.patterns[index == k].mean() for k in places])
+        axes.plot(places, _MICRO * known, color=version.colour, marker='_', label=version.label)
+    axes.axhline(0.0, color='0.4', linewidth=0.8)
+    axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse mod {period}',
+             ylabel='pulse error [µs]')
+    axes.legend(fontsize='x-small')
+
+
+def _thinned(values: Array) -> Array:
+    flat = values.ravel()
+    return np.asarray(flat[::max(1, flat.size // _MOST_POINTS)])

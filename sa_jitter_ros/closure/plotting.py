@@ -1,0 +1,19 @@
+"""Colours and panels that the figures of a report share."""
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
+
+
+def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with `count` panels in rows of `columns`, without the state of pyplot."""
+    rows = -(-count // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.1 * rows), layout='constrained')
+    axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for spare in axes[count:]:
+        spare.remove()
+    for one in axes[:count]:
+        one.grid(alpha=0.3)
+        one.tick_params(labelsize='small')
+    return figure, axes[:count]
