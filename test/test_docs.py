@@ -1,0 +1,515 @@
+"""
+What the documents say: commands and names exist, Python runs and prints what is printed.
+
+Python blocks of a document run in one namespace and one folder; a `text` block behind one is what
+it prints. A first line `# NAME` saves a block in that folder. Commands of this package are taken
+as far as one process can: nodes are constructed with the parameters given, tables are printed.
+What cannot be run says so above the block, `<!-- not run: REASON -->`, and is skipped with it.
+
+`python test/test_docs.py` writes docs/parameters.md, the list of all parameters.
+"""
+
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+import io
+from itertools import pairwise
+import os
+from pathlib import Path
+import re
+import shlex
+import sys
+import tempfile
+
+from matplotlib.figure import Figure
+import numpy as np
+import pytest
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sa_jitter_ros.averaging.indicators import INDICATORS
+from sa_jitter_ros.commands import design
+from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS
+from sa_jitter_ros.recordings.fields import FIELDS
+from scipy.io import wavfile
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = (ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md')))
+
+
+def scripts(kind):
+    """Return the names of the nodes or commands that setup.py installs."""
+    found = re.search(rf'(?s){kind} = \((.*?)\)', (ROOT / 'setup.py').read_text(encoding='utf-8'))
+    return re.findall(r"'(\w+)'", found[1])
+
+
+NODES = {name: getattr(import_module(f'sa_jitter_ros.nodes.{name}'),
+                       name.title().replace('_', '')) for name in scripts('NODES')}
+COMMANDS = {name: import_module(f'sa_jitter_ros.commands.{name}') for name in scripts('COMMANDS')}
+# Values that a node cannot do without.
+NEEDED = {'recording_player': ['-p', 'recording:=rig.npz']}
+PYTHONS = ('python', 'python3', '.venv/bin/python')
+OTHERS = {'.', 'cd', 'colcon', 'export', 'pip'}
+PROGRAMS = {'./run', 'ros2', *PYTHONS, *OTHERS, *NODES, *COMMANDS}
+SHARE = '$(ros2 pkg prefix --share sa_jitter_ros)'
+
+
+# --- blocks --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced or indented block; `reason` says why it is not run, `name` where it is saved."""
+
+    document: Path
+    line: int
+    language: str
+    text: str
+    reason: str = ''
+
+    @property
+    def name(self):
+        found = re.match(r'# ([\w.]+\.(?:py|yaml))\n', self.text)
+        return found[1] if found else ''
+
+    @property
+    def place(self):
+        return f'{self.document.name}:{self.line}'
+
+
+def blocks_of(document):
+    """Iterate over the blocks of a document."""
+    lines = document.read_text(encoding='utf-8').splitlines()
+    reason, at = '', 0
+    while at < len(lines):
+        line, start = lines[at], at + 1
+        fence = re.fullmatch(r' *```(\w*)', line)
+        if fence:
+            end = next(i for i in range(start, len(lines)) if lines[i].strip() == '```')
+            body, at = lines[start:end], end + 1
+        elif line.startswith('    ') and (at == 0 or not lines[at - 1].strip()):
+            end = next((i for i in range(at, len(lines))
+                        if lines[i].strip() and not lines[i].startswith('    ')), len(lines))
+            body, at = [item[4:] for item in lines[at:end]], end
+        else:
+            found = re.fullmatch(r'<!-- not run: (.+) -->', line)
+            reason = found[1] if found else reason if not line.strip() else ''
+            at += 1
+            continue
+        indent = len(fence[0]) - len(fence[0].lstrip()) if fence else 0
+        text = ''.join(f'{item[indent:]}\n' for item in body).strip('\n') + '\n'
+        yield Block(document, start, fence[1] if fence else language_of(text), text, reason)
+        reason = ''
+
+
+def language_of(text):
+    """Return what an indented block is: commands, a session with `$ ` before commands, or not."""
+    if text.startswith('$ '):
+        return 'session'
+    return 'bash' if text.split()[0] in PROGRAMS else 'formula'
+
+
+BLOCKS = [block for document in DOCUMENTS for block in blocks_of(document)]
+SHOWN = {block: after.text for block, after in pairwise(BLOCKS)
+         if after.language == 'text' and after.document == block.document}
+SHOWN |= {block: re.sub(r'(?m)^\$ .*\n', '', block.text) for block in BLOCKS
+          if block.language == 'session'}
+
+
+# --- a folder where a document's blocks have been run --------------------------------------------
+
+
+@contextmanager
+def inside(folder):
+    """Work in a folder from which modules can be imported."""
+    before, path = Path.cwd(), list(sys.path)
+    os.chdir(folder)
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        os.chdir(before)
+        sys.path[:] = path
+
+
+@cache
+def _base():
+    return tempfile.TemporaryDirectory(prefix='sa_jitter_ros_docs_')
+
+
+@cache
+def folder_of(document):
+    """Return a folder with a reader's recordings and the files that the document makes."""
+    folder = Path(_base().name) / document.stem
+    folder.mkdir()
+    pulses = np.arange(20) / 20.0
+    vibration = np.random.default_rng(1).normal(size=(2, 1000))
+    np.savez(folder / 'rig.npz', vibration=vibration, sample_rate=1000.0, pulse_times=pulses)
+    channels = np.stack((*vibration, np.arange(1000) % 50 < 10), axis=1)
+    wavfile.write(folder / 'rig.wav', 1000, channels.astype(np.float32))
+    for block in BLOCKS:
+        if block.document == document and block.name:
+            (folder / block.name).write_text(block.text)
+    return folder
+
+
+@cache
+def namespace_of(document):
+    return {'__name__': 'document'}
+
+
+def run_python(block):
+    """Run a block and the tests that it defines; return what it prints."""
+    namespace = namespace_of(block.document)
+    known = set(namespace)
+    with inside(folder_of(block.document)), redirect_stdout(io.StringIO()) as printed:
+        exec(compile(block.text, block.place, 'exec'), namespace)
+        for name in set(namespace) - known:
+            if name.startswith('test_'):
+                namespace[name]()
+    return printed.getvalue()
+
+
+PYTHON = [block for block in BLOCKS if block.language == 'python']
+
+
+@pytest.mark.parametrize('document', [
+    item for item in DOCUMENTS if any(block.document == item for block in PYTHON)],
+    ids=lambda document: document.name)
+def test_python_runs_and_prints_what_the_document_shows(document):
+    for block in PYTHON:
+        if block.document == document and not block.reason:
+            assert stripped(run_python(block)) == stripped(SHOWN.get(block, '')), block.place
+
+
+def stripped(text):
+    """Return the lines of a text without space at their ends."""
+    return [line.rstrip() for line in text.strip('\n').splitlines()]
+
+
+@pytest.mark.parametrize('block', [block for block in BLOCKS if block.reason],
+                         ids=lambda block: block.place)
+def test_block_that_cannot_be_run(block):
+    pytest.skip(f'{block.place} cannot be run: {block.reason}')
+
+
+@pytest.mark.parametrize('block', [block for block in BLOCKS if block.language == 'yaml'],
+                         ids=lambda block: block.place)
+def test_parameter_files_hold_parameters_of_the_nodes(block):
+    file = folder_of(block.document) / (block.name or 'parameters.yaml')
+    file.write_text(block.text)
+    for key in yaml.safe_load(block.text):
+        unknown = []
+        for name in NODES:
+            if key.strip('/') in (name, '**'):
+                with node(name, '--params-file', str(file), document=block.document) as made:
+                    assert made._parameter_overrides
+                    unknown.append(set(undeclared(made)))
+        assert unknown, f'{key} is no node'
+        assert not set.intersection(*unknown)
+
+
+# --- commands ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def node(name, *arguments, document=ROOT / 'README.md'):
+    """Construct a node as the command line would."""
+    context = Context()
+    needed = [] if any('recording:=' in item for item in arguments) else NEEDED.get(name, [])
+    with inside(folder_of(document)):
+        context.init(args=['--ros-args', *needed, *arguments])
+        try:
+            made = NODES[name](context=context)
+            yield made
+            made.destroy_node()
+        finally:
+            context.try_shutdown()
+
+
+def undeclared(made):
+    """Return overrides that match no parameter of a node."""
+    return [name for name in made._parameter_overrides if not made.has_parameter(name)]
+
+
+def topics_of(made):
+    """Return the topics of a node, its parameter events and log left out."""
+    return {item.topic_name if hasattr(item, 'topic_name') else item.topic
+            for item in (*made.publishers, *made.subscriptions)} - {
+                '/parameter_events', '/rosout'}
+
+
+@cache
+def all_topics():
+    """Return the topics of all nodes, with the shaft names of the defaults and of config/."""
+    found = set()
+    for name in NODES:
+        extra = ['-p', 'tach:=both'] if name == 'machine_simulator' else []
+        with node(name, *extra) as made:
+            found |= topics_of(made)
+    with node('synchronous_averager', '--params-file',
+              str(ROOT / 'config' / 'synchronous_averager.yaml')) as made:
+        return found | topics_of(made)
+
+
+def lines_of(block):
+    """Iterate over the commands of a block as lists of words."""
+    text = block.text.replace('\\\n', ' ')
+    if block.language == 'session':
+        text = '\n'.join(re.findall(r'(?m)^\$ (.*)$', text))
+    for line in text.splitlines():
+        line = re.split(r'\s(?:&&|\||>)\s', line.replace(SHARE, str(ROOT)))[0]
+        words = shlex.split(line, comments=True)
+        while words and re.fullmatch(r'[A-Z_]+=.*', words[0]):
+            words.pop(0)
+        if words and words[-1] == '&':
+            words.pop()
+        if words:
+            yield words
+
+
+COMMAND_LINES = [(block, words) for block in BLOCKS
+                 if block.language in ('bash', 'session') and not block.reason
+                 for words in lines_of(block)]
+
+
+@pytest.mark.parametrize(('block', 'words'), COMMAND_LINES, ids=[
+    f'{block.place} {" ".join(words[:4])}' for block, words in COMMAND_LINES])
+def test_command(block, words, capsys, monkeypatch):
+    monkeypatch.setattr(design, 'draw', lambda *_: Figure())  # test_design_command draws
+    program, *rest = words
+    if program in OTHERS:
+        pytest.skip(f'{program} is not ours to run')
+    elif program == './run':
+        assert rest[0] in ('demo', 'test')
+        if rest[0] == 'demo':
+            check_executable(block, 'demo', rest[1:], capsys)
+        else:
+            assert all(item.startswith('-') or (ROOT / item.split('::')[0]).exists()
+                       for item in rest[1:])
+    elif program in PYTHONS:
+        if rest[0] == '-m':
+            assert find_spec(rest[1]) is not None
+        else:
+            assert any((folder / rest[0]).is_file()
+                       for folder in (ROOT, folder_of(block.document)))
+    elif program == 'ros2':
+        check_ros2(block, rest, capsys)
+    elif program in NODES or program in COMMANDS:
+        check_executable(block, program, rest, capsys)
+    else:
+        pytest.fail(f'{block.place}: {program} is no command of this package: tag the block '
+                    'as text, or add it to OTHERS')
+
+
+def check_executable(block, name, arguments, capsys):
+    """Construct a node with its arguments, or take a command's."""
+    if name in COMMANDS:
+        check_command(block, name, arguments, capsys)
+        return
+    if arguments:
+        assert arguments.pop(0) == '--ros-args', 'parameters follow --ros-args'
+    with node(name, *arguments, document=block.document) as made:
+        assert not undeclared(made)
+        for option, value in pairwise(arguments):
+            if option in ('-r', '--remap') and not value.startswith('__'):
+                assert made.resolve_topic_name(value.split(':=')[1]) in topics_of(made)
+
+
+def check_command(block, name, arguments, capsys):
+    """Run `design`; of the others look whether there are such options."""
+    if name == 'design' and '--help' not in arguments:
+        with inside(folder_of(block.document)):
+            assert design.main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert set(stripped(SHOWN.get(block, ''))) <= set(stripped(printed))
+        return
+    with pytest.raises(SystemExit):
+        COMMANDS[name].main(['--help'])
+    known = re.findall(r'--[a-z-]+', capsys.readouterr().out)
+    assert {item for item in arguments if item.startswith('--')} <= set(known)
+
+
+def check_ros2(block, words, capsys):
+    """Look whether what a command of ROS 2 names is there."""
+    verb, *rest = words
+    if verb == 'run':
+        assert rest[0] == 'sa_jitter_ros'
+        check_executable(block, rest[1], rest[2:], capsys)
+    elif verb in ('topic', 'bag'):
+        named = {item for item in rest if re.fullmatch(r'/[a-z_/]+', item)}
+        assert named
+        assert named <= all_topics()
+    elif verb == 'param':
+        action, name, *parameter = [item for item in rest if not item.startswith('-')]
+        with node(name.lstrip('/'), document=block.document) as made:
+            if parameter:
+                assert made.has_parameter(parameter[0])
+            if action == 'set':
+                value = Parameter(parameter[0], value=yaml.safe_load(parameter[1]))
+                result, = made.set_parameters([value])
+                assert result.successful, result.reason
+    else:
+        pytest.skip(f'ros2 {verb} is not ours to run')
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+
+def parameters_of(name):
+    """Return the parameters of a node with their descriptors and defaults; `<shaft>.` for one."""
+    with node(name) as made:
+        names = list(made.parameters.values())
+        return {re.sub(r'^shaft\.', '<shaft>.', key): (
+            made.describe_parameter(key), made.get_parameter(key).value) for key in names}
+
+
+def table_of_parameters():
+    """Return docs/parameters.md."""
+    lines = ['# Parameters', '',
+             'What `ros2 param describe` tells, node by node. `<shaft>` stands for each name in '
+             '`shafts`. A float parameter takes an integer.',
+             'Those marked *fixed* are read when the node starts. Written by '
+             '`python test/test_docs.py`.']
+    for name in NODES:
+        lines += ['', f'## {name}', '| parameter | default | allowed | meaning |',
+                  '|---|---|---|---|']
+        for key, (descriptor, value) in parameters_of(name).items():
+            if key == 'recording':
+                value = ''
+            lines.append(f'| `{key}` | {shown(value)} | {allowed(descriptor)} | '
+                         f'{descriptor.description}{"; *fixed*" * descriptor.read_only} |')
+    return '\n'.join(lines) + '\n'
+
+
+def shown(value):
+    """Return a default as YAML has it."""
+    if isinstance(value, str):
+        return f"`'{value}'`"
+    if hasattr(value, '__len__'):
+        return f'`{list(value)}`'
+    return f'`{str(value).lower() if isinstance(value, bool) else value}`'
+
+
+def allowed(descriptor):
+    """Return the range of a parameter in words."""
+    parts = [descriptor.additional_constraints] if descriptor.additional_constraints else []
+    for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
+        low, high = limits.from_value, limits.to_value
+        if abs(low) < 1e300 and low > -2**63:
+            parts.append(f'at least {low:g}')
+        if abs(high) < 1e300 and high < 2**63 - 1:
+            parts.append(f'at most {high:g}')
+    return '; '.join(parts)
+
+
+def test_the_list_of_parameters_is_that_of_the_nodes():
+    held = (ROOT / 'docs' / 'parameters.md').read_text(encoding='utf-8')
+    assert held == table_of_parameters(), 'run: python test/test_docs.py'
+
+
+def words_in(path):
+    """Return all that stands between backticks."""
+    text = re.sub(r'(?ms)^ *```.*?^ *```', '', path.read_text(encoding='utf-8'))
+    return {word.strip('/') for item in re.findall(r'`([^`\n]+)`', text)
+            for word in re.split('[:,]', item.split(': ')[0])}
+
+
+@cache
+def known_words():
+    """Return the names of parameters, their choices, topics, fields, nodes and counts."""
+    known = {*NODES, *COMMANDS, *INDICATORS, *FIELDS, *messages.AMPLITUDE_FIELDS,
+             *messages.PULSE_ERROR_FIELDS, *messages.PREDICTION_FIELDS,
+             *messages.SAMPLE_TYPES, *messages.PULSE_TYPES, *diagnostic_keys()}
+    for name in NODES:
+        for key, (descriptor, _) in parameters_of(name).items():
+            known |= {key, key.removeprefix('<shaft>.')}
+            choices = descriptor.additional_constraints.partition('one of ')[2]
+            known |= set(choices.split(';')[0].split(', '))
+    return known.union((topic[1:] for topic in all_topics()), *(
+        {topic, topic.rpartition('/')[2]} for topic in general_topics()))
+
+
+def general_topics():
+    """Return the topics of all nodes without the first stroke, `<shaft>/` for one of a shaft."""
+    return {re.sub('^(shaft|input|output)/', '<shaft>/', topic[1:]) for topic in all_topics()}
+
+
+@cache
+def diagnostic_keys():
+    """Return the keys that the nodes show in /diagnostics."""
+    keys = {'<shaft>.corrections_refused', '<shaft>.refusal', 'channels', 'sample_rate'}
+    for name in NODES:
+        with node(name) as made:
+            made.update_counts()
+            keys |= {*made.counts, *made.summary()[1]}
+    return keys
+
+
+# Other words in backticks: ROS's own, and the dimensions of arrays.
+ORDINARY = {
+    'ros2', 'foxglove_bridge',
+    'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'indicator', 'time_ref', 'source',
+    'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
+    'qos_overrides.<topic>.subscription.reliability', 'std_msgs/Float64MultiArray'}
+
+
+@pytest.mark.parametrize('name', ['interfaces.md', 'monitoring.md'])
+def test_names_in_backticks_exist(name):
+    words = {re.sub('[./]data$', '', word) for word in words_in(ROOT / 'docs' / name)
+             if re.fullmatch(r'[a-z<][a-z0-9_<>./]+', word)}
+    assert not words - known_words() - ORDINARY
+
+
+def test_every_topic_is_in_the_interfaces():
+    assert general_topics() <= words_in(ROOT / 'docs' / 'interfaces.md')
+
+
+def test_every_diagnostic_key_is_explained():
+    assert diagnostic_keys() <= words_in(ROOT / 'docs' / 'monitoring.md')
+    assert set(DIAGNOSTIC_KEYS) <= words_in(ROOT / 'docs' / 'interfaces.md')
+
+
+# --- links and the names of tests and files ------------------------------------------------------
+
+
+def slugs(document):
+    """Return the anchors of a document's headings."""
+    headings = re.findall(r'(?m)^#+ (.+)$', document.read_text(encoding='utf-8'))
+    return {re.sub(r'[^\w\- ]', '', item.lower()).replace(' ', '-') for item in headings}
+
+
+LINKS = [(document, target) for document in (*DOCUMENTS, ROOT / 'CONTRIBUTING.md')
+         for target in re.findall(r'\]\(([^)\s]+)\)', document.read_text(encoding='utf-8'))
+         if '://' not in target]
+
+
+@pytest.mark.parametrize(('document', 'target'), LINKS, ids=[
+    f'{document.name} {target}' for document, target in LINKS])
+def test_link(document, target):
+    path, _, anchor = target.partition('#')
+    found = (document.parent / path).resolve() if path else document
+    assert found.exists()
+    assert not anchor or anchor in slugs(found)
+
+
+@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda document: document.name)
+def test_files_and_tests_that_are_named_exist(document):
+    tests = {path.name: path.read_text(encoding='utf-8') for path in (ROOT / 'test').glob('*.py')}
+    text = re.sub(r'(?ms)^ *```.*?^ *```', '', document.read_text(encoding='utf-8'))
+    for name in re.findall(r'`([^`\s]+)`', text):
+        if re.fullmatch(r'test_\w+\.py', name):
+            assert name in tests
+        elif re.fullmatch(r'test_\w+', name):
+            assert any(f'def {name}(' in content for content in tests.values()), name
+        elif re.fullmatch(r'(?:\w+/)+\w+\.(py|yaml|md)', name):
+            assert any((folder / name).is_file() for folder in (
+                ROOT, ROOT / 'sa_jitter_ros', ROOT / 'docs')), name
+
+
+if __name__ == '__main__':
+    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
+    (ROOT / 'docs' / 'parameters.md').write_text(table_of_parameters(), encoding='utf-8')
