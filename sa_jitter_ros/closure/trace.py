@@ -7,8 +7,8 @@ against it, and the held-out acquisitions are predicted better with it; the one 
 specific evidence first. "None of these" is an answer.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from sa_jitter_ros.closure.observation import Observation, together
 from sa_jitter_ros.closure.residual import Residual, residual
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import Pulses
-from sa_jitter_ros.effects.evidence import Evidence, Finding, LineEvidence
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
@@ -82,8 +82,8 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class _Bench:
-    """Everything that scoring needs."""
+class Bench:
+    """Everything that scoring needs; `untold` says of effects why these data cannot tell them."""
 
     observation: Observation
     lines: Lines
@@ -96,6 +96,7 @@ class _Bench:
     fit: tuple[int, ...]
     held_out: tuple[int, ...]
     declared: tuple[Effect, ...]
+    untold: Mapping[str, str] = field(default_factory=dict)
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Expectation:
         """Predict some acquisitions."""
@@ -139,12 +140,23 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     Raises ModelError for fewer than 4 acquisitions and SignalError where nothing can be compared.
     """
     observation = together(observations)
+    require_acquisitions(observation)
+    return trace_bench(_bench(observation, observations, recordings, declared), progress=progress)
+
+
+def require_acquisitions(observation: Observation) -> None:
+    """Raise ModelError for fewer than 4 acquisitions."""
     count = len(observation.acquisitions)
     if count < _FEWEST:
         raise ModelError(f'{count} acquisitions of {observation.model.trigger_cycles} trigger '
                          f'cycles: fitting and scoring take at least {_FEWEST}; lower '
                          'trigger_cycles or record longer')
-    bench = _bench(observation, observations, recordings, declared)
+
+
+def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
+    """Trace the residual of what is on the bench."""
+    observation, declared = bench.observation, bench.declared
+    count = len(observation.acquisitions)
     say = progress or (lambda text: None)
     before = after = bench.score(())
     chosen: list[Finding] = []
@@ -183,13 +195,13 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     attenuation, _, amplitude = bench.observed(everything)
     verdict = ('unexplained' if after.p_value < SIGNIFICANT else 'traced' if chosen else 'none')
     return Trace(
-        observation, tuple(declared), bench.lines, bench.level, bench.fit, bench.held_out,
+        observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         tuple(chosen), tuple(candidates), before, after, attenuation, amplitude,
         bench.expect((), everything), bench.expect(effects, everything), first_evidence, verdict)
 
 
 def _bench(observation: Observation, observations: Sequence[Observation],
-           recordings: Sequence[Recording], declared: Sequence[Effect]) -> _Bench:
+           recordings: Sequence[Recording], declared: Sequence[Effect]) -> Bench:
     lines = choose_lines(observation)
     count = len(observation.acquisitions)
     fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
@@ -200,12 +212,12 @@ def _bench(observation: Observation, observations: Sequence[Observation],
     orders = observation.orders.size
     corrected = np.abs(observation.stacked('corrected')[..., :orders])
     level = lines.of(corrected[list(fit)].mean(axis=0))
-    return _Bench(observation, lines, level, [row for _, _, rows in known for row in rows], clock,
-                  period_std, group, line_evidence(observation, lines), fit, held_out,
-                  tuple(declared))
+    return Bench(observation, lines, level, [row for _, _, rows in known for row in rows], clock,
+                 period_std, group, line_evidence(observation, lines), fit, held_out,
+                 tuple(declared))
 
 
-def _try_all(bench: _Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
+def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
              significant: bool) -> list[Candidate]:
     """Fit every effect that is not there yet and score it on the held-out acquisitions."""
     effects = [finding.effect for finding in chosen if finding.effect is not None]
@@ -216,7 +228,8 @@ def _try_all(bench: _Bench, evidence: Evidence, chosen: Sequence[Finding], curre
     for name, kind in EFFECTS.items():
         if name in taken:
             continue
-        finding = kind.fit(evidence)
+        finding = absent(name, bench.untold[name]) if name in bench.untold else (
+            kind.fit(evidence))
         if finding.effect is None:
             found.append(Candidate(name, number, finding, None,
                                    finding.against if significant else unneeded))
