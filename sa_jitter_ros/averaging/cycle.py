@@ -46,7 +46,7 @@ class CycleSamples:
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
         """Values (len(u), channel) at fractions `u` of the cycle."""
-        positions = (cycle_times(law, self.pulses, self.first, u) - self.start_time) * self.rate
+        positions = cycle_times(law, self.pulses - self.start_time, self.first, u) * self.rate
         # a pulse on the first or last sample may round to just outside it
         np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
         return interpolate(self.samples, positions, method=method, cutoff=cutoff)
