@@ -45,7 +45,7 @@ EFFECTS: Mapping[str, Mapping[str, Any]] = {
     'interpolation_loss': {'method': 'linear'},
     'additive_noise': {'std': 1.0},
     'amplitude_modulation': {'std': 0.3},
-    'interfering_tone': {'frequency': 400.9, 'amplitude': 0.2},
+    'interfering_tone': {'frequency': 400.9, 'amplitude': 0.12},
 }
 
 

@@ -1,4 +1,4 @@
-"""Trigger cycles of a recording: reading them, their amplitudes, and the errors of their pulses."""
+"""Trigger cycles of a recording: reading them, their amplitudes, their pulse errors."""
 
 from dataclasses import dataclass
 
@@ -49,14 +49,14 @@ class CycleReader:
 
 
 def repaired(times: FloatArray, missing: NDArray[np.int64]
-              ) -> tuple[FloatArray, NDArray[np.intp]]:
+             ) -> tuple[FloatArray, NDArray[np.intp]]:
     """Return pulses with the missing ones put evenly between, and where the measured ones are."""
     index = np.concatenate(([0], np.cumsum(1 + missing)))
     return np.interp(np.arange(index[-1] + 1), index, times), np.asarray(index, np.intp)
 
 
-def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...], *,
-             with_ripple: bool) -> PulseErrorRecovery:
+def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...],
+            *, with_ripple: bool) -> PulseErrorRecovery:
     """Recover pulse errors from the channels `rows`, of the declared size or larger."""
     periods = np.diff(pulses)
     grid = reader.cycles(pulses, grid_points(float(periods.max()), reader.rate))[:, :, list(rows)]
@@ -82,7 +82,7 @@ def _strength(recovery: PulseErrorRecovery) -> float:
 
 
 def amplitudes(grid: FloatArray, cycles: float, orders: tuple[float, ...]) -> ComplexArray:
-    """Return complex peak amplitudes (cycle, channel, order) of cycles, both ends included."""
+    """Return complex peaks (cycle, channel, order) of cycles that hold both their ends."""
     count, points, channels = grid.shape
     flat = grid.transpose(1, 0, 2).reshape(points, count * channels)
     parts = project(flat, cycles, orders, 0.0).reshape(count, channels, len(orders))

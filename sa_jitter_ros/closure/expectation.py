@@ -140,11 +140,9 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
     """Return the mean amplitude (order, source) that each unit source shows at each order."""
     model, sources = observation.model, observation.sources
     r, count = model.cycle_length, model.trigger_cycles
-    turns = r * float(np.ptp(np.append(sources, observation.orders)))
-    u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
     e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
-    if np.any(np.abs(np.diff(e)) > 0.5):
-        return np.zeros((observation.orders.size, sources.size))
+    turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()
+    u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
     offset = e[:-1, None] + np.diff(e)[:, None] * u
     cycle = np.arange(count)[:, None]
     table = np.zeros((observation.orders.size, sources.size), complex)

@@ -15,12 +15,12 @@ from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording
-from scipy import stats
 
 Array = NDArray[Any]
 
-_STRONG, _COHERENT = 0.2, 0.9
+_STRONG, _COHERENT = 0.2, 0.8
 _PRECISE = 0.25
+_TWIN = 4.0
 _GROUPS = 3
 # A clock this much faster than the declared one is no cause of anything.
 _FINE = 50.0
@@ -31,7 +31,7 @@ def choose_lines(observation: Observation) -> Lines:
     Return the lines worth comparing.
 
     They have at least 20 % of their order's strongest channel and the same phase in both halves of
-    an acquisition (coherence 0.9). Raises SignalError where there is none.
+    an acquisition (coherence 0.8). Raises SignalError where there is none.
     """
     orders = observation.orders.size
     cycles = _cycles(observation)
@@ -157,29 +157,37 @@ def _cycles(observation: Observation) -> Array:
 
 
 def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) -> LineEvidence:
-    """Find the line that stands out most between the synchronous ones, order by order."""
+    """
+    Find the tone that turns most clearly against an order, from cycle to cycle over the record.
+
+    A modulation has a twin on the other side of the order, a tone has none.
+    """
     model = observation.model
-    period = model.trigger_period
-    count = cycles.shape[1]
-    left = cycles - cycles.mean(axis=1, keepdims=True)
-    size = 4 * count
+    turned = cycles * np.exp(-1j * np.angle(cycles.mean(axis=1, keepdims=True)))
+    series = turned.reshape(-1, cycles.shape[2])
+    series = series - series.mean(axis=0)
+    count = len(series)
     window = np.hanning(count + 2)[1:-1]
-    spectrum = np.mean(np.abs(np.fft.fft(left * window[None, :, None], size, axis=1)) ** 2, axis=0)
-    floor = np.median(spectrum, axis=0)
-    peak = spectrum.max(axis=0)
-    line = int(np.argmax(peak / floor))
-    bin_ = int(np.argmax(spectrum[:, line]))
-    turns = np.fft.fftfreq(size)[bin_]
-    rows = len(cycles)
-    tail = float(stats.gamma.sf(peak[line] / floor[line] * rows * 0.69, rows))
-    frequency = evidence.order[line] * model.fundamental_frequency + turns / period
-    passed = abs(np.sinc(turns))
-    amplitude = float(np.sqrt(peak[line]) / window.sum() / max(passed, 0.05))
+    spectrum = np.abs(np.fft.fft(series * window[:, None], 4 * count, axis=0)) ** 2
+    turns = np.fft.fftfreq(4 * count)
+    spectrum[np.abs(turns) < 2.0 / count] = 0.0
+    floor = np.median(spectrum[spectrum[:, 0] > 0.0], axis=0) / np.log(2.0)
+    single = spectrum - _TWIN * spectrum[(-np.arange(4 * count)) % (4 * count)]
+    height = single / floor
+    peak, line = np.unravel_index(int(np.argmax(height)), height.shape)
+    ratio = float(spectrum[peak, line] / floor[line])
+    # Each acquisition's own phase has taken half the tone's mean over it away.
+    kept = np.sinc(turns[peak]) * (1.0 - 0.5 * np.sinc(turns[peak] * cycles.shape[1]) ** 2)
+    amplitude = float(np.sqrt(spectrum[peak, line]) / window.sum() / kept)
     return replace(
-        evidence, tone_frequency=float(frequency), tone_amplitude=amplitude,
-        tone_standard_error=amplitude * float(np.sqrt(floor[line] / peak[line] / rows)),
-        tone_frequency_error=0.1 / (period * count),
-        tone_p_value=min(1.0, tail * count * cycles.shape[2]))
+        evidence, tone_amplitude=amplitude,
+        tone_frequency=float(evidence.order[line] * model.fundamental_frequency
+                             + turns[peak] / model.trigger_period),
+        tone_standard_error=amplitude * float(np.sqrt(0.5 / ratio)),
+        tone_frequency_error=float(np.sqrt(1.5 / ratio) / (
+            np.pi * count * model.trigger_period)),
+        tone_p_value=min(1.0, count * cycles.shape[2] * float(np.exp(
+            -max(height[peak, line], 0.0)))))
 
 
 def _on_grid(errors: Array, clock: float) -> Array:

@@ -170,8 +170,8 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
                     ) -> FloatArray:
     """Return pulse errors (acquisition, N_t + 1) that only some channels tell, NaN where none."""
     samples = np.ascontiguousarray(recording.read().T)
-    reader = CycleReader(samples - samples.mean(axis=0), recording.start_time, recording.sample_rate,
-                     'band_limited')
+    reader = CycleReader(samples - samples.mean(axis=0), recording.start_time,
+                         recording.sample_rate, 'band_limited')
     rows = tuple(channels)
     errors = []
     for item in observation.acquisitions:
@@ -231,7 +231,7 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
         bend = recovery.ripple
     raw = amplitudes(reader.cycles(times, points, ends=True), model.cycle_length, orders)
     clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend),
-                        model.cycle_length, orders)
+                       model.cycle_length, orders)
     return Acquisition(
         first, times, missing, errors, standard_errors, reference, raw.mean(axis=0),
         clean.mean(axis=0), clean, radial_noise(clean), ripple, bend_error, recovery.accepted,

@@ -31,7 +31,7 @@ class MissingPulses(Effect):
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
         """Return how far the counted angle is behind in the average at hand."""
-        if pulses.missing is None or not pulses.missing.any():
+        if pulses.missing is None:
             return None
         period = (pulses.times[-1] - pulses.times[0]) / (
             pulses.missing.size + pulses.missing.sum())

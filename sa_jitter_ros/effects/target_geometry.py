@@ -13,7 +13,7 @@ from scipy import stats
 _LONGEST = 24
 _SIGNIFICANT = 1e-4
 # In favour of the number of marks that the target has.
-_KNOWN = math.log(100.0)
+_KNOWN = 10.0
 
 
 @dataclass(frozen=True)
@@ -50,17 +50,12 @@ class TargetGeometry(Effect):
         marks = model.pulses_per_revolution
         step = model.pulses_per_trigger or marks
         own = marks // math.gcd(marks, step)
-        periods = {own, *range(2, min(_LONGEST, count // 2) + 1)} & set(range(2, count))
+        periods = {own, *range(2, min(_LONGEST, count // 2) + 1)} & set(range(2, count - 2))
         if len(evidence.errors) < 3 or not periods:
             return absent(cls.name, 'too few pulses to fold by the pulse index')
-        folds = {p: _folded(evidence, evidence.errors, p) for p in sorted(periods)}
-        best = min(folds, key=lambda p: folds[p][1] - (_KNOWN if p == own else 0.0))
-        for longer in sorted(p for p in folds if p > best and p % best == 0):
-            phase = [(pulses.first + np.arange(count)) % best for pulses in evidence.pulses]
-            left = evidence.errors - folds[best][0][np.array(phase)]
-            if _folded(evidence, left, longer)[1] < math.log(_SIGNIFICANT / len(folds)):
-                best = longer
-        mean, log_p_value, error = folds[best]
+        folds = {p: _folded(evidence, p) for p in sorted(periods)}
+        best = min(folds, key=lambda p: folds[p][3] - (_KNOWN if p == own else 0.0))
+        mean, log_p_value, error, _ = folds[best]
         p_value = min(1.0, math.exp(max(log_p_value, -690.0)) * len(folds))
         size = float(np.sqrt(np.mean(mean**2)))
         text = (f'the pulse errors repeat every {best} trigger pulses with {size:.3g} s, '
@@ -77,17 +72,27 @@ class TargetGeometry(Effect):
                        {'pulse_angles': errors.tolist()}, p_value, text)
 
 
-def _folded(evidence: Evidence, errors: Array, period: int) -> tuple[Array, float, float]:
-    """Return each phase's mean error, the log p value of the repeating, and its standard error."""
-    table = []
-    for row, pulses in zip(errors, evidence.pulses):
-        phase = (pulses.first + np.arange(row.size)) % period
-        folded = np.bincount(phase, row, period) / np.bincount(phase, minlength=period)
+def _folded(evidence: Evidence, period: int) -> tuple[Array, float, float, float]:
+    """
+    Return each phase's mean error, log p value of their repeating, standard error, and BIC.
+
+    The p value comes from how acquisitions agree, which any memory of the errors leaves valid; the
+    Bayesian information criterion compares periods. Errors at the ends are rough and left out.
+    """
+    table, phases = [], []
+    for row, pulses in zip(evidence.errors, evidence.pulses):
+        phase = (pulses.first + np.arange(row.size))[1:-1] % period
+        folded = np.bincount(phase, row[1:-1], period) / np.bincount(phase, minlength=period)
         table.append(folded - folded.mean())
+        phases.append(phase)
     rows = np.array(table)
     count = len(rows)
     mean = rows.mean(axis=0)
     between = np.sum((rows - mean) ** 2) / ((count - 1) * (period - 1))
     ratio = count * np.sum(mean**2) / (period - 1) / max(between, 1e-300)
     log_p_value = float(stats.f.logsf(ratio, period - 1, (count - 1) * (period - 1)))
-    return mean, log_p_value, float(np.sqrt(between * (period - 1) / period / count))
+    left = evidence.errors[:, 1:-1] - mean[np.array(phases)]
+    left = left - left.mean(axis=1, keepdims=True)
+    criterion = left.size * math.log(float(np.mean(left**2))) + period * math.log(left.size)
+    error = float(np.sqrt(between * (period - 1) / period / count))
+    return mean, log_p_value, error, criterion
