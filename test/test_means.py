@@ -74,6 +74,33 @@ def test_sliding_mean_forgets_the_oldest():
     assert np.isnan(mean.mean)
 
 
+@given(st.lists(st.one_of(st.integers(1, 5), st.complex_numbers(max_magnitude=1e6)), max_size=60))
+def test_sliding_mean_is_that_of_its_window_whatever_came_and_went(steps):
+    mean, window, largest = SlidingMean(), [], 1e-300
+    for step in steps:
+        if isinstance(step, int):
+            mean.forget(step)
+            del window[:step]
+        else:
+            mean.update(np.array([step]))
+            window.append(step)
+            largest = max(largest, abs(step))
+        assert mean.count == len(window)
+        if window:
+            np.testing.assert_allclose(mean.mean[0], np.mean(window), atol=1e-13 * largest)
+        if len(window) > 1:
+            np.testing.assert_allclose(
+                mean.standard_error[0], np.std(window, ddof=1) / np.sqrt(len(window)),
+                rtol=1e-6, atol=1e-7 * largest)
+
+
+def test_sliding_mean_recovers_from_an_undefined_value():
+    mean = filled(SlidingMean(), [1.0, np.nan, 2.0, 4.0])
+    assert np.isnan(mean.mean[0])
+    mean.forget(2)
+    assert mean.mean[0] == 3.0
+
+
 def test_exponential_mean_has_the_noise_of_as_many_equal_weights(rng):
     cycles, mean = 9.0, ExponentialMean(9.0)
     means_, errors = [], []

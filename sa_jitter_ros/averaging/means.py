@@ -11,7 +11,6 @@ grow with the number of cycles (a sliding mean keeps its window). Undefined valu
 (array([3.]), array([1.528]), 3)
 """
 
-from collections import deque
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +18,13 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
+
+
+def _power(values: Array) -> FloatArray:
+    """Return the squared magnitude."""
+    if np.iscomplexobj(values):
+        return np.asarray(np.square(values.real) + np.square(values.imag))
+    return np.asarray(np.square(values))
 
 
 class RunningMean(Protocol):
@@ -57,7 +63,7 @@ class BlockMean:
             return
         step = values - self._mean
         self._mean += step / self.count
-        self._squares += (step * np.conj(values - self._mean)).real
+        self._squares += _power(step) * (1.0 - 1.0 / self.count)
 
     def merge(self, other: 'BlockMean') -> None:
         """Take all that another mean has taken."""
@@ -70,7 +76,7 @@ class BlockMean:
         total = self.count + other.count
         step = other._mean - self._mean
         self._mean += step * (other.count / total)
-        self._squares += other._squares + np.abs(step) ** 2 * (self.count * other.count / total)
+        self._squares += other._squares + _power(step) * (self.count * other.count / total)
         self.count = total
 
     @property
@@ -87,40 +93,63 @@ class BlockMean:
 
 
 class SlidingMean:
-    """Mean of the latest arrays; the caller says which are out of the window."""
+    """
+    Mean of the latest arrays; the caller says which are out of the window.
+
+    The window is two heaps: arrays that came last, and sums of older ones, each with all that came
+    between it and the first heap. To forget the oldest is to drop its sum. When there is none left
+    the first heap is summed up from behind, so that an array is added twice in all, whatever the
+    length of the window, nothing is ever subtracted, and rounding does not build up.
+    """
 
     def __init__(self) -> None:
-        self._window: deque[Array] = deque()
+        self._latest: list[Array] = []
+        self._sum = BlockMean()  # of the latest
+        self._older: list[BlockMean] = []
 
     @property
     def count(self) -> int:
         """Number of arrays in the window."""
-        return len(self._window)
+        return len(self._latest) + len(self._older)
 
     def update(self, values: Array) -> None:
-        """Take one more array."""
-        self._window.append(values)
+        """Take one more array, which must stay as it is."""
+        self._latest.append(values)
+        self._sum.update(values)
 
     def forget(self, count: int) -> None:
         """Forget the oldest `count` arrays."""
-        for _ in range(min(count, len(self._window))):
-            self._window.popleft()
+        for _ in range(min(count, self.count)):
+            if not self._older:
+                self._turn()
+            self._older.pop()
 
-    def _block(self) -> BlockMean:
-        block = BlockMean()
-        for values in self._window:
-            block.update(values)
-        return block
+    def _turn(self) -> None:
+        """Sum up the latest arrays from behind."""
+        while self._latest:
+            block = BlockMean()
+            block.update(self._latest.pop())
+            if self._older:
+                block.merge(self._older[-1])
+            self._older.append(block)
+        self._sum = BlockMean()
+
+    def _window(self) -> BlockMean:
+        window = BlockMean()
+        window.merge(self._sum)
+        if self._older:
+            window.merge(self._older[-1])
+        return window
 
     @property
     def mean(self) -> Array:
-        """Mean of the window, summed anew: rounding does not build up."""
-        return np.mean(self._window, axis=0) if self._window else np.array(np.nan)
+        """Mean of the window."""
+        return self._window().mean
 
     @property
     def standard_error(self) -> FloatArray:
         """Standard error of the mean of the window; NaN below two arrays."""
-        return self._block().standard_error
+        return self._window().standard_error
 
 
 class ExponentialMean:
@@ -151,7 +180,7 @@ class ExponentialMean:
             anew = np.isnan(self._mean)
             self._mean = np.where(anew, values, self._mean + weight * step)
             self._variance = np.where(
-                anew, 0.0, (1.0 - weight) * (self._variance + weight * np.abs(step) ** 2))
+                anew, 0.0, (1.0 - weight) * (self._variance + weight * _power(step)))
         self._squared_weights = (1.0 - weight) ** 2 * self._squared_weights + weight**2
 
     @property
