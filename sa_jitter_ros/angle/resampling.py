@@ -24,10 +24,11 @@ from scipy import sparse
 
 FloatArray = NDArray[np.float64]
 
-DEGREE = 7  # of the polynomials
 _SPLINE_POLE = np.sqrt(3.0) - 2.0
 # method: half-width of its kernel in samples
 _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
+# method: degree of the polynomials
+_DEGREE = {'band_limited': 7, 'linear': 1, 'cubic': 3, 'spline': 3}
 METHODS = tuple(_HALF_WIDTH)
 _KAISER_BETA = 9.0
 
@@ -71,8 +72,8 @@ def _polynomials(method: str, cutoff: float) -> FloatArray:
     the sample in front of it, through the kernel at the Chebyshev nodes.
     """
     method, half, stretch = _stretch(method, cutoff)
-    width = math.ceil(half / stretch)
-    nodes = np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))
+    width, powers = math.ceil(half / stretch), _DEGREE[method] + 1
+    nodes = np.cos(np.pi * (np.arange(powers) + 0.5) / powers)
     taps = np.arange(1 - width, width + 1)
     weights = _kernel(method, stretch * (taps - (nodes[:, None] + 1.0) / 2.0), half)
     weights /= weights.sum(axis=1, keepdims=True)  # a constant stays what it is
@@ -128,9 +129,9 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
         raise SignalError(f'positions {low:.6g} to {high:.6g} asked of samples 0 to '
                           f'{len(samples) - 1}: stay within the samples')
     base = np.floor(positions)
-    powers = np.ones((DEGREE + 1, len(positions)))
+    powers = np.ones((len(polynomials), len(positions)))
     np.subtract(2.0 * (positions - base), 1.0, out=powers[1])
-    for k in range(2, DEGREE + 1):
+    for k in range(2, len(powers)):
         np.multiply(powers[k - 1], powers[1], out=powers[k])
     weights = powers.T @ polynomials
 

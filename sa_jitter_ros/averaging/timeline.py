@@ -261,12 +261,13 @@ class VibrationTimeline:
     def _store(self, samples: FloatArray, index: int) -> None:
         """Keep the finite samples; a non-finite one leaves a gap."""
         assert self._clock is not None
-        finite = np.asarray(np.isfinite(samples).all(axis=0))
-        if finite.all():
+        every = np.isfinite(samples)
+        if every.all():
             self._put(samples, index)
             return
+        finite = np.asarray(every.all(axis=0))
         bad = int(np.count_nonzero(~finite))
-        channels = np.flatnonzero(~np.isfinite(samples).all(axis=1)).tolist()
+        channels = np.flatnonzero(~every.all(axis=1)).tolist()
         self.counts.non_finite += bad
         self.counts.samples_dropped += bad
         self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in '
