@@ -75,6 +75,19 @@ def test_attenuation_is_that_of_the_noiseless_machine_within_its_error():
     assert 0.6 < np.std(z) < 1.6
 
 
+def test_order_whose_phase_the_errors_do_not_tell_is_not_corrected():
+    found = averages_of(gearbox(2.40789, noise=6.0), ratio=2.40789, seconds=40.0)
+    accepted = [average.correction for average in found if average.correction.recovery.accepted]
+    assert len(accepted) > 10
+    amplitudes = np.abs([correction.corrected.amplitudes[0] for correction in accepted])
+    assert np.isnan(amplitudes[:, 1]).any()
+    low = amplitudes[:, 0] - 1.0
+    assert abs(low.mean()) < 0.03 + 3.0 * low.std() / np.sqrt(len(low))
+    for correction in accepted:
+        np.testing.assert_array_equal(np.isnan(correction.attenuation),
+                                      np.isnan(correction.corrected.amplitudes))
+
+
 def test_noise_alone_is_left_as_it_is():
     machine = gearbox(1.0, noise=1.0, harmonics=(0.0, 0.0))
     for average in averages_of(machine):

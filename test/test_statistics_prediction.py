@@ -1,7 +1,6 @@
 """The prediction: declared models, every law, effects, design and detectability."""
 
 from dataclasses import replace
-import time
 
 import numpy as np
 import pytest
@@ -77,18 +76,6 @@ def test_few_cycles_are_sampled_and_many_are_not():
     assert isinstance(predict(MODEL).law, AmplitudeLaw)
     first, second = (predict(replace(MODEL, trigger_cycles=2)).quantile_50 for _ in range(2))
     np.testing.assert_array_equal(first, second)
-
-
-@pytest.mark.parametrize('changes', [
-    {}, {'trigger_cycles': 3}, {'jitter_distribution': 'table', 'jitter_table': SKEWED}])
-def test_64_orders_take_less_than_50_ms(changes):
-    model = replace(MODEL, orders=tuple(range(1, 65)), **changes)
-    times = []
-    for _ in range(5):
-        start = time.process_time()
-        predict(model)
-        times.append(time.process_time() - start)
-    assert min(times) < 0.05
 
 
 def test_declared_laws_and_lengths():

@@ -14,6 +14,9 @@ from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, Synchr
 FloatArray = NDArray[np.float64]
 
 _REACH = 0.02  # of a trigger cycle by which a corrected pulse may move
+# Phase in rad up to which the recovered errors may be uncertain at an order. Beyond it the noise
+# of the order itself has a say in them, and aligning noise to itself raises the amplitude.
+_UNCERTAIN = 0.3
 
 
 @dataclass(frozen=True)
@@ -95,12 +98,19 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
                                   f'{_REACH:.0%} of a trigger cycle: validate the pulses')
     elif recovery.accepted:
         corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
+    phase = np.zeros(len(raw.orders))
+    if recovery.accepted:
+        frequency = raw.orders * settings.cycles / np.diff(raw.pulses).mean()
+        phase = 2.0 * np.pi * frequency * math.sqrt(np.mean(recovery.standard_errors**2))
+        corrected = replace(corrected, amplitudes=np.where(
+            phase <= _UNCERTAIN, corrected.amplitudes, np.nan))
     with np.errstate(divide='ignore', invalid='ignore'):
         amplitude = np.abs(corrected.amplitudes)
         attenuation = np.abs(raw.amplitudes) / amplitude
         # The noises of raw and corrected are correlated by what the signal keeps, `attenuation`.
         error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
-    return Correction(corrected, recovery, attenuation, error)
+    return Correction(corrected, recovery, attenuation,
+                      np.hypot(error, attenuation * phase**2 / 2.0))
 
 
 def _average_again(raw: SynchronousAverage, cycles: Sequence[CycleSamples],

@@ -47,7 +47,7 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
 
     `cycles` (cycle, ...) are complex amplitudes of single trigger cycles. Pulse jitter turns an
     amplitude and leaves its length alone to first order, so the part in phase with the mean shows
-    the noise. From 18 cycles on the median over that part's periodogram is taken: other orders
+    the noise. From 17 cycles on the median over that part's periodogram is taken: other orders
     that leak into single cycles, or a modulation, are lines there and do not count. NaN for one
     cycle.
     """

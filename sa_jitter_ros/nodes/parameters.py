@@ -68,6 +68,8 @@ class Parameter:
         kind = self.kind
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
+        if kind is str and isinstance(value, int) and not isinstance(value, bool):
+            value = str(value)  # `-p tach_channel:=2` means the name 2
         if type(value) is not kind:
             raise ParameterError(f'{self.name} is {value!r} ({type(value).__name__}): '
                                  f'give {kind.__name__}')
