@@ -25,6 +25,7 @@ def integrated(signal, order, length):
 
 
 class TestCombResponse:
+
     @given(st.floats(-50.0, 50.0), st.integers(1, 60))
     def test_equals_the_average_of_a_tone(self, order, cycles):
         theta = np.arange(64) / 64
@@ -54,6 +55,7 @@ class TestCombResponse:
 
 
 class TestOrderResponse:
+
     @given(st.floats(0.0, 8.0), st.floats(0.0, 8.0), st.integers(1, 5), st.floats(0.2, 2.0))
     def test_equals_the_integral_over_whole_trigger_cycles(self, tone, order, cycles, ratio):
         found = order_response(tone, order, trigger_cycles=cycles, ratio=ratio)
@@ -86,6 +88,7 @@ class TestOrderResponse:
 
 
 class TestChooseCycles:
+
     def test_a_rational_order_gets_its_exact_notch(self):
         choice = choose_cycles(2.4, minimum=8, maximum=40)
         assert choice.trigger_cycles == 10
@@ -143,6 +146,7 @@ class TestChooseCycles:
 
 
 class TestBadInput:
+
     @pytest.mark.parametrize('order', [np.nan, np.inf])
     def test_orders_are_finite(self, order):
         for call in (lambda: comb_response(order, 3),

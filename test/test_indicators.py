@@ -29,6 +29,7 @@ def gaussian_moment(order, degrees):
 
 
 class TestLines:
+
     def test_mesh_shaft_and_sidebands_are_told_apart(self):
         lines = gear_lines(GearSettings([10], sidebands=2, shaft_harmonics=2), 64)
         assert np.flatnonzero(lines.mesh).tolist() == [10, 20, 30]
@@ -52,6 +53,7 @@ class TestLines:
 
 
 class TestSeparate:
+
     @pytest.mark.parametrize('points', [120, 121])
     def test_every_line_goes_where_the_definition_says(self, points):
         parts = {'mean': {0: 0.7}, 'shaft': {1: 0.5, 2: 0.4}, 'mesh': {19: 3.0, 38: 2.0},
@@ -85,6 +87,7 @@ class TestSeparate:
 
 
 class TestValues:
+
     def test_values_computed_by_hand(self):
         average = np.array([[1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -3.0]])
         found = condition_indicators(average)
@@ -173,6 +176,7 @@ class TestValues:
 
 
 class TestUndefined:
+
     def test_constants_and_pure_mesh_give_nan_where_nothing_is_left(self):
         flat = condition_indicators(np.full((1, 64), 0.1), GearSettings([19]))
         assert np.isnan(flat.values[0, 3:]).all()
@@ -197,6 +201,7 @@ class TestUndefined:
 
 
 class TestHistory:
+
     settings = GearSettings([19])
 
     def test_na4_divides_by_the_mean_variance_of_all_averages(self, rng):
@@ -245,6 +250,7 @@ class TestHistory:
 
 
 class TestBadInput:
+
     @pytest.mark.parametrize('order', [0, -19, 19.5, np.nan, np.inf])
     def test_mesh_orders_are_positive_integers(self, order):
         with pytest.raises(ParameterError, match='positive integer'):

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
-
 from sa_jitter_ros.statistics.angle_error import unit_nodes
 from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.sampled_law import require_probabilities
+from scipy.special import ndtr
 
 Array = NDArray[Any]
 

@@ -13,12 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-from scipy.special import gammainc, gammaln
-
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.statistics.angle_error import unit_nodes
 from sa_jitter_ros.statistics.moments import AverageMoments, CycleMoments
+from scipy.optimize import brentq
+from scipy.special import gammainc, gammaln
 
 Array = NDArray[Any]
 

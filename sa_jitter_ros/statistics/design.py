@@ -14,12 +14,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import brentq
-
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.angle_error import IndependentPulseJitter
 from sa_jitter_ros.statistics.moments import cycle_moments
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
+from scipy.optimize import brentq
 
 Array = NDArray[Any]
 

@@ -17,14 +17,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import erf, sici
-
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess,
     joint_characteristic,
     unit_nodes,
 )
+from scipy.special import erf, sici
 
 Array = NDArray[Any]
 #: Deterministic angle errors d_k(u) in fundamental cycles: u of shape (m,) to (trigger cycles, m).
