@@ -1,0 +1,192 @@
+"""Node `live_view`: what all nodes publish, on a page for a web browser."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+import json
+import math
+import re
+import time
+from typing import Any, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
+from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
+from sa_jitter_ros.nodes.live_view_board import (
+    Attenuations, Board, CHANNELS, number, ORDERS, orders_content, PulseErrors, pulses_content,
+    SPEEDS, table_content, waveform_content)
+from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
+from sa_jitter_ros.nodes.messages import (
+    AMPLITUDE_FIELDS, AverageMessage, decode_average, decode_prediction, decode_residual,
+    PREDICTION_FIELDS, PULSE_ERROR_FIELDS, RESIDUAL_FIELDS)
+from sa_jitter_ros.nodes.parameters import Parameter, Values
+from std_msgs.msg import Float64, Float64MultiArray, String
+
+Decoded = TypeVar('Decoded')
+
+LARGEST_REPORT = 1_000_000  # characters of missing_effect
+NODES, NODE_VALUES = 64, 100  # whose diagnostics are kept; values of each
+
+PARAMETERS = (
+    Parameter('shafts', ['shaft'], 'shafts to show, named as the averager names them',
+              read_only=True),
+    Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
+    Parameter('port', 8420, 'port of the page, or the next free one; 0 for any', minimum=0,
+              maximum=65535, read_only=True),
+    Parameter('open_to_network', False, 'allow a host that other machines can reach: whoever '
+              'reaches it sees everything', read_only=True),
+    Parameter('vibration_unit', '', 'unit of the vibration, for the labels'),
+    Parameter('channel_names', [], 'names of the vibration channels, for the labels',
+              element=str),
+)
+
+
+class LiveView(MonitoringNode):
+    """Serves a page with the latest results of the other nodes."""
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('live_view', PARAMETERS, **node_kwargs)
+        values = self.parameters.values()
+        wrong = [name for name in values['shafts'] if not re.fullmatch('[a-z][a-z0-9_]*', name)]
+        if wrong:
+            raise ParameterError(f'shafts holds {wrong}: give names of small letters, digits and '
+                                 'underscores')
+        if not (is_loopback(values['host']) or values['open_to_network']):
+            raise ParameterError(f'host {values["host"]!r} is open to other machines: leave it '
+                                 '127.0.0.1, or set open_to_network too')
+        self._board = Board()
+        self._averages = 0
+        self._speeds: list[float] = []
+        self._nodes: dict[str, dict[str, Any]] = {}
+        self._apply(values)
+        for shaft in values['shafts']:
+            self._watch_shaft(shaft)
+        self.create_input(Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS)
+        self.create_input(Float64MultiArray, 'residual', self._on_residual, RESULT_QOS)
+        self.create_input(String, 'missing_effect', self._on_missing_effect, LATCHED_QOS)
+        self.create_input(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
+        self.create_input(DiagnosticArray, '/diagnostics', self._on_diagnostics, RESULT_QOS)
+        self.parameters.watch(check=lambda values: None, apply=self._apply)
+        self._server = PageServer(self._board.since, host=values['host'], port=values['port'])
+        if self._server.port != values['port'] != 0:
+            self.warn(f'port {values["port"]} is in use: {self._server.port} is used instead')
+        self.get_logger().info(f'open {self._server.address} in a browser')
+
+    def destroy_node(self) -> None:
+        """Close the page, too."""
+        self._server.close()
+        super().destroy_node()
+
+    def _apply(self, values: Values) -> None:
+        shown = {key: values[key] for key in ('shafts', 'vibration_unit', 'channel_names')}
+        self._board.put('settings', lambda: shown, data=False)
+
+    # --- messages ---
+
+    def _watch_shaft(self, shaft: str) -> None:
+        """Subscribe to the results of one shaft."""
+        errors, attenuations = PulseErrors(), Attenuations()
+
+        def on_waveform(kind: str, message: Float64MultiArray) -> None:
+            average = checked(partial(decode_average, kind), message)
+            self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
+
+        def on_orders(message: Float64MultiArray) -> None:
+            average = with_fields(message, 'order_amplitude', AMPLITUDE_FIELDS)
+            self._averages += 1
+            shown = average.values[:CHANNELS, :ORDERS]
+            history = attenuations.add(shown[..., 0], shown[..., 5])
+            self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))
+
+        def on_pulses(message: Float64MultiArray) -> None:
+            average = with_fields(message, 'pulse_error', PULSE_ERROR_FIELDS)
+            self._board.put(f'{shaft}/pulse_error', partial(
+                pulses_content, average, errors.add(average.values)))
+
+        callbacks: dict[str, Callable[[Any], None]] = {
+            **{kind: partial(on_waveform, kind)
+               for kind in ('synchronous_average', 'corrected_average')},
+            'order_amplitude': on_orders, 'pulse_error': on_pulses}
+        for kind, callback in callbacks.items():
+            self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
+
+    def _on_prediction(self, message: Float64MultiArray) -> None:
+        prediction = checked(decode_prediction, message)
+        check_width(prediction.values, PREDICTION_FIELDS)
+        self._board.put('prediction', partial(table_content, prediction, PREDICTION_FIELDS),
+                        data=False)
+
+    def _on_residual(self, message: Float64MultiArray) -> None:
+        residual = checked(decode_residual, message)
+        check_width(residual.values, RESIDUAL_FIELDS)
+        self._board.put('residual', partial(table_content, residual, RESIDUAL_FIELDS))
+
+    def _on_missing_effect(self, message: String) -> None:
+        if len(message.data) > LARGEST_REPORT:
+            raise MessageError(f'{len(message.data)} characters: at most {LARGEST_REPORT} are '
+                               'taken')
+        try:
+            report = json.loads(message.data, parse_constant=lambda name: None,
+                                parse_float=lambda text: number(float(text)))
+        except (RecursionError, ValueError) as error:
+            raise MessageError(f'no JSON: {error}') from None
+        if not isinstance(report, dict):
+            raise MessageError(f'JSON {type(report).__name__}: send an object')
+        self._board.put('missing_effect', lambda: report, data=False)
+
+    def _on_speed(self, message: Float64) -> None:
+        if not math.isfinite(message.data):
+            raise MessageError(f'speed is {message.data} Hz: publish a finite number')
+        self._speeds = speeds = [*self._speeds, message.data][-SPEEDS:]
+        self._board.put('shaft_speed', lambda: {'value': speeds[-1], 'history': speeds})
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._nodes.pop(status.name, None)
+            self._nodes[status.name] = {
+                'level': int.from_bytes(status.level, 'little'), 'message': status.message,
+                'values': {item.key: item.value for item in status.values[:NODE_VALUES]},
+                'received': time.monotonic()}
+        self._nodes = nodes = dict([*self._nodes.items()][-NODES:])
+        self._board.put('/diagnostics', lambda: nodes, data=False)
+
+    # --- diagnostics ---
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Say where the page is and whether there is something on it."""
+        silence = self._board.silence()
+        state = 'no data received yet' if silence is None else (
+            f'{self._averages} averages shown' if silence < 3.0 else
+            f'no data for {silence:.0f} s')
+        return f'{state} on {self._server.address}', {
+            'address': self._server.address, 'averages': str(self._averages),
+            'requests': str(self._server.requests),
+            'requests_refused': str(self._server.refused)}
+
+
+def checked(decode: Callable[[Any], Decoded], message: Any) -> Decoded:
+    """Decode; a count in the header that is no number raises `MessageError`, too."""
+    try:
+        return decode(message)
+    except SaJitterError:
+        raise
+    except (OverflowError, ValueError) as error:
+        raise MessageError(f'header: {error}: send whole numbers as counts') from None
+
+
+def check_width(values: Any, fields: tuple[str, ...]) -> None:
+    """Raise `MessageError` unless the last dimension is that of the fields."""
+    if values.shape[-1] != len(fields):
+        raise MessageError(f'{values.shape[-1]} fields: send {len(fields)}, {",".join(fields)}')
+
+
+def with_fields(message: Float64MultiArray, kind: str, fields: tuple[str, ...]) -> AverageMessage:
+    """Decode an average's table, whose last dimension is that of the fields."""
+    average = checked(partial(decode_average, kind), message)
+    check_width(average.values, fields)
+    return AverageMessage(average.header, np.asarray(average.values), fields)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(LiveView, args)

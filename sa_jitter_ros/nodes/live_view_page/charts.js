@@ -1,0 +1,190 @@
+// Charts as SVG: axes with units, curves, marks with error bars, bands. Colours are in style.css.
+
+const SVG = 'http://www.w3.org/2000/svg';
+const MARGIN = {left: 62, right: 14, top: 24, bottom: 40};
+
+function make(name, attributes = {}, text = null) {
+  const node = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+  if (text !== null) node.textContent = text;
+  return node;
+}
+
+export const known = value => value !== null && value !== undefined;
+
+// A number for people: 4 significant digits, powers of ten only where they are needed.
+export function format(value, digits = 4) {
+  if (!known(value)) return '–';
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e5)) {
+    const [mantissa, exponent] = value.toExponential(digits - 1).split('e');
+    return `${Number(mantissa)}e${Number(exponent)}`;
+  }
+  return String(Number(value.toPrecision(digits)));
+}
+
+// Range of all known values, a little wider; never empty.
+export function range(values, {margin = 0.06, include = []} = {}) {
+  let low = Infinity, high = -Infinity;
+  for (const value of values) {
+    if (known(value)) { low = Math.min(low, value); high = Math.max(high, value); }
+  }
+  for (const value of include) { low = Math.min(low, value); high = Math.max(high, value); }
+  if (low > high) return [0, 1];
+  const room = margin * (high - low) || 0.1 * Math.abs(high) || 1;
+  return [low - room, high + room];
+}
+
+// Scales: `at(value)` from 0 to 1, `ticks` as [value, label].
+
+export function linear([low, high], count = 5) {
+  const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
+  const step = [1, 2, 5, 10].find(item => item * power >= rough * 0.999) * power;
+  const ticks = [];
+  for (let k = Math.ceil(low / step); k * step <= high * (1 + 1e-12); ++k) ticks.push(k * step);
+  const digits = Math.max(1, 1 + Math.ceil(Math.log10(
+    Math.max(Math.abs(low), Math.abs(high)) / step)));
+  return {at: value => (value - low) / (high - low),
+          ticks: ticks.map(value => [value, format(value, digits)])};
+}
+
+export function logarithmic(values) {
+  const positive = values.filter(value => known(value) && value > 0);
+  let low = Math.log10(Math.min(...positive)), high = Math.log10(Math.max(...positive));
+  if (!positive.length) [low, high] = [0, 1];
+  const room = Math.max(0.08 * (high - low), 0.15);
+  [low, high] = [low - room, high + room];
+  const steps = high - low > 3 ? [1] : high - low > 1.2 ? [1, 3] : [1, 2, 3, 5, 7];
+  const ticks = [];
+  for (let power = Math.floor(low); power <= high; ++power) {
+    for (const step of steps) {
+      const value = step * 10 ** power, place = Math.log10(value);
+      if (place >= low && place <= high) ticks.push([value, format(value, 1)]);
+    }
+  }
+  return {at: value => value > 0 ? (Math.log10(value) - low) / (high - low) : -1, ticks};
+}
+
+// Places 0, 1, ... with labels, thinned out where they would touch.
+export function places(labels, width) {
+  const longest = Math.max(1, ...labels.map(label => label.length));
+  const step = Math.max(1, Math.ceil(labels.length * (longest * 7.5 + 8) / width));
+  return {at: value => (value + 0.5) / labels.length,
+          ticks: labels.map((label, i) => [i, label]).filter(([i]) => i % step === 0)};
+}
+
+export class Chart {
+  // `draw` is called with this chart when its size is known and whenever that changes.
+  constructor(container, height, draw) {
+    this.container = container;
+    this.height = height;
+    this.render = () => { this.width = container.clientWidth; if (this.width) draw(this); };
+    new ResizeObserver(this.render).observe(container);
+  }
+
+  get inner() { return Math.max(10, this.width - MARGIN.left - MARGIN.right); }
+
+  empty(text) {
+    const note = document.createElement('p');
+    note.className = 'empty';
+    note.textContent = text;
+    this.container.replaceChildren(note);
+  }
+
+  axes({x, y, xLabel, yLabel, title = ''}) {
+    const {left, top} = MARGIN, bottom = this.height - MARGIN.bottom;
+    this.svg = make('svg', {viewBox: `0 0 ${this.width} ${this.height}`, height: this.height,
+                            role: 'img', 'aria-label': `${title} ${yLabel} over ${xLabel}`});
+    this.x = value => left + x.at(value) * this.inner;
+    this.y = value => bottom - Math.min(Math.max(y.at(value), -0.02), 1.02) * (bottom - top);
+    for (const [value, label] of y.ticks) {
+      const place = this.y(value);
+      this.add('line', {class: 'grid', x1: left, x2: left + this.inner, y1: place, y2: place});
+      this.add('text', {x: left - 6, y: place + 4, 'text-anchor': 'end'}, label);
+    }
+    for (const [value, label] of x.ticks) {
+      const place = this.x(value);
+      this.add('line', {class: 'grid', x1: place, x2: place, y1: bottom, y2: bottom + 4});
+      this.add('text', {x: place, y: bottom + 17, 'text-anchor': 'middle'}, label);
+    }
+    this.add('text', {x: left + this.inner / 2, y: this.height - 6, 'text-anchor': 'middle'},
+             xLabel);
+    this.add('text', {transform: `translate(12 ${(top + bottom) / 2}) rotate(-90)`,
+                      'text-anchor': 'middle'}, yLabel);
+    if (title) this.add('text', {class: 'title', x: left, y: top - 9}, title);
+    this.container.replaceChildren(this.svg);
+  }
+
+  add(name, attributes, text = null, tip = '') {
+    const node = make(name, attributes, text);
+    if (tip) node.append(make('title', {}, tip));
+    this.svg.append(node);
+  }
+
+  curve(style, xs, ys) {
+    let path = '', pen = 'M';
+    ys.forEach((value, i) => {
+      if (!known(value)) { pen = 'M'; return; }
+      path += `${pen}${this.x(xs(i)).toFixed(1)} ${this.y(value).toFixed(1)}`;
+      pen = 'L';
+    });
+    this.add('path', {class: `curve ${style}`, d: path});
+  }
+
+  level(style, value) {
+    const place = this.y(value);
+    this.add('line', {class: style, x1: MARGIN.left, x2: MARGIN.left + this.inner, y1: place,
+                      y2: place});
+  }
+
+  // Horizontal line of some width around x.
+  dash(style, x, value, half, tip = '') {
+    if (!known(value)) return;
+    const place = this.y(value);
+    this.add('line', {class: style, x1: this.x(x - half), x2: this.x(x + half), y1: place,
+                      y2: place}, null, tip);
+  }
+
+  band(from, to, low, high, tip = '') {
+    if (!known(low) || !known(high)) return;
+    const top = this.y(high);
+    this.add('rect', {class: 'band', x: this.x(from), width: this.x(to) - this.x(from), y: top,
+                      height: Math.max(1, this.y(low) - top)}, null, tip);
+  }
+
+  mark(style, x, value, {error = null, size = 4, square = false, tip = ''} = {}) {
+    if (!known(value)) return;
+    const [cx, cy] = [this.x(x), this.y(value)];
+    if (known(error)) {
+      this.add('line', {class: `bar ${style}`, x1: cx, x2: cx, y1: this.y(value - error),
+                        y2: this.y(value + error)});
+    }
+    if (square) {
+      this.add('path', {class: `mark ${style}`, d: `M${cx} ${cy - size - 1}l${size + 1} ${size + 1}`
+        + `l${-size - 1} ${size + 1}l${-size - 1} ${-size - 1}z`}, null, tip);
+    } else {
+      this.add('circle', {class: `mark ${style}`, cx, cy, r: size}, null, tip);
+    }
+  }
+
+  // Calls `told(position from 0 to 1, or null)` as the pointer moves, and shows where it is.
+  follow(told) {
+    const cursor = make('line', {class: 'cursor', y1: MARGIN.top,
+                                 y2: this.height - MARGIN.bottom});
+    const show = () => {
+      const position = known(this.pointer) ? (this.pointer - MARGIN.left) / this.inner : -1;
+      const inside = position >= 0 && position <= 1;
+      cursor.setAttribute('visibility', inside ? 'visible' : 'hidden');
+      cursor.setAttribute('x1', inside ? this.pointer : 0);
+      cursor.setAttribute('x2', inside ? this.pointer : 0);
+      told(inside ? position : null);
+    };
+    this.svg.append(cursor);
+    this.svg.onpointermove = event => {
+      this.pointer = event.clientX - this.svg.getBoundingClientRect().left;
+      show();
+    };
+    this.svg.onpointerleave = () => { this.pointer = null; show(); };
+    show();
+  }
+}

@@ -1,0 +1,194 @@
+"""
+The HTTP side of the live view: a page and what it shows, to read only.
+
+The page needs nothing but this server: no request leaves it (a content security policy says so).
+A name that some other site lets point here (DNS rebinding) is refused by the Host header.
+"""
+
+from collections.abc import Callable
+from errno import EADDRINUSE
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+import ipaddress
+import json
+import socket
+from socketserver import TCPServer
+import sys
+from threading import BoundedSemaphore, Thread
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+from sa_jitter_ros.errors import ParameterError
+
+PORTS_TRIED = 20  # from `port` on, so that a second view on the same host starts too
+CONNECTIONS = 32  # served at once; more are hung up on
+KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
+HEADERS = {
+    'Cache-Control': 'no-store',
+    'Content-Security-Policy': "default-src 'self'; frame-ancestors 'none'",
+    'Cross-Origin-Resource-Policy': 'same-origin',
+    'Referrer-Policy': 'no-referrer',
+    'X-Content-Type-Options': 'nosniff',
+}
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach an address to listen on."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == 'localhost'
+
+
+def is_own_name(header: str) -> bool:
+    """
+    Whether a Host header names this machine, whatever the port (a tunnel changes it).
+
+    Addresses cannot be rebound; of names only those are taken that no foreign name server answers.
+    """
+    try:
+        host = urlsplit(f'//{header}').hostname or ''
+    except ValueError:
+        return False
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        own = socket.gethostname().lower()
+        return host in ('localhost', own, f'{own}.local')
+    return True
+
+
+class PageServer:
+    """
+    Serves the page and `snapshot(since)`, a JSON object, from a thread of its own.
+
+    Listens on `host` and the first free port from `port` on (0: any). Raises `ParameterError`
+    if it cannot. `requests` and `refused` are counts.
+    """
+
+    def __init__(self, snapshot: Callable[[int], dict[str, Any]], *, host: str, port: int) -> None:
+        folder = files('sa_jitter_ros.nodes').joinpath('live_view_page')
+        pages = {f'/{item.name}': item.read_bytes() for item in folder.iterdir()
+                 if item.name.rpartition('.')[2] in KINDS}
+        pages['/'] = pages['/index.html']
+        self._server = _listen(host, port)
+        self._server.pages, self._server.snapshot = pages, snapshot
+        self.port = int(self._server.server_address[1])
+        name = socket.gethostname() if host in ('0.0.0.0', '::') else host
+        self.address = f'http://{f"[{name}]" if ":" in name else name}:{self.port}/'
+        self._thread = Thread(target=self._server.serve_forever, kwargs={'poll_interval': 0.05},
+                              name='live_view', daemon=True)
+        self._thread.start()
+
+    @property
+    def requests(self) -> int:
+        """Requests answered."""
+        return self._server.requests
+
+    @property
+    def refused(self) -> int:
+        """Requests refused: another method than GET, a foreign host name, too many at once."""
+        return self._server.refused
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+def _listen(host: str, port: int) -> '_Server':
+    last = min(port + PORTS_TRIED, 65536) if port else 1
+    for candidate in range(port, last):
+        try:
+            return _Server(host, candidate)
+        except OSError as error:
+            if error.errno != EADDRINUSE:
+                raise ParameterError(f'cannot listen on {host} port {candidate}: '
+                                     f'{error.strerror or error}') from None
+    raise ParameterError(f'ports {port} to {last - 1} of {host} are in use: set another port, or '
+                         '0 for any')
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    pages: dict[str, bytes]
+    snapshot: Callable[[int], dict[str, Any]]
+
+    def __init__(self, host: str, port: int) -> None:
+        self.address_family = socket.AF_INET6 if ':' in host else socket.AF_INET
+        super().__init__((host, port), _Handler)
+        self.requests = self.refused = 0
+        self._free = BoundedSemaphore(CONNECTIONS)
+
+    def server_bind(self) -> None:
+        """Bind without asking a name server who we are."""
+        TCPServer.server_bind(self)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve in a thread, if not too many do so already."""
+        if self._free.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.refused += 1
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        """Serve one connection."""
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a browser that hung up."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = 10.0  # s for a request to arrive
+    server_version, sys_version = 'live_view', ''
+
+    def do_GET(self) -> None:
+        """Answer with a file of the page or with the snapshot."""
+        path, _, query = self.path.partition('?')
+        if not is_own_name(self.headers.get('Host', '')):
+            self._refuse(HTTPStatus.FORBIDDEN, 'open this page by address or as localhost')
+        elif path == '/snapshot.json':
+            since = parse_qs(query).get('since', ['0'])[0]
+            if not (since.isascii() and since.isdecimal() and len(since) < 20):
+                self._refuse(HTTPStatus.BAD_REQUEST, 'since is the version of a snapshot')
+                return
+            content = json.dumps(self.server.snapshot(int(since)), allow_nan=False)
+            self._send(HTTPStatus.OK, 'application/json', content.encode())
+        elif path in self.server.pages:
+            kind = KINDS['html' if path == '/' else path.rpartition('.')[2]]
+            self._send(HTTPStatus.OK, f'{kind}; charset=utf-8', self.server.pages[path])
+        else:
+            self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
+
+    def _only_get(self) -> None:
+        self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, 'this server is to read only', Allow='GET')
+
+    do_CONNECT = do_DELETE = do_HEAD = do_OPTIONS = do_PATCH = do_POST = do_PUT = do_TRACE = \
+        _only_get
+
+    def _refuse(self, status: HTTPStatus, text: str, **headers: str) -> None:
+        self.server.refused += 1
+        self._send(status, 'text/plain; charset=utf-8', f'{text}\n'.encode(), **headers)
+
+    def _send(self, status: HTTPStatus, kind: str, body: bytes, **headers: str) -> None:
+        self.server.requests += 1
+        self.send_response(status)
+        sent = {'Content-Type': kind, 'Content-Length': str(len(body)), **HEADERS, **headers}
+        for name, value in sent.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if self.command != 'HEAD':
+            self.wfile.write(body)
+
+    def log_message(self, *arguments: Any) -> None:
+        """Keep the terminal to the nodes' own messages."""
