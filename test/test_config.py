@@ -6,13 +6,15 @@ import pytest
 from rclpy.context import Context
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
+from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector
 import yaml
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
 NODES = {'jitter_predictor': JitterPredictor, 'machine_simulator': MachineSimulator,
-         'synchronous_averager': SynchronousAverager, 'tach_detector': TachDetector}
+         'residual_analyser': ResidualAnalyser, 'synchronous_averager': SynchronousAverager,
+         'tach_detector': TachDetector}
 
 
 def flat(parameters, prefix=''):

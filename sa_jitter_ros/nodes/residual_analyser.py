@@ -1,0 +1,274 @@
+"""Node `residual_analyser`: measured against predicted attenuation, and what the model lacks."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+import json
+import threading
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.task import Future
+from sa_jitter_ros.closure.online import (Average, Batch, compare, declared_by, Published,
+                                          require_comparable, trace_averages)
+from sa_jitter_ros.closure.report import report
+from sa_jitter_ros.closure.trace import SIGNIFICANT, Trace
+from sa_jitter_ros.effects import Effect, enabled_effects
+from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.nodes import jitter_predictor
+from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
+                                          encode_residual, ResidualMessage)
+from sa_jitter_ros.nodes.parameters import as_ros_parameter, Parameter, Values
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from std_msgs.msg import Float64MultiArray, String
+
+PARAMETERS = (
+    Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
+    Parameter('predictor', 'jitter_predictor', 'node that predicts, and whose effects are set',
+              read_only=True),
+    Parameter('acquisitions', 20, 'averages in a batch; at least 4 to find a missing effect',
+              minimum=2, maximum=10000),
+    Parameter('close_loop', False, "set the predictor's effect parameters to what was found"),
+)
+_PREDICTOR = (*jitter_predictor.PARAMETERS, *jitter_predictor.effect_parameters())
+_TICK = 0.1  # s between looks at what has come
+_PATIENCE = 3.0  # s to wait for an answer of the predictor
+
+
+class ResidualAnalyser(MonitoringNode):
+    """
+    Publishes `residual` for every batch of averages and `missing_effect` once it is traced.
+
+    The trace runs beside the executor. With `close_loop` the effects that it finds become the
+    predictor's, and the next batch waits for the prediction that holds them.
+    """
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('residual_analyser', PARAMETERS, **node_kwargs)
+        self._values = self.parameters.values()
+        self._batch = Batch(self._values['acquisitions'])
+        self._pulses: dict[float, NDArray[np.float64]] = {}
+        self._prediction: Published | None = None
+        self._significant = self._waited = False
+        self._step: Callable[[], None] = self._judge
+        self._added: set[str] = set()
+        self._verdict = ''
+        self._batches = self._uncorrected = 0
+        self._predictor_name = self._values['predictor']
+        self._predictor = AsyncParameterClient(self, self._predictor_name)
+        shaft = self._values['shaft']
+        self._residual = self.create_output(Float64MultiArray, 'residual')
+        self._missing_effect = self.create_output(String, 'missing_effect', LATCHED_QOS)
+        self.create_input(Float64MultiArray, f'{shaft}/order_amplitude', self._on_average)
+        self.create_input(Float64MultiArray, f'{shaft}/pulse_error', self._on_pulse_error)
+        self.create_input(Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS)
+        self.create_steady_timer(_TICK, lambda: self._step())
+        self.parameters.watch(check=lambda values: None, apply=self._apply)
+
+    def _apply(self, values: Values) -> None:
+        self._values = values
+        self._batch.size = values['acquisitions']
+
+    # --- messages ---
+
+    def _on_average(self, message: Float64MultiArray) -> None:
+        average = average_of(decode_average('order_amplitude', message))
+        if np.isfinite(average.attenuation).any():
+            self._batch.add(average)
+        else:
+            self._uncorrected += 1
+            self.warn(
+                'order_amplitude without corrected amplitudes: set correct_jitter: true of the '
+                'averager, and see in its diagnostics whether it refuses; or give it a better '
+                'keyphasor')
+
+    def _on_pulse_error(self, message: Float64MultiArray) -> None:
+        received = decode_average('pulse_error', message)
+        self._pulses[received.header.start_time] = received.values
+        while len(self._pulses) > 2 * self._batch.size + 10:
+            del self._pulses[next(iter(self._pulses))]
+
+    def _on_prediction(self, message: Float64MultiArray) -> None:
+        received = decode_prediction(message)
+        table = received.values
+        self._prediction = Published(
+            table[:, 0], table[:, 1], table[:, 3], received.trigger_speed,
+            received.keyphasor_rate, received.trigger_cycles, received.ratio,
+            received.pulse_error_standard_deviation)
+
+    # --- the loop: `_step` is what comes next, looked at in every tick ---
+
+    def _judge(self) -> None:
+        """Compare a full batch with the prediction, then ask the predictor what it declares."""
+        if not self._batch.full or self._prediction is None:
+            return
+        averages = [replace(item, pulses=self._pulses.get(item.start_time))
+                    for item in self._batch.averages]
+        if averages[-1].pulses is None and not self._waited:
+            self._waited = True  # its pulse errors are published after it
+            return
+        self._waited = False
+        try:
+            require_comparable(averages, self._prediction)
+            table, found = compare(averages, self._prediction)
+        except SaJitterError as error:
+            self.warn(str(error))
+            return
+        self._batch.averages.clear()
+        self._batches += 1
+        self._significant = found.p_value < SIGNIFICANT
+        self._residual.publish(encode_residual(ResidualMessage(
+            table, len(averages), found.chi2_per_dof, found.p_value, found.rms)))
+        self._ask(averages, self._prediction)
+
+    def _ask(self, averages: Sequence[Average], prediction: Published) -> None:
+        """Get what the predictor declares; without an answer, what its prediction tells of it."""
+        def without() -> None:
+            self.warn(f'{self._predictor_name} does not answer: its prediction is taken for that '
+                      'of independent jitter without effects; start it, or set predictor')
+            self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
+
+        def answered(response: Any) -> None:
+            model, effects = self._declared(response)
+            self._trace(lambda: trace_averages(averages, model, declared=effects))
+        self._request(lambda: self._predictor.get_parameters([item.name for item in _PREDICTOR]),
+                      answered, without)
+
+    def _declared(self, response: Any) -> tuple[DeclaredModel, tuple[Effect, ...]]:
+        """Return the predictor's model and its effects, less those that were set here."""
+        values: Values = {item.name: item.default for item in _PREDICTOR}
+        for item, value in zip(_PREDICTOR, response.values):
+            known = parameter_value_to_python(value)
+            if known is not None:
+                values[item.name] = list(known) if item.is_list else known
+        self._added = {name for name in self._added if values[f'effects.{name}.enabled']}
+        values.update({f'effects.{name}.enabled': False for name in self._added})
+        return jitter_predictor.declared_model(values), enabled_effects(values)
+
+    def _trace(self, work: Callable[[], Trace]) -> None:
+        """Trace in a thread, so that the executor goes on."""
+        job = _Job(work)
+
+        def look() -> None:
+            if job.thread.is_alive():
+                return
+            self._step = self._judge
+            if job.result is not None:
+                self._tell(job.result)
+            else:
+                self.warn(f'not traced: {job.error}')
+        self._step = look
+
+    def _tell(self, trace: Trace) -> None:
+        """Publish what was found and, where asked for, hand it to the predictor."""
+        content = report(trace)
+        self._verdict = content['verdict']
+        self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
+        found = {item.name: item.effect.values for item in trace.findings
+                 if item.effect is not None}
+        news = (found or self._added) if self._significant else (found and not self._added)
+        if self._values['close_loop'] and news:
+            self._close(found)
+
+    def _close(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Set the predictor's effects and wait for the prediction that holds them."""
+        wanted: dict[str, Any] = {
+            f'effects.{name}.enabled': False for name in self._added - found.keys()}
+        for name, parameters in found.items():
+            wanted[f'effects.{name}.enabled'] = True
+            wanted.update({f'effects.{name}.{key}': list(value) if isinstance(value, tuple)
+                           else value for key, value in parameters.items()})
+        judged = self._prediction
+
+        def wait() -> None:
+            if self._prediction is not judged:
+                self._step = self._judge
+
+        def answered(response: Any) -> None:
+            if response.result.successful:
+                self._added, self._step = set(found), wait
+            else:
+                self.warn(f'{self._predictor_name} refuses the effects: {response.result.reason}')
+                self._step = self._judge
+
+        def without() -> None:
+            self.warn(f'{self._predictor_name} does not answer: its effects cannot be set')
+            self._step = self._judge
+        changes = [as_ros_parameter(name, value) for name, value in wanted.items()]
+        self._request(lambda: self._predictor.set_parameters_atomically(changes),
+                      answered, without)
+
+    def _request(self, call: Callable[[], Future], answered: Callable[[Any], None],
+                 without: Callable[[], None]) -> None:
+        """Ask the predictor and go on with its answer, or without one when patience ends."""
+        end = time.monotonic() + _PATIENCE
+        future: Future | None = None
+
+        def look() -> None:
+            nonlocal future
+            if future is None and self._predictor.services_are_ready():
+                future = call()
+            elif future is not None and future.done():
+                try:
+                    answered(future.result())
+                except SaJitterError as error:
+                    self.warn(f'{self._predictor_name}: {error}')
+                    self._step = self._judge
+            elif time.monotonic() > end:
+                if future is not None:
+                    future.cancel()
+                without()
+        self._step = look
+
+    # --- diagnostics ---
+
+    def update_counts(self) -> None:
+        """Gather the counts of the batches."""
+        self.counts.update(averages_overlapping=self._batch.overlapping)
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Say how far the batch is and what was found last."""
+        count, size = len(self._batch.averages), self._batch.size
+        values = {'averages': str(count), 'batches': str(self._batches), 'verdict': self._verdict,
+                  'uncorrected': str(self._uncorrected), 'effects_set': ', '.join(sorted(
+                      self._added))}
+        if self._prediction is None:
+            return 'no prediction received yet', values
+        return f'{count} of {size} averages; {self._verdict or "nothing judged yet"}', values
+
+
+class _Job:
+    """Work in a daemon thread; there is a `result` or an `error` once it is no longer alive."""
+
+    def __init__(self, work: Callable[[], Trace]) -> None:
+        self.result: Trace | None = None
+        self.error = ''
+        self._work = work
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.result = self._work()
+        except SaJitterError as error:
+            self.error = str(error)
+        except Exception as error:  # a node outlives what nobody expected
+            self.error = repr(error)
+
+
+def average_of(message: AverageMessage) -> Average:
+    """Return the average that a message of order amplitudes tells."""
+    header, table = message.header, message.values
+    raw, corrected = (table[..., k] * np.exp(1j * table[..., k + 1]) for k in (1, 3))
+    return Average(header.start_time, header.end_time, header.trigger_cycles,
+                   header.fundamental_cycles, header.mean_trigger_speed, table[0, :, 0], raw,
+                   corrected, table[..., 5], table[..., 6], table[..., 7])
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(ResidualAnalyser, args)
