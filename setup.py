@@ -9,6 +9,7 @@ NODES = (
     'jitter_predictor',
     'machine_simulator',
     'recording_player',
+    'residual_analyser',
     'synchronous_averager',
     'tach_detector',
 )
