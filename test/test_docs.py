@@ -423,6 +423,7 @@ def known_words():
     """Return the names of parameters, their choices, topics, fields, nodes and counts."""
     known = {*NODES, *COMMANDS, *INDICATORS, *FIELDS, *messages.AMPLITUDE_FIELDS,
              *messages.PULSE_ERROR_FIELDS, *messages.PREDICTION_FIELDS,
+             *messages.RESIDUAL_FIELDS,
              *messages.SAMPLE_TYPES, *messages.PULSE_TYPES, *diagnostic_keys()}
     for name in NODES:
         for key, (descriptor, _) in parameters_of(name).items():

@@ -45,7 +45,7 @@ def report_files(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str
     figures = illustrate(trace)
     pictures = {f'{item.name}.png': item.png() for item in figures}
     page = html(content, figures, pictures)
-    return {'report.json': (json.dumps(content, indent=2) + '\n').encode(),
+    return {'report.json': (json.dumps(content, indent=2, allow_nan=False) + '\n').encode(),
             'report.html': page.encode(), **pictures}
 
 
