@@ -13,7 +13,7 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('demo', 'design', 'reproduce')
+COMMANDS = ('close_loop', 'demo', 'design', 'reproduce')
 
 setup(
     name=NAME,
@@ -67,6 +67,7 @@ setup(
         'console_scripts': [
             *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
             *(f'{name} = {NAME}.commands.{name}:main' for name in COMMANDS),
+            f'sa_jitter_close_loop = {NAME}.commands.close_loop:main',
         ],
     },
 )
