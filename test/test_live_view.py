@@ -7,8 +7,10 @@ import math
 import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
+import sys
 import tempfile
 
 from bench import NodeBench
@@ -495,9 +497,41 @@ def test_the_browser_shows_the_numbers(bench):
     assert '<b>end' not in page
 
 
+def test_the_browser_bears_a_report_that_is_not_as_ours_are(bench):
+    b = bench()
+    publish_all(b)
+    b.send('missing_effect', String(data='{"lines": [null], "missing_effects": 3}'))
+    page = shown(b)
+    assert text_of(page, 'speed') == '16.625 Hz'
+    assert 'rig/averager' in text_of(page, 'nodes')
+
+
 def test_the_browser_says_when_there_is_nothing(bench):
     page = shown(bench())
     assert text_of(page, 'state') == 'no data received yet'
     assert 'no synchronous average received yet' in page
     assert 'live_view' in text_of(page, 'nodes')
     assert 'NaN' not in page
+
+
+def test_the_demo_prints_an_address_that_answers(process_environment, tmp_path):
+    demo = subprocess.Popen(
+        [sys.executable, '-c',
+         'from sa_jitter_ros.commands.demo import main; raise SystemExit(main())', '--live',
+         '--output', str(tmp_path)], env={**process_environment, 'PYTHONUNBUFFERED': '1'},
+        stdout=subprocess.PIPE, text=True)
+    try:
+        address = next(filter(None, (re.search(r'http://127\.0\.0\.1:(\d+)/', line)
+                                     for line in demo.stdout)))
+        connection = http.client.HTTPConnection('127.0.0.1', int(address[1]), timeout=10.0)
+        connection.request('GET', '/snapshot.json')
+        parts = json.loads(connection.getresponse().read())['parts']
+        connection.close()
+        assert parts['settings']['content']['vibration_unit'] == 'm/s^2'
+        assert parts['settings']['content']['channel_names'] == ['channel 0', 'channel 1']
+    finally:
+        demo.send_signal(signal.SIGINT)
+        demo.stdout.close()
+        assert demo.wait(timeout=30.0) == 130
+    with socket.socket() as probe:
+        assert probe.connect_ex(('127.0.0.1', int(address[1]))) != 0

@@ -21,6 +21,7 @@ from sa_jitter_ros.errors import SaJitterError
 
 START_TIMEOUT = 30.0  # s for discovery
 PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may hold thousands of pulses a second
+LIVE_ACQUISITIONS = 4  # averages in a residual
 QUIET = 3.0  # s without a new average after the source has ended
 
 
@@ -35,8 +36,8 @@ def node_command(name: str, parameters: dict[str, object]) -> list[str]:
     return command
 
 
-def processes(plan: Plan) -> dict[str, dict[str, object]]:
-    """Nodes to start and their parameters."""
+def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]:
+    """Nodes to start and their parameters; with `live` those that are only for eyes, too."""
     nodes: dict[str, dict[str, object]] = {
         'synchronous_averager': {
             'pulses_per_revolution': plan.pulses_per_revolution,
@@ -53,11 +54,15 @@ def processes(plan: Plan) -> dict[str, dict[str, object]]:
         # as the prediction declares it: the first sample past the threshold
         nodes['tach_detector'] = {'interpolate': False, 'tach_type': PULSE_BLOCKS}
         nodes['synchronous_averager']['tach_type'] = PULSE_BLOCKS
+    if live:
+        unit = '' if plan.unit == 'unknown' else plan.unit
+        nodes['live_view'] = {'vibration_unit': repr(unit), 'channel_names': plan.channels}
+        nodes['residual_analyser'] = {'acquisitions': LIVE_ACQUISITIONS}
     return nodes
 
 
 def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
-          children: Sequence[subprocess.Popen[bytes]]) -> None:
+          children: Sequence[subprocess.Popen[bytes]], *, live: bool = False) -> None:
     """Start the source, show progress, return when it has ended and the averages are in."""
     def spin(seconds: float) -> None:
         end = time.monotonic() + seconds
@@ -70,12 +75,16 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
     print('waiting for the nodes ...', flush=True)
     end = time.monotonic() + START_TIMEOUT
     listeners = ['vibration', 'tach_waveform' if plan.waveform else 'tach_pulse']
-    started = None
+    started, address = None, ''
     while started is None:
         spin(0.2)
         if time.monotonic() > end:
             raise SaJitterError(f'the nodes did not find each other within {START_TIMEOUT:g} s')
-        if watcher.prediction is not None and all(
+        if live and not address:
+            address = watcher.status.get('live_view', {}).get('address', '')
+            if address:
+                print(f'open {address} in a web browser', flush=True)
+        elif watcher.prediction is not None and all(
                 watcher.count_subscribers(topic) and watcher.count_publishers(topic)
                 for topic in listeners):
             started = watcher.set_parameter(plan.source, 'playing', True)
@@ -124,6 +133,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--keyphasor-rate', type=float, default=0.0, metavar='HZ',
                         help='round pulse times up to this clock, as if the keyphasor had been '
                         'sampled so slowly')
+    parser.add_argument('--live', action='store_true',
+                        help='show everything live on a page for a web browser, until Ctrl-C')
     parser.add_argument('--output', type=Path, default=Path('out'), help='folder for the figures')
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
@@ -134,14 +145,19 @@ def main(args: Sequence[str] | None = None) -> int:
             plan = plan_recording(options.recording, keyphasor_rate=options.keyphasor_rate)
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')
+        if not options.live:
+            print('to watch it live in a web browser: ./run demo --live')
         rclpy.init(context=context)
         watcher = Watcher(context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(watcher)
         children += [subprocess.Popen(node_command(name, parameters))
-                     for name, parameters in processes(plan).items()]
-        watch(plan, watcher, executor, children)
+                     for name, parameters in processes(plan, live=options.live).items()]
+        watch(plan, watcher, executor, children, live=options.live)
         report(plan, watcher, options.output)
+        if options.live:
+            print('the page stays until Ctrl-C', flush=True)
+            executor.spin()
     except SaJitterError as error:
         print(f'demo: {error}', file=sys.stderr)
         return 2

@@ -1,0 +1,179 @@
+// The charts of the page, each from what is known now.
+
+import {Chart, format, known, linear, logarithmic, places, range} from './charts.js';
+import {channel, channelName, find, finite, ofShaft, orderRows, part, predicted, timeUnit, unit,
+        withTimeUnit} from './model.js';
+
+const CURVES = 6;  // channels whose waveform is shown at once
+
+const waveformCharts = [];
+
+export function drawWaveforms() {
+  const raw = ofShaft('synchronous_average'), box = find('waveforms');
+  const count = raw ? Math.min(CURVES, raw.channels.length) : 1;
+  while (waveformCharts.length > count) { waveformCharts.pop(); box.lastChild.remove(); }
+  while (waveformCharts.length < count) {
+    const place = waveformCharts.length;
+    const div = box.appendChild(document.createElement('div'));
+    waveformCharts.push(new Chart(div, 190, chart => drawWaveform(chart, place)));
+  }
+  waveformCharts.forEach(chart => chart.render());
+}
+
+function drawWaveform(chart, place) {
+  const raw = ofShaft('synchronous_average'), corrected = ofShaft('corrected_average');
+  if (!raw) { chart.empty('no synchronous average received yet'); return; }
+  const first = Math.max(0, Math.min(channel(), raw.channels.length - CURVES));
+  const shown = raw.channels.length > CURVES ? first + place : place;
+  // The two arrive one after the other: that of the average before is as good.
+  const fresh = corrected && Math.abs(raw.header.sequence - corrected.header.sequence) < 2;
+  const curves = [['raw', raw.channels[shown]],
+                  ['corrected', fresh ? corrected.channels[shown] : null]]
+    .filter(([, values]) => values);
+  const x = linear([0, 360]);
+  x.ticks = [0, 45, 90, 135, 180, 225, 270, 315, 360].map(value => [value, `${value}`]);
+  chart.axes({
+    x, y: linear(range(curves.flatMap(([, values]) => values)), 4), title: channelName(shown),
+    xLabel: `angle of ${find('shaft').value} [degrees]`, yLabel: `[${unit()}]`});
+  for (const [style, values] of curves) {
+    chart.curve(style, i => 360 * i / values.length, values);
+  }
+  const usual = waveformNote(raw, fresh);
+  chart.follow(position => {
+    find('waveform-note').textContent = position === null ? usual
+      : `${channelName(shown)} at ${(360 * position).toFixed(1)}°: ` + curves.map(
+        ([style, values]) => `${style} ` + format(
+          values[Math.min(Math.round(position * values.length), values.length - 1)])).join(', ');
+  });
+}
+
+function waveformNote(raw, fresh) {
+  const all = raw.channels.length;
+  return (fresh ? '' : 'no corrected average ') + (all > CURVES
+    ? `${CURVES} of ${all} channels, from the chosen one on` : '');
+}
+
+function orderAxis(chart, rows) {
+  return places(rows.map(row => format(row.order, 6)), chart.inner);
+}
+
+export function drawAmplitudes(chart) {
+  const rows = orderRows();
+  if (!rows.length) { chart.empty('no order amplitudes received yet'); return; }
+  chart.axes({
+    x: orderAxis(chart, rows), xLabel: `order of ${find('shaft').value}`,
+    y: logarithmic(rows.flatMap(row => [row.raw_amplitude, row.corrected_amplitude,
+                                        row.noise_standard_deviation])),
+    yLabel: `amplitude [${unit()}]`, title: channelName(channel())});
+  rows.forEach((row, i) => {
+    const tip = `order ${format(row.order, 6)}: raw ${format(row.raw_amplitude)}, corrected `
+      + `${format(row.corrected_amplitude)}, noise ${format(row.noise_standard_deviation)}`;
+    chart.dash('noise', i, row.noise_standard_deviation, 0.35, tip);
+    chart.mark('raw', i - 0.1, row.raw_amplitude, {tip});
+    chart.mark('corrected', i + 0.1, row.corrected_amplitude, {square: true, tip});
+  });
+}
+
+export function drawAttenuation(chart) {
+  const rows = orderRows(), {note} = predicted();
+  const measured = rows.some(row => known(row.attenuation));
+  if (!measured && !rows.some(row => row.predicted)) {
+    chart.empty(rows.length ? `no attenuation measured; ${note}` : 'nothing received yet');
+    return;
+  }
+  const values = rows.flatMap(row => [row.attenuation, ...row.past, row.predicted?.low,
+                                      row.predicted?.high]);
+  chart.axes({
+    x: orderAxis(chart, rows), xLabel: `order of ${find('shaft').value}`,
+    y: linear(range(values, {include: [1]})), yLabel: 'attenuation (1: nothing lost)',
+    title: note || channelName(channel())});
+  chart.level('zero', 1);
+  rows.forEach((row, i) => {
+    const name = `order ${format(row.order, 6)}`, band = row.predicted;
+    if (band) {
+      const tip = `${name}: predicted ${format(band.mean)}, 5 % to 95 %: ${format(band.low)} to `
+        + format(band.high);
+      chart.band(i - 0.35, i + 0.35, band.low, band.high, tip);
+      chart.dash('predicted', i, band.mean, 0.35, tip);
+    }
+    row.past.forEach((value, k) => chart.mark(
+      'past', i + 0.24 * (((k * 0.618) % 1) - 0.5), value, {size: 2.5}));
+    const error = row.attenuation_standard_error;
+    chart.mark('measured', i, row.attenuation, {
+      error: known(error) ? 2 * error : null,
+      tip: `${name}: measured ${format(row.attenuation)} ± ${format(error, 2)}`});
+  });
+}
+
+export function drawErrors(chart) {
+  const pulses = ofShaft('pulse_error');
+  if (!pulses) { chart.empty('no pulse errors recovered yet (correct_jitter)'); return; }
+  const declared = part('prediction')?.pulse_error_standard_deviation;
+  const bars = pulses.error.flatMap((error, i) => known(error)
+    ? [error - (pulses.standard_error[i] ?? 0), error + (pulses.standard_error[i] ?? 0)] : []);
+  const limits = known(declared) ? [-declared, declared] : [];
+  const [low, high] = range(bars, {include: limits});
+  const [size, name] = timeUnit(Math.max(-low, high) / 2);
+  const last = Math.max(...finite(pulses.time));
+  const start = Math.min(...finite(pulses.time)) - last;
+  chart.axes({
+    x: linear([start || -1, 0]), xLabel: 'time before the last pulse [s]',
+    y: linear([low / size, high / size]), yLabel: `pulse error [${name}]`});
+  if (known(declared)) chart.band(start || -1, 0, -declared / size, declared / size);
+  chart.level('zero', 0);
+  pulses.error.forEach((error, i) => {
+    const spread = pulses.standard_error[i];
+    if (known(error) && known(pulses.time[i])) {
+      chart.mark('corrected', pulses.time[i] - last, error / size, {
+        error: known(spread) ? spread / size : null, size: 2,
+        tip: `pulse at ${format(pulses.time[i], 9)} s: ${withTimeUnit(error)} ± `
+          + withTimeUnit(spread, 2)});
+    }
+  });
+}
+
+export function drawResidual(chart) {
+  const residual = part('residual'), lines = part('missing_effect')?.lines ?? [];
+  if (!residual && !lines.length) {
+    chart.empty('no residual received (residual_analyser)');
+    return;
+  }
+  const orders = [...new Set([...(residual?.order ?? []), ...lines.map(line => line.order)])]
+    .filter(known).sort((a, b) => a - b);
+  const before = lines.map(line => line.observed - line.predicted_before);
+  const after = lines.map(line => line.observed - line.predicted_after);
+  const bars = (residual?.residual ?? []).flatMap((value, i) => known(value)
+    ? [value - 2 * (residual.standard_error[i] ?? 0), value + 2 * (residual.standard_error[i] ?? 0)]
+    : []);
+  chart.axes({
+    x: places(orders.map(order => format(order, 6)), chart.inner), xLabel: 'order',
+    y: linear(range([...before, ...after, ...bars], {include: [0]})),
+    yLabel: 'observed − predicted'});
+  chart.level('zero', 0);
+  const at = order => orders.indexOf(order);
+  lines.forEach((line, i) => {
+    chart.mark('past', at(line.order) - 0.15, before[i], {
+      tip: `${line.channel}, order ${line.order}: ${format(before[i])} with the declared model`});
+    chart.mark('corrected', at(line.order) + 0.15, after[i], {square: true,
+      tip: `${line.channel}, order ${line.order}: ${format(after[i])} with the traced effects`});
+  });
+  residual?.order.forEach((order, i) => chart.mark('measured', at(order), residual.residual[i], {
+    error: known(residual.standard_error[i]) ? 2 * residual.standard_error[i] : null,
+    tip: `order ${order}: ${format(residual.residual[i])} ± `
+      + `${format(residual.standard_error[i], 2)}, z = ${format(residual.z[i], 3)}`}));
+}
+
+export function drawSpeedLine() {
+  const speeds = part('shaft_speed')?.history ?? [], box = find('speed-line');
+  const svg = document.createElementNS('http://www.w3.org/2000/svg', 'svg');
+  const path = svg.appendChild(document.createElementNS(svg.namespaceURI, 'path'));
+  const {at} = linear(range(speeds));
+  path.setAttribute('class', 'curve corrected');
+  path.setAttribute('vector-effect', 'non-scaling-stroke');
+  path.setAttribute('d', speeds.map((value, i) => `${i ? 'L' : 'M'}`
+    + `${100 * i / Math.max(1, speeds.length - 1)} ${18 * (1 - at(value)) + 1}`).join(''));
+  svg.setAttribute('viewBox', '0 0 100 20');
+  svg.setAttribute('preserveAspectRatio', 'none');
+  svg.setAttribute('height', 20);
+  box.replaceChildren(svg);
+}

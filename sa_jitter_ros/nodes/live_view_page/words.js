@@ -1,0 +1,110 @@
+// The numbers and tables of the page, each from what is known now.
+
+import {format, known} from './charts.js';
+import {drawSpeedLine} from './drawings.js';
+import {find, finite, inBand, ofShaft, orderRows, part, predicted, state, timeUnit, unit,
+        withTimeUnit} from './model.js';
+
+const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
+const LOSSES = /dropped|gaps|restarts|clock_deviation|rejected|refused/;
+
+const rms = values => Math.sqrt(values.reduce((sum, x) => sum + x * x, 0) / values.length);
+function say(id, text) { find(id).textContent = text; }
+
+export function drawTiles() {
+  const orders = ofShaft('order_amplitude'), pulses = ofShaft('pulse_error');
+  const header = orders?.header ?? ofShaft('synchronous_average')?.header;
+  const speed = part('shaft_speed')?.value, prediction = part('prediction');
+  say('speed', known(speed) ? `${format(speed, 5)} Hz` : '–');
+  drawSpeedLine();
+  say('average', header ? `No. ${header.sequence}` : '–');
+  say('average-note', header ? `${header.trigger_cycles} trigger cycles, `
+    + `${header.fundamental_cycles} revolutions of ${find('shaft').value}` : '');
+  const errors = finite(pulses?.error ?? []);
+  say('pulses', errors.length ? `${withTimeUnit(rms(errors))} RMS` : '–');
+  const declared = prediction?.pulse_error_standard_deviation;
+  say('pulses-note', (errors.length ? `${errors.length} pulses; ` : '')
+    + (known(declared) ? `declared ${withTimeUnit(declared)}` : ''));
+  const judged = orderRows().flatMap(({attenuation, past, predicted: row}) =>
+    finite([attenuation, ...past]).filter(() => known(row?.low))
+      .map(value => value >= row.low && value <= row.high));
+  say('band', judged.length
+    ? `${(100 * judged.filter(Boolean).length / judged.length).toFixed(0)} %` : '–');
+  say('band-note', predicted().note || (judged.length
+    ? `90 % expected; ${orders.history.length} averages` : ''));
+  const report = part('missing_effect'), residual = part('residual');
+  const [before, after] = [report?.error_before?.rms, report?.error_after?.rms];
+  say('error', known(before) ? `${format(before, 2)} → ${format(after, 2)}`
+    : known(residual?.rms) ? format(residual.rms, 2) : '–');
+  say('error-note', known(before) ? `RMS before → after; verdict: ${report.verdict}`
+    : residual ? `RMS of ${residual.acquisitions} acquisitions, chi² per degree of freedom `
+      + format(residual.chi2_per_dof, 3) : '');
+}
+
+// Rows of [text, class] cells under a row of headings.
+function fill(table, headings, rows) {
+  const line = (tag, cells) => {
+    const row = document.createElement('tr');
+    for (const [text, style = ''] of cells) {
+      const cell = row.appendChild(document.createElement(tag));
+      cell.textContent = text;
+      cell.className = style;
+    }
+    return row;
+  };
+  table.replaceChildren(line('th', headings), ...rows.map(cells => line('td', cells)));
+}
+
+export function drawOrders() {
+  const right = text => [text, 'number'];
+  fill(find('orders'), [
+    'order', `raw [${unit()}]`, 'corrected', 'noise', 'attenuation', 'predicted',
+    '5 % to 95 %', 'in band'].map(right), orderRows().map(row => {
+    const inside = inBand(row), band = row.predicted;
+    return [...[format(row.order, 6), format(row.raw_amplitude), format(row.corrected_amplitude),
+                format(row.noise_standard_deviation, 2),
+                known(row.attenuation) ? `${format(row.attenuation)} ± `
+                  + format(row.attenuation_standard_error, 2) : '–', format(band?.mean),
+                band ? `${format(band.low)} to ${format(band.high)}` : '–'].map(right),
+            [inside === null ? '–' : inside ? 'yes' : 'no',
+             `number ${inside === false ? 'warn' : ''}`]];
+  }));
+}
+
+export function drawEffects() {
+  const list = document.createElement('dl');
+  for (const effect of part('missing_effect')?.missing_effects ?? []) {
+    const parameters = Object.entries(effect.parameters ?? {}).map(
+      ([name, {value, standard_error: error, unit: given}]) => {
+        const values = [value].flat(), numbers = values.filter(item => typeof item === 'number');
+        const [size, measure] = given === 's' ? timeUnit(Math.max(0, ...numbers.map(Math.abs)))
+          : [1, given === '1' ? '' : given ?? ''];
+        const write = (items, digits) => items.map(
+          item => typeof item === 'number' ? format(item / size, digits) : item).join(', ');
+        return `${name} = ${write(values, 3)}`
+          + (known(error) ? ` ± ${write([error].flat(), 2)}` : '') + ` ${measure}`.trimEnd();
+      });
+    list.appendChild(document.createElement('dt')).textContent =
+      `missing effect: ${effect.name} (${parameters.join('; ')})`;
+    list.appendChild(document.createElement('dd')).textContent = (effect.evidence ?? '')
+      + (effect.indistinguishable_from?.length
+        ? `; cannot be told from ${effect.indistinguishable_from.join(', ')}` : '');
+  }
+  find('effects').replaceChildren(list);
+}
+
+export function drawNodes() {
+  const nodes = Object.entries(part('/diagnostics') ?? {}).sort(([a], [b]) => a < b ? -1 : 1);
+  fill(find('nodes'), [['node'], ['level'], ['message'], ['lost or refused'], ['other counts'],
+                       ['seen', 'number']],
+       nodes.map(([name, node]) => {
+    const age = state.now - node.received;
+    const [style, level] = age > 5 ? LEVELS[3] : LEVELS[node.level] ?? LEVELS[3];
+    const counts = Object.entries(node.values).filter(([, value]) => /^0*[1-9][0-9]*$/.test(value));
+    const listed = bad => counts.filter(([key]) => LOSSES.test(key) === bad)
+      .map(([key, value]) => `${key} ${value}`).join(', ') || '–';
+    return [[name], [level, `level ${style}`], [node.message],
+            [listed(true), listed(true) === '–' ? '' : 'warn'], [listed(false)],
+            [`${age.toFixed(0)} s ago`, 'number']];
+  }));
+}
