@@ -81,7 +81,8 @@ def _findings(
         Finding('Fig. 7', 'simulations and the exact model agree',
                 f'KS over {len(tests)} cases of {tests[0].sizes[0]} against {tests[0].sizes[1]}: '
                 f'smallest p {min(item.p_value for item in tests):.3f}; with the same pulse '
-                f'errors the amplitudes differ by at most {gap:.1e}',
+                f'errors the amplitudes differ by at most {gap:.1e} beside a second harmonic of '
+                f'{AMPLITUDE_RATIO:g}',
                 agreement(one_law(tests), gap < 1e-3)),
         Finding('Fig. 7a', 'r = 2.286: the approximate model is not suitable',
                 f'KS distance of approximate and exact model for r_hf = 2, 3, 4: {listed(rough)}',

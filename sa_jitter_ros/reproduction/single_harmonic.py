@@ -25,6 +25,7 @@ TABLE_3 = ((1, 40, 1.0, 0.2), (2, 60, 1.0, 0.2), (3, 80, 1.0, 0.2), (4, 100, 1.0
            (12, 100, 75.27, 0.2))
 
 _CHECKED = 2  # simulations repeated with Table 1's sampling rate and interpolator
+_SEEDS = 1_000_000  # of each case's simulations
 _EXACT_ENOUGH = 1e-4  # of an amplitude of 1
 
 
@@ -65,7 +66,7 @@ def harmonic_case(trigger_cycles: int, ratio: float, width: float) -> HarmonicCa
 
 def sample(case: HarmonicCase, effort: Effort, seed: int, progress: Progress) -> Samples:
     """Draw the amplitude of order 1 by simulation and by both numerical models."""
-    simulated = simulate(case, effort.simulations, seed=1000 * seed, progress=progress)
+    simulated = simulate(case, effort.simulations, seed=_SEEDS * seed, progress=progress)
     orders, amplitudes = zip(*case.harmonics)
     signal = AveragedSignal(case.trigger_cycles, case.cycle_length, 1.0, orders, amplitudes)
     exact, approximate = (
@@ -112,8 +113,9 @@ def run(effort: Effort, progress: Progress) -> Results:
         cases[number] = sample(harmonic_case(cycles, ratio, width), effort, number,
                                stage(progress, k, len(TABLE_3)))
     check = cases[8].case
-    coarse, fine = (simulate(item, _CHECKED, seed=8000, progress=lambda done: None).amplitudes
-                    for item in (check, as_in_table_1(check)))
+    coarse, fine = (
+        simulate(item, _CHECKED, seed=_SEEDS * 8, progress=lambda done: None).amplitudes
+        for item in (check, as_in_table_1(check)))
     sampling_gap = float(np.abs(coarse - fine).max())
     places = np.concatenate([np.searchsorted(np.sort(item.exact), item.simulated)
                              / item.exact.size for item in cases.values()])
