@@ -141,8 +141,8 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
                         mode='reflect', reflect_type='odd')
     taps = 2 * half
-    columns = (base.astype(np.int32) - (half - 1 + first))[:, None] + np.arange(
-        taps, dtype=np.int32)
+    columns = np.repeat(base.astype(np.int32) - (half - 1 + first), taps).reshape(-1, taps)
+    columns += np.arange(taps, dtype=np.int32)
     rows = np.arange(0, taps * len(positions) + 1, taps, dtype=np.int32)
     operator = sparse.csr_matrix((weights.ravel(), columns.ravel(), rows),
                                  shape=(len(positions), len(window)))
