@@ -18,11 +18,12 @@ from sa_jitter_ros.closure.observation import observe
 from sa_jitter_ros.closure.trace import Trace, trace
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
-from sa_jitter_ros.simulation.effect import Effect
+from sa_jitter_ros.simulation.effect import Effect, IndexArray, Setting
 from sa_jitter_ros.simulation.effects import make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor
 from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
+from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -47,6 +48,41 @@ EFFECTS: Mapping[str, Mapping[str, Any]] = {
     'amplitude_modulation': {'std': 0.3},
     'interfering_tone': {'frequency': 400.9, 'amplitude': 0.12},
 }
+
+PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('target_geometry', 'excess_jitter'),
+         ('excess_jitter', 'amplitude_modulation'), ('speed_fluctuation', 'additive_noise'),
+         ('clock_skew', 'correlated_jitter'), ('missing_pulses', 'excess_jitter'))
+
+
+class Hum(Effect):
+    """Unknown to every module: the trigger level hums, 100 us at a frequency that is no order."""
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the delay of each pulse."""
+        return 100e-6 * np.sin(2.0 * np.pi * 0.2871 * setting.trigger_rate * times + setting.seed)
+
+
+class Bursts(Effect):
+    """Unknown to every module: one pulse in eight is up to 400 us late."""
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the delay of each pulse."""
+        late = RandomStream(setting.seed, 'bursts', rows=2).uniform(
+            int(index[0]), int(index[-1]) + 1)
+        return np.asarray(np.where(late[0] < 0.125, 400e-6 * late[1], 0.0))
+
+
+class Switching(Effect):
+    """Unknown to every module: jitter that switches on for stretches of the record."""
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the delay of each pulse."""
+        noise = RandomStream(setting.seed, 'switching').normal(int(index[0]), int(index[-1]) + 1)
+        return np.asarray(np.where(np.sin(2.0 * np.pi * times / 5.0 + setting.seed) > 0.6,
+                                   160e-6 * noise[0], 0.0))
+
+
+UNKNOWN: Mapping[str, type[Effect]] = {'hum': Hum, 'bursts': Bursts, 'switching': Switching}
 
 
 def machine(effects: Sequence[Effect], *, seed: int, pulses: int = 1, ratio: float = 1.0,
@@ -85,7 +121,8 @@ def run(seed: int, names: Sequence[str], *, acquisitions: int = 24) -> Trace:
     """Trace one simulated machine with these effects at their documented sizes."""
     geometry = 'target_geometry' in names
     pulses, ratio = (4, 4.0) if geometry else (1, 1.0)
-    effects = make_effects({name: EFFECTS[name] for name in names})
+    effects = (*make_effects({name: EFFECTS[name] for name in names if name in EFFECTS}),
+               *(UNKNOWN[name]() for name in names if name in UNKNOWN))
     gearbox = machine(effects, seed=seed, pulses=pulses, ratio=ratio,
                       jitter='keyphasor_quantisation' not in names)
     declared = model(pulses=pulses, ratio=ratio)
@@ -116,12 +153,15 @@ def main() -> None:
     parser.add_argument('--seeds', type=int, default=20)
     parser.add_argument('--null', type=int, default=200)
     parser.add_argument('--effects', nargs='*', default=list(EFFECTS))
+    parser.add_argument('--unknown', type=int, default=20, help='runs of each unknown effect')
+    parser.add_argument('--pairs', type=int, default=10, help='runs of each pair')
     parser.add_argument('--workers', type=int, default=1)
     parser.add_argument('--verbose', action='store_true')
     options = parser.parse_args()
     with ProcessPoolExecutor(options.workers) as pool:
         for names, seeds in [*(((name,), options.seeds) for name in options.effects),
-                             ((), options.null)]:
+                             *(((name,), options.unknown) for name in UNKNOWN),
+                             *((pair, options.pairs) for pair in PAIRS), ((), options.null)]:
             if not seeds:
                 continue
             rows = list(pool.map(partial(one, names=names), range(seeds)))

@@ -18,7 +18,8 @@ from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
 from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
 from sa_jitter_ros.statistics.angle_error import (
-    AngleErrorProcess, joint_characteristic, unit_nodes)
+    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
+from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.moments import AverageMoments, cycle_moments, noise_line_variance
 
 Array = NDArray[Any]
@@ -91,8 +92,12 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
                                     _leakage(observation, processes, None))
                 rows.append(shared)
             else:
-                rows.append((_known(observation, processes, errors),
-                             _leakage(observation, processes, errors)))
+                unsure = processes
+                if each.error_std and any(effect.replaces_jitter(model) for effect in effects):
+                    unsure = (*processes, IndependentPulseJitter(
+                        Normal(each.error_std), model.fundamental_frequency))
+                rows.append((_known(observation, unsure, errors),
+                             _leakage(observation, unsure, errors)))
         mean, variance, pseudo = _of_lines(item, lines, rows, group)
         means.append(mean)
         variances.append(variance)

@@ -15,12 +15,16 @@ from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording
+from scipy import stats
 
 Array = NDArray[Any]
 
-_STRONG, _COHERENT = 0.2, 0.8
+_STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
 _TWIN = 4.0
+# What the phases of the acquisitions leave uncertain of a tone's amplitude.
+_ROUGH = 0.03
+_CERTAIN = 1e-4
 _GROUPS = 3
 # A clock this much faster than the declared one is no cause of anything.
 _FINE = 50.0
@@ -30,20 +34,19 @@ def choose_lines(observation: Observation) -> Lines:
     """
     Return the lines worth comparing.
 
-    They have at least 20 % of their order's strongest channel and the same phase in both halves of
-    an acquisition (coherence 0.8). Raises SignalError where there is none.
+    They have at least 20 % of their order's strongest channel and a coherence from cycle to cycle
+    of 0.9 times that of the best line, which noise and modulation lower too. Raises SignalError
+    where there is none.
     """
     orders = observation.orders.size
     cycles = _cycles(observation)
-    half = cycles.shape[1] // 2
-    early, late = cycles[:, :half].mean(axis=1), cycles[:, half:].mean(axis=1)
-    if half == 0:
-        early, late = cycles[:-1, 0], cycles[1:, 0]
     level = np.abs(observation.stacked('corrected')[..., :orders]).mean(axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):
-        coherence = np.abs(np.sum(early.conj() * late, axis=0)) ** 2 / (
-            np.sum(np.abs(early) ** 2, axis=0) * np.sum(np.abs(late) ** 2, axis=0))
-    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (coherence >= _COHERENT)
+        coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
+            np.abs(cycles) ** 2, axis=(0, 1))
+    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (coherence > 4.0 / cycles.shape[1])
+    if good.any():
+        good &= coherence >= _COHERENT * coherence[good].max()
     channel, order = np.nonzero(good)
     if channel.size == 0:
         raise SignalError(
@@ -86,16 +89,21 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     if usable and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
                  for i in range(int(group.max()) + 1)]
+    again = [None if motion is None or smooth is None else _unskewed(observation, motion, smooth)
+             for motion in again]
+    spread = [motion for motion in again if motion is not None]
+    error_std = np.sqrt(np.mean(np.var(spread, axis=0, ddof=1), axis=1)) if len(spread) > 1 else (
+        np.zeros(len(observation.acquisitions)))
     known = []
     for a, item in enumerate(observation.acquisitions):
         grid = None if smooth is None else smooth[item.first:item.first + item.times.size]
         rows = []
         for motion in again:
-            errors = grid
+            errors, std = grid, 0.0
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
             if motion is not None and precise and np.all(np.isfinite(motion[a])):
-                errors = _on_grid(motion[a], clock)
-            rows.append(Pulses(item.times, item.first, errors, item.missing))
+                errors, std = _on_grid(motion[a], clock), float(np.nan_to_num(error_std[a]))
+            rows.append(Pulses(item.times, item.first, errors, item.missing, std))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), period_std, known
 
@@ -176,18 +184,35 @@ def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) 
     height = single / floor
     peak, line = np.unravel_index(int(np.argmax(height)), height.shape)
     ratio = float(spectrum[peak, line] / floor[line])
-    # Each acquisition's own phase has taken half the tone's mean over it away.
-    kept = np.sinc(turns[peak]) * (1.0 - 0.5 * np.sinc(turns[peak] * cycles.shape[1]) ** 2)
-    amplitude = float(np.sqrt(spectrum[peak, line]) / window.sum() / kept)
+    # Along the radius only: the pulse errors have been fitted to what turns.
+    finer = turns[peak] + np.linspace(-0.25, 0.25, 51) / count
+    fine = np.abs(np.exp(-2j * np.pi * np.outer(finer, np.arange(count))) @ (
+        series[:, line].real * window))
+    turn = float(finer[np.argmax(fine)])
+    amplitude = float(2.0 * fine.max() / window.sum() / np.sinc(turn))
     return replace(
         evidence, tone_amplitude=amplitude,
         tone_frequency=float(evidence.order[line] * model.fundamental_frequency
-                             + turns[peak] / model.trigger_period),
-        tone_standard_error=amplitude * float(np.sqrt(0.5 / ratio)),
-        tone_frequency_error=float(np.sqrt(1.5 / ratio) / (
-            np.pi * count * model.trigger_period)),
+                             + turn / model.trigger_period),
+        tone_standard_error=amplitude * float(np.sqrt(0.5 / ratio + _ROUGH**2)),
+        tone_frequency_error=float((np.sqrt(1.5 / ratio) / np.pi + 0.005) / (
+            count * model.trigger_period)),
         tone_p_value=min(1.0, count * cycles.shape[2] * float(np.exp(
             -max(height[peak, line], 0.0)))))
+
+
+def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
+    """Return recovered errors (acquisition, pulse) less a slope over time that no grid makes."""
+    items = observation.acquisitions
+    grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
+    times = np.array([item.times - item.times.mean() for item in items])
+    left = motion - grid
+    slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(
+        times**2, axis=1)
+    slopes = slopes[np.isfinite(slopes)]
+    if slopes.size < 4 or stats.ttest_1samp(slopes, 0.0).pvalue > _CERTAIN:
+        return motion
+    return np.asarray(motion - float(np.median(slopes)) * times)
 
 
 def _on_grid(errors: Array, clock: float) -> Array:

@@ -7,7 +7,7 @@ acquisitions that the fit has not seen.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import json
 import os
 from pathlib import Path
@@ -15,8 +15,9 @@ import sys
 import tempfile
 from typing import NoReturn
 
+from sa_jitter_ros.closure.html_report import report_files
 from sa_jitter_ros.closure.observation import observe
-from sa_jitter_ros.closure.report import report, summary
+from sa_jitter_ros.closure.report import summary
 from sa_jitter_ros.closure.trace import Trace, trace
 from sa_jitter_ros.commands.declaration import read_declaration
 from sa_jitter_ros.errors import SaJitterError
@@ -67,18 +68,14 @@ def run(options: argparse.Namespace) -> Trace:
     return trace(observations, recordings, declared=declaration.effects, progress=say)
 
 
-def write(folder: Path, name: str, content: str) -> None:
-    """Write a file wholly or not at all."""
+def write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write all files or none: they are complete before the first gets its name."""
     folder.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=folder, prefix=f'.{name}.')
-    try:
-        with os.fdopen(handle, 'w', encoding='utf-8') as file:
-            file.write(content)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, folder / name)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with tempfile.TemporaryDirectory(dir=folder, prefix='.close_loop.') as temporary:
+        for name, content in files.items():
+            (Path(temporary) / name).write_bytes(content)
+        for name in files:
+            os.replace(Path(temporary) / name, folder / name)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -86,13 +83,13 @@ def main(args: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(args)
     try:
         found = run(options)
-        content = report(found, recordings=[str(path) for path in options.recordings])
-        write(options.output, 'report.json', json.dumps(content, indent=1, allow_nan=False) + '\n')
+        files = report_files(found, recordings=[str(path) for path in options.recordings])
+        write(options.output, files)
     except (SaJitterError, OSError) as error:
         print(f'close_loop: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    print(summary(content))
-    print(f'report: {options.output / "report.json"}')
+    print(summary(json.loads(files['report.json'])))
+    print(f'report: {options.output / "report.html"}')
     return 0
 
 

@@ -9,7 +9,7 @@ from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
-_SIGNIFICANT = 1e-4
+_SIGNIFICANT = 1e-3
 
 
 @dataclass(frozen=True)

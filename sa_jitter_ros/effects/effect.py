@@ -63,13 +63,14 @@ class Pulses:
     `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` is the
     index of the first of them in the recording; `errors` (N_t + 1,) in s holds what the grid of a
     clock says about each (`keyphasor_quantisation`), None where it says nothing; `missing` (N_t,)
-    is how many pulses lack within each cycle.
+    is how many pulses lack within each cycle; `error_std` in s is how uncertain `errors` are.
     """
 
     times: Array
     first: int = 0
     errors: Array | None = None
     missing: Array | None = None
+    error_std: float = 0.0
 
 
 class Effect:

@@ -11,6 +11,9 @@ Array = NDArray[Any]
 
 _TOLERANCE = 0.02  # of a tick
 _STEPS = 3000
+_FEWEST = 8
+# Ticks that an interval holds at least: with fewer, pulses are no time measurement.
+_COARSEST = 4.0
 
 
 @dataclass(frozen=True)
@@ -30,7 +33,8 @@ def find_clock(times: Array) -> Clock:
     """
     none = Clock(0.0, 0.0)
     intervals = np.sort(np.diff(times))
-    if intervals.size < 8:
+    intervals = intervals[intervals < 1.5 * np.median(intervals)]
+    if intervals.size < _FEWEST:
         return none
     resolution = 4.0 * np.spacing(np.max(np.abs(times)))
     gaps = np.diff(intervals)
@@ -38,6 +42,8 @@ def find_clock(times: Array) -> Clock:
     if steps.size == 0:
         return none
     tick = float(np.min(steps))
+    if tick > intervals[0] / _COARSEST:
+        return none
     if np.count_nonzero(gaps <= 0.05 * tick) < 0.5 * gaps.size:
         return none
     elapsed = times - times[0]

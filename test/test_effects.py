@@ -1,0 +1,266 @@
+"""The forward model of every effect, against closed forms, quadrature and Monte Carlo."""
+
+import numpy as np
+import pytest
+
+from sa_jitter_ros.effects import (
+    Effect, EFFECTS, enabled_effects, make_effect, parameter_defaults, parameter_ranges,
+    predict_with)
+from sa_jitter_ros.effects.effect import Pulses
+from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
+from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
+from scipy.signal import lfilter
+
+MODEL = DeclaredModel(keyphasor_rate=10_000.0, trigger_speed=25.0, trigger_cycles=20,
+                      orders=(10.0, 20.0, 40.0), sample_rate=20_000.0)
+SMALL = {
+    'excess_jitter': {'std': 5e-5},
+    'keyphasor_quantisation': {'clock_rate': 10_000.0, 'period_std': 3e-6},
+    'correlated_jitter': {'std': 5e-5, 'correlation': 0.6},
+    'target_geometry': {'pulse_angles': (0.01, -0.005, 0.02)},
+    'speed_fluctuation': {'acceleration_std': 40.0},
+    'clock_skew': {'skew': 2e-4},
+    'phase_wander': {'std': 0.01},
+    'missing_pulses': {'probability': 0.02},
+    'interpolation_loss': {'method': 'linear'},
+    'additive_noise': {'std': 1.0},
+    'amplitude_modulation': {'std': 0.2},
+    'interfering_tone': {'frequency': 250.5, 'amplitude': 0.2},
+}
+
+
+def average_of(errors):
+    """Return |X| (draw, order) of pulse errors (draw, pulse) in s: Eq. 26 with N_i = r."""
+    cycles = np.multiply.outer(errors * MODEL.fundamental_frequency, np.array(MODEL.orders))
+    gains = np.exp(1j * np.pi * (cycles[:, 1:] + cycles[:, :-1])) * np.sinc(
+        np.diff(cycles, axis=1))
+    return np.abs(gains.mean(axis=1))
+
+
+def declared_errors(rng, draws):
+    return rng.uniform(-5e-5, 5e-5, (draws, MODEL.trigger_cycles + 1))
+
+
+def check(prediction, amplitudes):
+    """Compare mean and standard deviation with draws (draw, order) within 4.5 standard errors."""
+    count = len(amplitudes)
+    spread = amplitudes.std(axis=0)
+    assert prediction.mean_attenuation == pytest.approx(
+        amplitudes.mean(axis=0), abs=float(4.5 * spread.max() / np.sqrt(count) + 2e-5))
+    kurtosis = np.mean((amplitudes - amplitudes.mean(axis=0)) ** 4, axis=0) / spread**4
+    error = 4.5 * np.sqrt((kurtosis - 1.0) / count) / 2.0
+    assert np.all(np.abs(prediction.standard_deviation / spread - 1.0) < error + 0.02)
+
+
+def test_registry_has_the_effects_of_the_contract():
+    assert set(EFFECTS) == set(SMALL)
+    assert list(parameter_ranges(EFFECTS['correlated_jitter'])) == ['std', 'correlation']
+    assert parameter_defaults(EFFECTS['excess_jitter']) == {'std': 0.0}
+    assert parameter_ranges(EFFECTS['speed_fluctuation'])['acceleration_std'].unit == 'rad/s^2'
+
+
+@pytest.mark.parametrize('name', EFFECTS)
+def test_every_effect_lowers_the_mean_or_widens_the_law(name):
+    before, after = predict(MODEL), predict_with(MODEL, [make_effect(name, **SMALL[name])])
+    lower = before.mean_attenuation - after.mean_attenuation
+    wider = after.standard_deviation - before.standard_deviation
+    if name == 'keyphasor_quantisation':  # takes the place of the declared jitter
+        assert np.all(after.mean_attenuation < 1.0)
+    else:
+        assert np.all((lower > 1e-4) | (wider > 1e-6))
+    assert after.model is MODEL
+    assert after.mean_attenuation**2 + after.variance == pytest.approx(
+        after.moments.mean_square, rel=1e-6)
+
+
+def test_no_effect_is_the_prediction_itself():
+    assert predict_with(MODEL).mean_attenuation == pytest.approx(predict(MODEL).mean_attenuation)
+
+
+def test_excess_jitter_is_independent_normal(rng):
+    errors = declared_errors(rng, 20_000)
+    errors = errors + rng.normal(0.0, 5e-5, errors.shape)
+    check(predict_with(MODEL, [make_effect('excess_jitter', std=5e-5)]), average_of(errors))
+
+
+@pytest.mark.parametrize('correlation', [-0.6, 0.7])
+def test_correlated_jitter_is_autoregressive(rng, correlation):
+    errors = declared_errors(rng, 20_000)
+    white = rng.normal(0.0, 5e-5, (len(errors), 60 + errors.shape[1]))
+    slow = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)[:, 60:]
+    effect = make_effect('correlated_jitter', std=5e-5, correlation=correlation)
+    check(predict_with(MODEL, [effect]), average_of(errors + slow))
+
+
+def test_quantisation_is_rounding_up_to_the_clock(rng):
+    clock, std = 10_000.0, 4e-6
+    periods = 1.0 / 25.0 + rng.normal(0.0, std, (20_000, MODEL.trigger_cycles))
+    times = np.cumsum(np.column_stack((rng.uniform(0.0, 1.0, len(periods)), periods)), axis=1)
+    effect = make_effect('keyphasor_quantisation', clock_rate=clock, period_std=std)
+    assert effect.replaces_jitter(MODEL)
+    prediction = predict_with(MODEL, [effect])
+    drawn = average_of(np.ceil(times * clock) / clock - times)
+    # 128 paths stand for all: their own standard error on top of that of the draws
+    assert prediction.mean_attenuation == pytest.approx(
+        drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(128)))
+
+
+def test_clock_of_another_rate_comes_on_top():
+    effect = make_effect('keyphasor_quantisation', clock_rate=5_000.0)
+    assert not effect.replaces_jitter(MODEL)
+    alone = predict_with(DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 5_000.0}), [effect])
+    assert np.all(predict_with(MODEL, [effect]).mean_attenuation < alone.mean_attenuation)
+
+
+def test_geometry_repeats_with_the_pulse_index(rng):
+    angles = (0.01, -0.005, 0.02)
+    pattern = np.array(angles) / (2.0 * np.pi * 25.0)
+    first = rng.integers(0, 3, 20_000)
+    index = first[:, None] + np.arange(MODEL.trigger_cycles + 1)
+    effect = make_effect('target_geometry', pulse_angles=angles)
+    check(predict_with(MODEL, [effect]),
+          average_of(declared_errors(rng, 20_000) + pattern[index % 3]))
+    pulses = Pulses(np.arange(21.0) / 25.0, first=4)
+    assert effect.pattern(MODEL, pulses) == pytest.approx(pattern[(4 + np.arange(21)) % 3])
+
+
+def test_geometry_counts_pulses_and_not_triggers():
+    model = DeclaredModel(**{**vars(MODEL), 'pulses_per_revolution': 6, 'pulses_per_trigger': 2})
+    effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
+    late = effect.pattern(model, Pulses(np.arange(21.0), first=1)) * 2.0 * np.pi * 25.0
+    assert late[:4] == pytest.approx([2.0, 4.0, 0.0, 2.0])
+
+
+def test_skew_is_a_delay_that_grows(rng):
+    delay = 2e-4 * np.arange(MODEL.trigger_cycles + 1) / 25.0
+    check(predict_with(MODEL, [make_effect('clock_skew', skew=2e-4)]),
+          average_of(declared_errors(rng, 20_000) + delay))
+    quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
+    gain = predict_with(quiet, [make_effect('clock_skew', skew=2e-4)]).mean_attenuation
+    frequency = np.array(MODEL.orders) * 25.0
+    assert gain == pytest.approx(np.abs(np.sinc(frequency * 2e-4 * 0.8)), abs=1e-6)
+
+
+def test_speed_fluctuation_has_the_closed_form_at_small_size():
+    quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
+    effect = make_effect('speed_fluctuation', acceleration_std=20.0)
+    prediction = predict_with(quiet, [effect])
+    cycles = 20.0 / (2.0 * np.pi)
+    loss = (2.0 * np.pi * np.array(MODEL.orders)) ** 2 * 25.0**-4 * cycles**2 / 240.0
+    assert np.abs(prediction.moments.mean) == pytest.approx(1.0 - loss, rel=0.0, abs=0.7 * loss[
+        -1] ** 2 + 1e-6)
+
+
+def test_phase_wander_turns_by_its_standard_deviation():
+    quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
+    prediction = predict_with(quiet, [make_effect('phase_wander', std=0.01)])
+    assert np.abs(prediction.moments.mean) == pytest.approx(
+        np.exp(-0.5 * (0.01 * np.array(MODEL.orders)) ** 2), rel=1e-9)
+
+
+def test_missing_pulses_are_counted_angle_that_lacks(rng):
+    quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
+    lost = rng.geometric(0.98, (20_000, MODEL.trigger_cycles)) - 1
+    behind = np.concatenate((np.zeros((len(lost), 1)), np.cumsum(lost, axis=1)), axis=1) / 25.0
+    drawn = average_of(behind)
+    prediction = predict_with(quiet, [make_effect('missing_pulses', probability=0.02)])
+    assert prediction.mean_attenuation == pytest.approx(
+        drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(256)))
+
+
+def test_interpolation_loss_is_the_gain_of_the_interpolator():
+    ratio = np.array(MODEL.orders) * 25.0 / 20_000.0
+    plain = predict(MODEL).moments.mean
+    for method, gain in (('linear', np.sinc(ratio) ** 2),
+                         ('spline', 3.0 * np.sinc(ratio) ** 4 / (2.0 + np.cos(
+                             2.0 * np.pi * ratio)))):
+        prediction = predict_with(MODEL, [make_effect('interpolation_loss', method=method)])
+        assert np.abs(prediction.moments.mean / plain) == pytest.approx(gain, abs=1e-4)
+
+
+def test_noise_and_tone_add_their_power():
+    plain = predict(MODEL).moments.mean_square
+    noisy = predict_with(MODEL, [make_effect('additive_noise', std=1.0)]).moments.mean_square
+    assert noisy - plain == pytest.approx(4.0 / (20_000.0 * 0.8))
+    tone = make_effect('interfering_tone', frequency=250.5, amplitude=0.2)
+    added = predict_with(MODEL, [tone]).moments.mean_square - plain
+    assert added[0] == pytest.approx(0.04 * np.sinc(0.5 * 0.8) ** 2, rel=1e-2)
+    assert np.all(added[1:] < 1e-3 * added[0])
+
+
+def test_modulation_leaves_the_mean_and_widens_all_orders_alike():
+    plain = predict(MODEL)
+    after = predict_with(MODEL, [make_effect('amplitude_modulation', std=0.2)])
+    assert after.moments.mean == pytest.approx(plain.moments.mean)
+    spread = np.sqrt(after.moments.variance - plain.moments.variance) / np.abs(after.moments.mean)
+    assert spread == pytest.approx(np.full(3, spread[0]), rel=0.04)
+
+
+def test_effects_combine(rng):
+    angles = (0.02, -0.02)
+    effects = [make_effect('clock_skew', skew=2e-4), make_effect('excess_jitter', std=5e-5),
+               make_effect('target_geometry', pulse_angles=angles)]
+    errors = declared_errors(rng, 20_000)
+    index = np.arange(MODEL.trigger_cycles + 1)
+    errors = errors + rng.normal(0.0, 5e-5, errors.shape) + 2e-4 * index / 25.0
+    errors = errors + (np.array(angles) / (2.0 * np.pi * 25.0))[
+        (index + rng.integers(0, 2, (len(errors), 1))) % 2]
+    check(predict_with(MODEL, effects), average_of(errors))
+
+
+def test_parameters_become_effects():
+    found = enabled_effects({
+        'effects.excess_jitter.enabled': True, 'effects.excess_jitter.std': 5e-6,
+        'effects.target_geometry.enabled': True,
+        'effects.target_geometry.pulse_angles': [0.1, 0.2],
+        'effects.clock_skew.enabled': False, 'effects.clock_skew.skew': 1e-3, 'ratio': 2.0})
+    assert found == (make_effect('excess_jitter', std=5e-6),
+                     make_effect('target_geometry', pulse_angles=(0.1, 0.2)))
+    assert all(isinstance(item, Effect) for item in found)
+
+
+@pytest.mark.parametrize(('name', 'values', 'text'), [
+    ('excess_jiter', {}, 'no effect'),
+    ('excess_jitter', {'width': 1.0}, 'no .width'),
+    ('excess_jitter', {'std': -1e-6}, 'at least 0'),
+    ('excess_jitter', {'std': float('nan')}, 'finite'),
+    ('correlated_jitter', {'correlation': 1.0}, 'at most 0.999'),
+    ('keyphasor_quantisation', {'clock_rate': 0.0}, 'more than 0'),
+    ('target_geometry', {'pulse_angles': [0.0, float('inf')]}, 'finite'),
+    ('missing_pulses', {'probability': 1.0}, 'at most 0.9'),
+    ('interpolation_loss', {'method': 'nearest'}, 'band_limited, linear, cubic, spline'),
+])
+def test_bad_parameters_are_refused(name, values, text):
+    with pytest.raises(ParameterError, match=text):
+        make_effect(name, **values)
+
+
+@pytest.mark.parametrize('effect', [make_effect('additive_noise', std=1.0),
+                                    make_effect('interpolation_loss')])
+def test_effects_of_sampling_need_the_sample_rate(effect):
+    model = DeclaredModel(**{**vars(MODEL), 'sample_rate': 0.0})
+    with pytest.raises(ModelError, match='declare sample_rate'):
+        predict_with(model, [effect])
+
+
+@pytest.mark.parametrize('rate', [2560.0, 6000.0, 13_000.0])
+def test_grid_of_a_clock_is_found_and_says_the_errors(rng, rate):
+    periods = 0.03 + 1e-6 * np.sin(np.arange(300) / 9.0) + rng.normal(0.0, 1e-6, 300)
+    true = 1.0 + np.cumsum(periods)
+    times = np.ceil(true * rate) / rate
+    clock = find_clock(times)
+    assert clock.rate == pytest.approx(rate, rel=1e-9)
+    errors = times - true
+    told = smooth_on_grid(times, rate)
+    left = (errors - told) - np.mean(errors - told)
+    assert left.std() < 0.6 * errors.std()  # a whole number of ticks a period tells least
+    assert np.all(np.abs(told) <= 0.5 / rate * (1.0 + 1e-6))
+
+
+def test_pulses_on_no_grid_show_none(rng):
+    times = np.cumsum(0.04 + rng.normal(0.0, 1e-5, 300))
+    assert find_clock(times).rate == 0.0
+    assert find_clock(times[:5]).rate == 0.0
+    holes = np.delete(times, [20, 90, 91, 250])
+    assert find_clock(holes).rate == 0.0
