@@ -7,6 +7,7 @@ from setuptools import find_packages, setup
 NAME = 'sa_jitter_ros'
 NODES = (
     'jitter_predictor',
+    'live_view',
     'machine_simulator',
     'recording_player',
     'residual_analyser',
@@ -24,7 +25,7 @@ setup(
     maintainer_email='maintainers@sa-jitter-ros.example',
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
+    package_data={NAME: ['py.typed', 'nodes/live_view_page/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
