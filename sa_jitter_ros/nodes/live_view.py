@@ -9,7 +9,6 @@ import time
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
-import numpy as np
 from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
@@ -141,13 +140,14 @@ class LiveView(MonitoringNode):
         self._board.put('shaft_speed', lambda: {'value': speeds[-1], 'history': speeds})
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        nodes = dict(self._nodes)  # the one before may be on its way to a client
         for status in message.status:
-            self._nodes.pop(status.name, None)
-            self._nodes[status.name] = {
+            nodes.pop(status.name, None)
+            nodes[status.name] = {
                 'level': int.from_bytes(status.level, 'little'), 'message': status.message,
                 'values': {item.key: item.value for item in status.values[:NODE_VALUES]},
                 'received': time.monotonic()}
-        self._nodes = nodes = dict([*self._nodes.items()][-NODES:])
+        self._nodes = nodes = dict([*nodes.items()][-NODES:])
         self._board.put('/diagnostics', lambda: nodes, data=False)
 
     # --- diagnostics ---
@@ -184,7 +184,7 @@ def with_fields(message: Float64MultiArray, kind: str, fields: tuple[str, ...]) 
     """Decode an average's table, whose last dimension is that of the fields."""
     average = checked(partial(decode_average, kind), message)
     check_width(average.values, fields)
-    return AverageMessage(average.header, np.asarray(average.values), fields)
+    return AverageMessage(average.header, average.values, fields)
 
 
 def main(args: Sequence[str] | None = None) -> int:
