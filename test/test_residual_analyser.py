@@ -11,7 +11,9 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sa_jitter_ros.closure.online import (Average, Batch, compare, declared_by, Published,
-                                          require_comparable, trace_averages)
+                                          require_comparable)
+from sa_jitter_ros.closure.online_trace import trace_averages
+from sa_jitter_ros.closure.report import report
 from sa_jitter_ros.effects import EFFECTS, make_effect, predict_with
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.nodes import messages
@@ -38,13 +40,22 @@ def published(*effects, **changes):
                      int(cycles), ratio, error)
 
 
-def synthetic(count, *, std=0.0, seed=0, noise=1e-3):
-    """Return averages with the declared jitter and normal errors of `std` s, two channels."""
+def synthetic(count, *, std=0.0, seed=0, noise=1e-3, grid=0.0, wander=0.0):
+    """
+    Return averages of two channels with the declared jitter and normal errors of `std` s.
+
+    Pulse times lie on a `grid` (Hz); the source moves by `wander` s, which the times do not show.
+    """
     rng = np.random.default_rng(seed)
     edges = np.arange(count * CYCLES + 1)
     errors = rng.uniform(-0.5, 0.5, edges.size) / CLOCK + std * rng.standard_normal(edges.size)
     # the tach shaft is not quite steady, so that its times do not tell the errors
-    times = edges / SPEED + 1e-4 * np.sin(0.3 * edges) + errors
+    true = edges / SPEED + 1e-4 * np.sin(0.3 * edges)
+    times = true + errors
+    if grid:
+        times = np.ceil(true * grid) / grid
+        errors = times - true
+    errors = errors + wander * rng.standard_normal(edges.size)
     found = []
     for first in range(0, count * CYCLES, CYCLES):
         rows = slice(first, first + CYCLES + 1)
@@ -127,6 +138,20 @@ def test_trace_names_the_effect_and_its_size():
     assert found.after.rms < 0.2 * found.before.rms
     reasons = {item.name: item.rejected_because for item in found.candidates if item.stage == 1}
     assert 'run close_loop on a recording' in reasons['speed_fluctuation']
+
+
+def test_trace_sees_the_grid_of_a_clock():
+    found = trace_averages(synthetic(20, grid=4000.0), MODEL)
+    assert found.verdict == 'traced'
+    assert [item.name for item in found.findings] == ['keyphasor_quantisation']
+    assert found.findings[0].effect.clock_rate == pytest.approx(4000.0, rel=1e-6)
+    assert found.after.rms < 0.1 * found.before.rms
+
+
+def test_trace_names_what_it_cannot_tell_apart():
+    found = trace_averages(synthetic(20, wander=3e-5), MODEL)
+    assert [item.name for item in found.findings] == ['phase_wander']
+    assert 'speed_fluctuation' in report(found)['missing_effects'][0]['indistinguishable_from']
 
 
 def test_trace_knows_what_is_declared_already():
