@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from sa_jitter_ros.angle.resampling import interpolate
+from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.observation import observe
 from sa_jitter_ros.closure.report import report, summary
 from sa_jitter_ros.closure.residual import residual
@@ -133,6 +135,36 @@ def test_clock_is_traced_pulse_by_pulse():
     clock = content['missing_effects'][0]['parameters']['clock_rate']
     assert clock['value'] == pytest.approx(2000.0, rel=1e-6)
     assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+
+
+def test_interpolation_is_traced_by_its_beat():
+    content = report(traced(*make_effects({'interpolation_loss': {'method': 'linear'}})))
+    assert content['verdict'] == 'traced'
+    assert [item['name'] for item in content['missing_effects']] == ['interpolation_loss']
+    assert content['missing_effects'][0]['parameters']['method']['value'] == 'linear'
+    assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+
+
+@pytest.mark.parametrize('method', ['linear', 'cubic', 'spline'])
+def test_beat_tells_the_gain_of_the_interpolator(rng, method):
+    frequency = np.array([0.08, 0.16, 0.24, 0.32])
+    place = (0.0873 * np.arange(240)) % 1.0
+    index = np.arange(64)
+    waves = np.exp(2j * np.pi * np.outer(index, frequency))
+    at = 31.0 + place
+    read = interpolate(np.hstack((waves.real, waves.imag)), at, method=method)
+    gain = np.real((read[:, :4] + 1j * read[:, 4:]) * np.exp(
+        -2j * np.pi * np.outer(at, frequency)))
+    mean = gain.mean(axis=0)
+    found = find_beat(gain / mean - 1.0 + rng.normal(0.0, 2e-4, gain.shape), frequency)
+    assert found.method == method
+    assert found.gain == pytest.approx(mean, abs=0.06 * (1.0 - mean.min()) + 1e-3)
+
+
+def test_modulation_of_all_lines_alike_is_no_beat(rng):
+    radial = 0.05 * np.cos(0.7 * np.arange(240))[:, None] + rng.normal(0.0, 1e-3, (240, 4))
+    assert find_beat(radial, np.array([0.08, 0.16, 0.24, 0.32])).method == ''
+    assert find_beat(radial[:8], np.array([0.08, 0.16, 0.24, 0.32])).method == ''
 
 
 def test_effect_of_no_module_stays_unexplained():

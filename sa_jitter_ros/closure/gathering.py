@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Observation, recovered_again
 from sa_jitter_ros.effects.effect import Effect, Pulses
@@ -154,6 +155,10 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     evidence = LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
         noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
+    beat = find_beat(along.reshape(-1, along.shape[2]), evidence.order
+                     * model.fundamental_frequency / observation.sample_rate)
+    evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
+                       beat_gain=beat.gain)
     return _with_tone(evidence, cycles, observation)
 
 

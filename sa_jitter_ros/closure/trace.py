@@ -111,8 +111,9 @@ class Bench:
         def of(name: str) -> Array:
             return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
 
-        return (of('attenuation'), of('attenuation_standard_error') ** 2,
-                np.abs(of('raw')) / self.level)
+        kept = self.scatter.beat_gain  # raw and corrected amplitude have both lost the rest
+        return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
+                kept * np.abs(of('raw')) / self.level)
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Residual:
         """Return the residual of the held-out acquisitions."""

@@ -27,7 +27,9 @@ class LineEvidence:
     the standard deviation per sample of white noise that makes the line's noise, in the units of
     the recording; `radial` (acquisition, cycle, line) each cycle's amplitude over `level`, less 1,
     and `radial_noise` (line,) its standard deviation by noise alone. `tone_frequency` (Hz) and
-    `tone_amplitude` are those of the line that stands out most between the synchronous ones.
+    `tone_amplitude` are those of the line that stands out most between the synchronous ones;
+    `beat_method` is the interpolator whose beat the lines show, '' for none, and
+    `beat_gain` (line,) what it has left of the amplitudes.
     """
 
     order: Array
@@ -41,6 +43,9 @@ class LineEvidence:
     tone_standard_error: float = float('nan')
     tone_frequency_error: float = float('nan')
     tone_p_value: float = 1.0
+    beat_method: str = ''
+    beat_p_value: float = 1.0
+    beat_gain: Array | float = 1.0
 
 
 @dataclass(frozen=True)
