@@ -83,7 +83,7 @@ def test_labels_may_be_left_empty_and_name_their_fields():
 def test_float32_index_must_be_a_whole_number(header):
     message = messages.encode_samples_float32(SampleBlock(np.ones((1, 2)), 0.0, 1.0, 0))
     message.data[0], message.data[1] = header
-    with pytest.raises(MessageError, match='index of the first sample'):
+    with pytest.raises(MessageError, match='sample index'):
         SampleDecoder(FLOAT32, sample_rate=1.0).decode(message)
 
 
@@ -161,7 +161,7 @@ def test_pulse_arrays_travel_unchanged(times):
     np.testing.assert_array_equal(messages.decode_pulse_array(bare), times)
 
 
-RESULTS = arrays(np.float64, (2, 3, 4), elements=st.floats(allow_infinity=False))
+RESULTS = arrays(np.float64, (2, 3, 8), elements=st.floats(allow_infinity=False))
 HEADER = st.builds(AverageHeader, FINITE, FINITE, st.integers(0, 2**53), st.integers(1, 10**6),
                    st.integers(0, 10**6), FINITE)
 
@@ -169,11 +169,11 @@ HEADER = st.builds(AverageHeader, FINITE, FINITE, st.integers(0, 2**53), st.inte
 @given(RESULTS, HEADER)
 def test_order_amplitudes_travel_unchanged(values, header):
     message = messages.encode_average(
-        'order_amplitude', AverageMessage(header, values, ('a', 'b', 'c', 'd')))
-    assert [dim.label for dim in message.layout.dim] == ['channel', 'order', 'field:a,b,c,d']
+        'order_amplitude', AverageMessage(header, values, tuple('abcdefgh')))
+    assert [dim.label for dim in message.layout.dim] == ['channel', 'order', 'field:a,b,c,d,e,f,g,h']
     assert message.layout.data_offset == 6
     got = messages.decode_average('order_amplitude', message)
-    assert (got.header, got.names) == (header, ('a', 'b', 'c', 'd'))
+    assert (got.header, got.names) == (header, tuple('abcdefgh'))
     np.testing.assert_array_equal(got.values, values)
 
 
@@ -207,3 +207,20 @@ def test_types_are_known_as_users_write_them():
     assert messages.SAMPLE_TYPES[known] is Float32MultiArray
     with pytest.raises(ParameterError, match="tach_type is 'Pulse': give one of sensor_msgs/Tim"):
         messages.known_type('tach_type', 'Pulse', messages.PULSE_TYPES)
+
+
+@pytest.mark.parametrize(('position', 'value'), [(2, np.nan), (3, np.inf), (4, -1.0), (2, 0.5)])
+def test_result_with_an_impossible_count_is_refused(position, value):
+    header = [0.0, 1.0, 3.0, 40.0, 40.0, 25.0]
+    header[position] = value
+    message = messages.encode_array(np.zeros((1, 4)), ('channel', 'angle'), tuple(header))
+    with pytest.raises(MessageError, match='in the header is'):
+        messages.decode_average('synchronous_average', message)
+
+
+@pytest.mark.parametrize(('decode', 'header'), [
+    (messages.decode_prediction, 6), (messages.decode_residual, 4)])
+def test_result_with_other_fields_is_refused(decode, header):
+    message = messages.encode_array(np.zeros((2, 3)), ('order', 'field'), (1.0,) * header)
+    with pytest.raises(MessageError, match='3 fields received'):
+        decode(message)

@@ -8,6 +8,7 @@ predictor, and compares what comes out with what was predicted.
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+import signal
 import subprocess
 import sys
 import time
@@ -139,6 +140,7 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
     context = rclpy.Context()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes as Ctrl-C does
     try:
         plan = SIMULATED
         if options.recording:

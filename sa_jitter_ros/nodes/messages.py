@@ -154,6 +154,12 @@ def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[s
     return data[:header_size].astype(np.float64), data[header_size:].reshape(shape), names
 
 
+def _whole(name: str, value: float) -> int:
+    if not (math.isfinite(value) and 0.0 <= value <= 2.0**53 and value == math.floor(value)):
+        raise MessageError(f'{name} in the header is {value}: send a whole number >= 0')
+    return int(value)
+
+
 # --- samples -------------------------------------------------------------------------------------
 
 def _block_samples(message: Float64MultiArray | Float32MultiArray,
@@ -173,12 +179,6 @@ def _block_samples(message: Float64MultiArray | Float32MultiArray,
         raise MessageError(f'empty block of {values.shape[0]} channels x {values.shape[1]} '
                            'samples: send at least one sample of one channel')
     return header, np.asarray(values, dtype=np.float64)
-
-
-def _checked_index(value: float) -> int:
-    if not (math.isfinite(value) and 0 <= value < 2.0**53 and value == math.floor(value)):
-        raise MessageError(f'index of the first sample is {value}: send a whole number >= 0')
-    return int(value)
 
 
 class SampleDecoder:
@@ -227,14 +227,14 @@ class SampleDecoder:
         if not (math.isfinite(time) and math.isfinite(rate) and rate > 0.0):
             raise MessageError(f'header time {time} s, rate {rate} Hz: send a finite time and a '
                                'positive rate')
-        return SampleBlock(samples, time, rate, _checked_index(float(header[2])))
+        return SampleBlock(samples, time, rate, _whole('sample index', float(header[2])))
 
     def _float32(self, message: Float32MultiArray) -> SampleBlock:
         if message.layout.data_offset == 0:
             return self._count(_block_samples(message, 0)[1])
         header, samples = _block_samples(message, 2)
-        index = (_checked_index(float(header[0])) * INDEX_BASE
-                 + _checked_index(float(header[1])))
+        index = (_whole('sample index', float(header[0])) * INDEX_BASE
+                 + _whole('sample index', float(header[1])))
         rate = self._known_rate()
         return SampleBlock(samples, self._start_time + index / rate, rate, index)
 
@@ -327,12 +327,25 @@ def encode_average(kind: str, average: AverageMessage) -> Float64MultiArray:
     return encode_array(average.values, labels, astuple(average.header))
 
 
+_AVERAGE_FIELDS = {'order_amplitude': AMPLITUDE_FIELDS, 'pulse_error': PULSE_ERROR_FIELDS}
+
+
+def _with_fields(values: FloatArray, fields: tuple[str, ...]) -> FloatArray:
+    if values.shape[-1] != len(fields):
+        raise MessageError(f'{values.shape[-1]} fields received, {len(fields)} expected: '
+                           f'{", ".join(fields)}')
+    return values
+
+
 def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
     """Decode an average's array; `kind` is the topic's name."""
     header, values, names = decode_array(message, _AVERAGE_LABELS[kind], 6)
+    if kind in _AVERAGE_FIELDS:
+        values = _with_fields(values, _AVERAGE_FIELDS[kind])
     start, end, sequence, cycles, fundamental, speed = (float(item) for item in header)
     return AverageMessage(
-        AverageHeader(start, end, int(sequence), int(cycles), int(fundamental), speed),
+        AverageHeader(start, end, _whole('sequence', sequence), _whole('trigger cycles', cycles),
+                      _whole('fundamental cycles', fundamental), speed),
         values, names)
 
 
@@ -346,7 +359,8 @@ def decode_prediction(message: Float64MultiArray) -> PredictionMessage:
     """Decode a prediction."""
     header, values, _ = decode_array(message, ('order', 'field'), 6)
     speed, rate, cycles, ratio, pulse_error, noise = (float(item) for item in header)
-    return PredictionMessage(values, speed, rate, int(cycles), ratio, pulse_error, noise)
+    return PredictionMessage(_with_fields(values, PREDICTION_FIELDS), speed, rate,
+                             _whole('trigger cycles', cycles), ratio, pulse_error, noise)
 
 
 def encode_residual(residual: ResidualMessage) -> Float64MultiArray:
@@ -359,4 +373,5 @@ def decode_residual(message: Float64MultiArray) -> ResidualMessage:
     """Decode a residual."""
     header, values, _ = decode_array(message, ('order', 'field'), 4)
     count, chi2, p_value, rms = (float(item) for item in header)
-    return ResidualMessage(values, int(count), chi2, p_value, rms)
+    return ResidualMessage(_with_fields(values, RESIDUAL_FIELDS), _whole('acquisitions', count),
+                           chi2, p_value, rms)
