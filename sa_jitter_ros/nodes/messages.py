@@ -156,7 +156,7 @@ def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[s
 
 def _whole(name: str, value: float) -> int:
     if not (math.isfinite(value) and 0.0 <= value <= 2.0**53 and value == math.floor(value)):
-        raise MessageError(f'{name} in the header is {value}: send a whole number >= 0')
+        raise MessageError(f'{name} is {value}: send a whole number >= 0')
     return int(value)
 
 
@@ -227,14 +227,15 @@ class SampleDecoder:
         if not (math.isfinite(time) and math.isfinite(rate) and rate > 0.0):
             raise MessageError(f'header time {time} s, rate {rate} Hz: send a finite time and a '
                                'positive rate')
-        return SampleBlock(samples, time, rate, _whole('sample index', float(header[2])))
+        index = _whole('index of the first sample', float(header[2]))
+        return SampleBlock(samples, time, rate, index)
 
     def _float32(self, message: Float32MultiArray) -> SampleBlock:
         if message.layout.data_offset == 0:
             return self._count(_block_samples(message, 0)[1])
         header, samples = _block_samples(message, 2)
-        index = (_whole('sample index', float(header[0])) * INDEX_BASE
-                 + _whole('sample index', float(header[1])))
+        high, low = (_whole('index of the first sample', float(item)) for item in header)
+        index = high * INDEX_BASE + low
         rate = self._known_rate()
         return SampleBlock(samples, self._start_time + index / rate, rate, index)
 
