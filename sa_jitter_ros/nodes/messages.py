@@ -101,8 +101,6 @@ def known_type(parameter: str, name: str, types: dict[str, type]) -> str:
     return key
 
 
-# --- arrays --------------------------------------------------------------------------------------
-
 def _build(message: ArrayMessage, typecode: str, values: NDArray[np.floating[Any]],
            labels: tuple[str, ...], header: tuple[float, ...]) -> ArrayMessage:
     """Fill a message with an array whose dimensions are named `labels`, behind its header."""
@@ -159,8 +157,6 @@ def _whole(name: str, value: float) -> int:
         raise MessageError(f'{name} is {value}: send a whole number >= 0')
     return int(value)
 
-
-# --- samples -------------------------------------------------------------------------------------
 
 def _block_samples(message: Float64MultiArray | Float32MultiArray,
                    header_size: int) -> tuple[FloatArray, FloatArray]:
@@ -273,8 +269,6 @@ def encode_samples_float32(block: SampleBlock) -> Float32MultiArray:
                   (float(high), float(low)))
 
 
-# --- pulses --------------------------------------------------------------------------------------
-
 def decode_time(seconds: int, nanoseconds: int) -> float:
     """Seconds of a ROS time; negative `seconds` are legal."""
     return seconds + 1e-9 * nanoseconds
@@ -307,8 +301,6 @@ def encode_pulse_array(times: FloatArray) -> Float64MultiArray:
     """Encode pulse times (n,) in s."""
     return encode_array(np.asarray(times, dtype=np.float64), ('pulse',))
 
-
-# --- results -------------------------------------------------------------------------------------
 
 _AVERAGE_LABELS = {
     'synchronous_average': ('channel', 'angle'),
