@@ -29,7 +29,7 @@ Array = NDArray[Any]
 Progress = Callable[[str], None]
 
 #: A residual with a smaller p value is no chance.
-SIGNIFICANT = 0.01
+SIGNIFICANT = 0.02
 _EVIDENCE = 1e-3
 _DECISIVE, _MATERIAL = 1e-6, 0.01
 _MOST_EFFECTS = 4

@@ -23,6 +23,7 @@ Correlation = Callable[[Array, float], Array]
 
 _MOST_PULSES = 200
 _GOOD = 1e-3
+_DRAWS = 4000
 
 
 def white(lags: Array, _: float) -> Array:
@@ -149,7 +150,7 @@ def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
     p_line = float(min(1.0, spectrum.size * stats.gamma.sf(peak * rows, rows)))
     if p_line < _GOOD:
         return f'the errors hold a line spectrum that it does not have: p = {p_line:.2g}'
-    p_law = min(_law_p_value(evidence, fit), _moments_p_value(evidence, fit))
+    p_law = min(_law_p_value(evidence, fit), _moments_p_value(evidence))
     if p_law < _GOOD:
         return f'the law of the errors is not the one it has: p = {p_law:.2g}'
     power = np.mean(white_left**2, axis=1)
@@ -185,21 +186,24 @@ def _law_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
     return float(stats.kstwobign.sf(distance * np.sqrt(errors.size / memory)))
 
 
-def _moments_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
-    """Compare skewness and kurtosis of the errors with those of declared plus normal jitter."""
-    errors = evidence.errors[:, 1:-1]
+def _moments_p_value(evidence: Evidence) -> float:
+    """Compare skewness and kurtosis of the errors with drawn ones, declared plus normal jitter."""
+    errors = evidence.errors[:, 1:-1]  # those at the ends are rough
     jitter = evidence.model.distribution
-    count = errors.size / max(1.0, _effective_repeats(errors))
-    draws = jitter.draw(np.random.default_rng(1), 100_000)
-    share = np.clip(jitter.variance / float(np.mean(errors**2)), 0.0, 1.0)
-    if np.any([effect.replaces_jitter(evidence.model) for effect in evidence.explained]):
-        share = 0.0
-    skew = stats.skew(draws) * share**1.5
-    excess = stats.kurtosis(draws) * share**2
-    values = errors.ravel()
-    z = ((stats.skew(values) - skew) / np.sqrt(6.0 / count),
-         (stats.kurtosis(values) - excess) / np.sqrt(24.0 / count))
-    return float(min(1.0, 2.0 * 2.0 * stats.norm.sf(np.max(np.abs(z)))))
+    size = int(errors.size / _effective_repeats(errors))
+    power = float(np.mean(errors**2))
+    known = 0.0 if any(effect.replaces_jitter(evidence.model) for effect in evidence.explained
+                       ) else min(jitter.variance, power)
+    rng = np.random.default_rng(1)
+    draws = rng.normal(0.0, np.sqrt(power - known), (_DRAWS, size))
+    if known:
+        draws += jitter.draw(rng, (_DRAWS, size))
+    p_values = []
+    for moment in (stats.skew, stats.kurtosis):
+        drawn, seen = moment(draws, axis=1), moment(errors.ravel())
+        tail = min(np.count_nonzero(drawn >= seen), np.count_nonzero(drawn <= seen))
+        p_values.append(2.0 * (tail + 1.0) / (_DRAWS + 1.0))
+    return float(min(1.0, *p_values))
 
 
 def _effective_repeats(errors: Array) -> float:
