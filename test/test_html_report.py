@@ -113,6 +113,13 @@ def test_nothing_runs_over_the_edge_of_a_picture(files, verdict):
             assert (picture[:, [0, -1]] == 1.0).all(), name
 
 
+def test_many_effects_leave_room_in_the_panels(traces):
+    (effect,) = traces['traced'].findings
+    axes = panel(replace(traces['traced'], findings=(effect, effect, effect)), 'pulse_errors',
+                 'autocorrelation')
+    assert 'with 3 effects' in axes.get_legend_handles_labels()[1]
+
+
 @pytest.mark.parametrize('verdict', ['none', 'traced', 'geometry', 'grid', 'unexplained'])
 def test_panels_are_labelled(traces, verdict):
     figures = illustrate(traces[verdict])

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
+from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, predict_with
@@ -102,8 +102,8 @@ def _versions(evidence: Evidence, effects: Sequence[Effect]) -> list[_Version]:
     """Return what declared model and, if there are any, added effects expect."""
     found = [_version('declared model', BEFORE, evidence, ())]
     if effects:
-        names = ', '.join(effect.name for effect in effects)
-        found.append(_version(f'with {names}', AFTER, evidence, tuple(effects)))
+        label = with_effects([effect.name for effect in effects])
+        found.append(_version(label, AFTER, evidence, tuple(effects)))
     return found
 
 

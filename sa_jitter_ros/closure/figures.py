@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.closure import evidence_figures
 from sa_jitter_ros.closure.expectation import Expectation
-from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
+from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
 from sa_jitter_ros.closure.residual import Residual
 from sa_jitter_ros.closure.trace import Trace
 from sa_jitter_ros.effects.effect import Effect
@@ -89,8 +89,8 @@ def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:
     before = ('declared model', BEFORE, trace.prediction_before, trace.before)
     if not trace.findings:
         return [before]
-    names = ', '.join(item.name for item in trace.findings)
-    return [before, (f'with {names}', AFTER, trace.prediction_after, trace.after)]
+    label = with_effects([item.name for item in trace.findings])
+    return [before, (label, AFTER, trace.prediction_after, trace.after)]
 
 
 def _positions(trace: Trace) -> tuple[Array, Array]:
@@ -166,7 +166,7 @@ def _probability_panel(trace: Trace, axes: Axes) -> None:
             trace.amplitude.shape)[list(trace.held_out)].ravel()
         _observed_share(axes, probability, color=colour, label=f'{label}: KS {left.ks:.3f}')
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='right')
-    axes.set(title='all lines', xlabel='predicted probability of a smaller amplitude',
+    axes.set(title='all lines', xlabel='predicted probability',
              ylabel='share below')
     axes.legend(fontsize='x-small')
 

@@ -94,7 +94,7 @@ def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
         yield _table(('parameter', 'value', 'standard error', 'unit'), [
             (name, _number(value['value']), _number(value['standard_error']), _unit(value))
             for name, value in item['parameters'].items()])
-        text = f'Evidence: {item["evidence"]} (p = {_number(item["p_value"])}).'
+        text = f'Evidence: {item["evidence"]}.'
         if item['indistinguishable_from']:
             text += (' These data cannot tell it from '
                      f'{", ".join(item["indistinguishable_from"])}.')

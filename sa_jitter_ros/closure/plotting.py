@@ -1,9 +1,16 @@
 """Colours and panels that the figures of a report share."""
 
+from collections.abc import Sequence
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
+
+
+def with_effects(names: Sequence[str]) -> str:
+    """Return the label of a prediction with these effects, short enough for a panel."""
+    return f'with {names[0]}' if len(names) == 1 else f'with {len(names)} effects'
 
 
 def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
