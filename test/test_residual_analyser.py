@@ -326,10 +326,39 @@ def test_averages_without_correction_are_refused(bench):
 
 def test_bad_messages_are_counted(bench):
     b = bench()
-    b.send('shaft/order_amplitude', Float64MultiArray())
-    b.prediction.publish(Float64MultiArray(data=[1.0]))
-    b.spin(timeout=0.2)
-    assert b.status()['messages_rejected'] == 2
+    (good,) = synthetic(1)
+    header = messages.AverageHeader(0.0, 1.0, 0, CYCLES, 60, SPEED)
+
+    def encoded(kind, shape, **changes):
+        return messages.encode_average(kind, messages.AverageMessage(
+            replace(header, **changes), np.ones(shape)))
+
+    for message in (Float64MultiArray(), encoded('order_amplitude', (0, 2, 8)),
+                    encoded('order_amplitude', (2, 2, 7)),
+                    encoded('order_amplitude', (2, 2, 8), end_time=float('nan'))):
+        b.send('shaft/order_amplitude', message)
+    for message in (encoded('pulse_error', (CYCLES, 3)), encoded('pulse_error', (CYCLES + 1, 2)),
+                    messages.encode_average('pulse_error', messages.AverageMessage(
+                        header, np.full(good.pulses.shape, np.nan)))):
+        b.send('shaft/pulse_error', message)
+    b.settle()
+    table = prediction_message(predict_with(MODEL))
+    for message in (Float64MultiArray(data=[1.0]),
+                    messages.encode_prediction(replace(table, values=table.values[:, :6])),
+                    messages.encode_prediction(replace(table, trigger_speed=float('nan')))):
+        b.prediction.publish(message)
+        b.spin(timeout=0.1)
+    assert b.status()['messages_rejected'] == 10
+    assert b.diagnostics()[2]['averages'] == '0'
+
+
+def test_name_of_another_node_is_not_taken_for_the_predictor(bench):
+    b = bench(predictor='bench')  # the bench has parameter services, but not the parameters
+    b.predict()
+    b.average(synthetic(8, std=5e-5))
+    assert b.spin(lambda: b.told('bench does not answer: its prediction is taken'))
+    assert b.spin(b.reports, timeout=20.0)
+    assert b.reports()[0]['declared']['keyphasor_rate'] == CLOCK
 
 
 def test_effects_reach_the_predictor_and_refusal_is_told(bench, ros_context):

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
@@ -18,7 +19,7 @@ from sa_jitter_ros.closure.online_trace import trace_averages
 from sa_jitter_ros.closure.report import report
 from sa_jitter_ros.closure.trace import SIGNIFICANT, Trace
 from sa_jitter_ros.effects import Effect, enabled_effects
-from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.nodes import jitter_predictor
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
@@ -37,7 +38,8 @@ PARAMETERS = (
 )
 _PREDICTOR = (*jitter_predictor.PARAMETERS, *jitter_predictor.effect_parameters())
 _TICK = 0.1  # s between looks at what has come
-_PATIENCE = 3.0  # s to wait for an answer of the predictor
+_PATIENCE = 3.0  # s to look for the predictor
+_ANSWER = 15.0  # s to wait for its answer: it predicts anew first
 
 
 class ResidualAnalyser(MonitoringNode):
@@ -57,7 +59,7 @@ class ResidualAnalyser(MonitoringNode):
         self._significant = self._waited = False
         self._step: Callable[[], None] = self._judge
         self._added: set[str] = set()
-        self._verdict = ''
+        self._verdict = self._doing = ''
         self._batches = self._uncorrected = 0
         self._predictor_name = self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
@@ -89,6 +91,10 @@ class ResidualAnalyser(MonitoringNode):
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)
+        count, cycles = len(received.values), received.header.trigger_cycles
+        if count != cycles + 1 or not np.isfinite(received.values).all():
+            raise MessageError(f'{count} pulses of {cycles} trigger cycles: send one more than '
+                               'there are cycles, of finite numbers')
         self._pulses[received.header.start_time] = received.values
         while len(self._pulses) > 2 * self._batch.size + 10:
             del self._pulses[next(iter(self._pulses))]
@@ -96,6 +102,10 @@ class ResidualAnalyser(MonitoringNode):
     def _on_prediction(self, message: Float64MultiArray) -> None:
         received = decode_prediction(message)
         table = received.values
+        if not (np.isfinite(table[:, :4]).all() and received.trigger_speed > 0.0
+                and received.keyphasor_rate > 0.0 and received.trigger_cycles > 0):
+            raise MessageError(f'prediction at {received.trigger_speed} Hz: send finite numbers, '
+                               'a positive speed and a positive keyphasor rate')
         self._prediction = Published(
             table[:, 0], table[:, 1], table[:, 3], received.trigger_speed,
             received.keyphasor_rate, received.trigger_cycles, received.ratio,
@@ -105,6 +115,7 @@ class ResidualAnalyser(MonitoringNode):
 
     def _judge(self) -> None:
         """Compare a full batch with the prediction, then ask the predictor what it declares."""
+        self._doing = ''
         if not self._batch.full or self._prediction is None:
             return
         averages = [replace(item, pulses=self._pulses.get(item.start_time))
@@ -134,6 +145,10 @@ class ResidualAnalyser(MonitoringNode):
             self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
 
         def answered(response: Any) -> None:
+            types = {value.type for value in response.values}
+            if len(response.values) < len(_PREDICTOR) or ParameterType.PARAMETER_NOT_SET in types:
+                without()  # it is the name of another node
+                return
             model, effects = self._declared(response)
             self._trace(lambda: trace_averages(averages, model, declared=effects))
         self._request(lambda: self._predictor.get_parameters([item.name for item in _PREDICTOR]),
@@ -141,11 +156,10 @@ class ResidualAnalyser(MonitoringNode):
 
     def _declared(self, response: Any) -> tuple[DeclaredModel, tuple[Effect, ...]]:
         """Return the predictor's model and its effects, less those that were set here."""
-        values: Values = {item.name: item.default for item in _PREDICTOR}
+        values: Values = {}
         for item, value in zip(_PREDICTOR, response.values):
             known = parameter_value_to_python(value)
-            if known is not None:
-                values[item.name] = list(known) if item.is_list else known
+            values[item.name] = list(known) if item.is_list else known
         self._added = {name for name in self._added if values[f'effects.{name}.enabled']}
         values.update({f'effects.{name}.enabled': False for name in self._added})
         return jitter_predictor.declared_model(values), enabled_effects(values)
@@ -156,6 +170,7 @@ class ResidualAnalyser(MonitoringNode):
 
         def look() -> None:
             if job.thread.is_alive():
+                self._doing = 'tracing'
                 return
             self._step = self._judge
             if job.result is not None:
@@ -186,6 +201,7 @@ class ResidualAnalyser(MonitoringNode):
         judged = self._prediction
 
         def wait() -> None:
+            self._doing = 'waiting for the prediction that holds the effects'
             if self._prediction is not judged:
                 self._step = self._judge
 
@@ -210,9 +226,9 @@ class ResidualAnalyser(MonitoringNode):
         future: Future | None = None
 
         def look() -> None:
-            nonlocal future
+            nonlocal future, end
             if future is None and self._predictor.services_are_ready():
-                future = call()
+                future, end = call(), time.monotonic() + _ANSWER
             elif future is not None and future.done():
                 try:
                     answered(future.result())
@@ -239,7 +255,8 @@ class ResidualAnalyser(MonitoringNode):
                       self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
-        return f'{count} of {size} averages; {self._verdict or "nothing judged yet"}', values
+        doing = self._doing or self._verdict or 'nothing judged yet'
+        return f'{count} of {size} averages; {doing}', values
 
 
 class _Job:
@@ -262,8 +279,12 @@ class _Job:
 
 
 def average_of(message: AverageMessage) -> Average:
-    """Return the average that a message of order amplitudes tells."""
+    """Return the average that a message of order amplitudes tells; raises MessageError."""
     header, table = message.header, message.values
+    if len(table) == 0 or not (
+            header.end_time > header.start_time and header.trigger_cycles > 0):
+        raise MessageError(f'{len(table)} channels from {header.start_time} to {header.end_time} '
+                           's: send at least one of an average of some trigger cycles')
     raw, corrected = (table[..., k] * np.exp(1j * table[..., k + 1]) for k in (1, 3))
     return Average(header.start_time, header.end_time, header.trigger_cycles,
                    header.fundamental_cycles, header.mean_trigger_speed, table[0, :, 0], raw,
