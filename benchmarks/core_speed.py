@@ -1,0 +1,140 @@
+"""
+Speed and accuracy of the core beside what people use now, and how its cost grows.
+
+`python benchmarks/core_speed.py` writes its figures as JSON to the standard output.
+`performance.py` starts it in an environment of its own that holds the other packages.
+"""
+
+import argparse
+from collections import deque
+from functools import partial
+import json
+import os
+import sys
+import tracemalloc
+from typing import Any
+
+import numpy as np
+from peers import METHODS, Package, PACKAGES, stream
+from record import gains, make_record, Record
+from timing import interleaved, machine, memory_bandwidth, multiply_adds, Timing
+
+TAPS = 16  # of the band-limited kernel: multiply-adds in a resampled value
+
+
+def compare(channels: int, seconds: float, ratio: float, *, rounds: int, packages: bool
+            ) -> dict[str, Any]:
+    """Time all methods in turns on one record; values are seconds of CPU and gains in dB."""
+    record = make_record(channels=channels, seconds=seconds, ratio=ratio)
+    methods, records = dict(METHODS), dict.fromkeys(METHODS, record)
+    skipped = {}
+    for name, package in PACKAGES.items() if packages else ():
+        try:
+            methods[name] = package.make()
+        except Exception as error:  # whatever keeps a package from working here
+            skipped[name] = ' '.join(f'{type(error).__name__}: {error}'.split())
+            continue
+        records[name] = package.record(channels, seconds, ratio)
+    decibels = {}
+    for name, method in list(methods.items()):
+        try:
+            decibels[name] = gains(records[name], method(records[name])).tolist()
+        except Exception as error:
+            if name in METHODS:
+                raise
+            skipped[name] = ' '.join(f'{type(error).__name__}: {error}'.split())
+            del methods[name]
+    timings = interleaved({name: partial(method, records[name])
+                           for name, method in methods.items()}, rounds=rounds)
+    return {
+        'channels': channels, 'seconds': seconds, 'ratio': ratio, 'skipped': skipped,
+        'bands': [order * ratio * 40.0 / record.rate for order in record.orders],
+        'rows': {name: _row(records[name], timing, seconds, decibels[name],
+                            PACKAGES.get(name))
+                 for name, timing in timings.items()}}
+
+
+def _row(record: Record, timing: Timing, seconds: float, decibels: list[float],
+         package: Package | None) -> dict[str, Any]:
+    """Return what a table shows; times of a shorter record are scaled."""
+    scale = seconds * record.rate / record.samples.shape[1]
+    return {'best': timing.best * scale, 'median': timing.median * scale, 'runs': timing.runs,
+            'nanoseconds': 1e9 * timing.best / record.samples.size,
+            'gains': None if package and package.whole_period else decibels,
+            'note': package.note if package else ''}
+
+
+def _exhaust(record: Record, **options: Any) -> None:
+    deque(stream(record, **options), maxlen=0)
+
+
+def growth(scale: float, rounds: int) -> dict[str, dict[str, float]]:
+    """Nanoseconds per vibration sample and channel on line, as one setting after another grows."""
+    def nanoseconds(records: dict[str, Record], **options: dict[str, Any]) -> dict[str, float]:
+        timings = interleaved({
+            name: partial(_exhaust, record, **{'trigger_cycles': 40, **options.get(name, {})})
+            for name, record in records.items()}, rounds=rounds)
+        return {name: 1e9 * timing.best / records[name].samples.size
+                for name, timing in timings.items()}
+
+    usual = make_record(seconds=10.0 * scale)
+    cycles = [str(count) for count in (2, 5, 10, 20, 40, 80, 160, 320)
+              if count < len(usual.pulses) - 1]
+    return {
+        'channels': nanoseconds({str(count): make_record(channels=count, seconds=5.0 * scale)
+                                 for count in (1, 2, 4, 8, 16, 32, 64)}),
+        'trigger cycles in an average': nanoseconds(
+            dict.fromkeys(cycles, usual), **{n: {'trigger_cycles': int(n)} for n in cycles}),
+        'ratio': nanoseconds({str(ratio): make_record(seconds=5.0 * scale, ratio=ratio)
+                              for ratio in (0.41, 1.0, 2.40789, 7.3)}),
+        'record length in s': nanoseconds({
+            f'{seconds:g}': make_record(seconds=seconds)
+            for seconds in np.array([5.0, 10.0, 20.0, 40.0]) * scale}),
+        'averaging': nanoseconds(
+            dict.fromkeys(('block', 'sliding', 'exponential'), usual),
+            **{name: {'averaging': name} for name in ('block', 'sliding', 'exponential')})}
+
+
+def memory(scale: float) -> dict[str, float]:
+    """Megabytes that the averager allocates at most, by the length of the record in s."""
+    peaks = {}
+    for seconds in np.array([5.0, 10.0, 20.0, 40.0]) * scale:
+        record = make_record(seconds=seconds)
+        tracemalloc.start()
+        _exhaust(record, trigger_cycles=20)
+        peaks[f'{seconds:g}'] = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+    return peaks
+
+
+def limits() -> dict[str, float]:
+    """Nanoseconds per sample and channel that this machine needs at the very least."""
+    bandwidth, products = memory_bandwidth(), multiply_adds()
+    return {'bandwidth': bandwidth, 'multiply_adds': products,
+            'memory': 8e9 / bandwidth, 'arithmetic': 1e9 * TAPS / products}
+
+
+def main() -> int:
+    """Measure and print JSON; progress goes to the standard error."""
+    parser = argparse.ArgumentParser(description='Measure the core beside its peers.')
+    parser.add_argument('--scale', type=float, default=1.0, help='of all record lengths')
+    parser.add_argument('--rounds', type=int, default=7, help='turns of every method')
+    options = parser.parse_args()
+    if os.environ.get('OMP_NUM_THREADS') != '1':
+        parser.error('set OMP_NUM_THREADS=1: CPU time is compared, threads that wait would count')
+    seconds, rounds = 10.0 * options.scale, options.rounds
+    found: dict[str, Any] = {'machine': machine(), 'limits': limits(), 'comparisons': []}
+    for channels, ratio in ((8, 1.0), (8, 2.40789), (64, 1.0)):
+        print(f'core: {channels} channels, ratio {ratio:g}', file=sys.stderr, flush=True)
+        found['comparisons'].append(compare(channels, seconds, ratio, packages=channels == 8,
+                                            rounds=rounds if channels == 8 else min(rounds, 3)))
+    print('core: growth', file=sys.stderr, flush=True)
+    found['growth'] = growth(options.scale, rounds)
+    found['memory'] = memory(options.scale)
+    found['load'] = f'{os.getloadavg()[0]:.1f}'
+    print(json.dumps(found))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

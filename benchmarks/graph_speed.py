@@ -1,0 +1,242 @@
+"""
+The averager over DDS, in a process of its own on one core: CPU share, latency, saturation.
+
+A source process publishes vibration at 93.75 kHz in real time, 40 pulses a second, on another
+core; this process receives the averages. `python benchmarks/graph_speed.py` writes its figures as
+JSON to the standard output. Clocks: CLOCK_MONOTONIC is one for all processes of a host.
+"""
+
+import argparse
+from functools import partial
+import json
+import os
+from pathlib import Path
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.nodes.base import INPUT_QOS, RESULT_QOS
+from sa_jitter_ros.nodes.messages import encode_pulse_reference, encode_samples
+from sensor_msgs.msg import TimeReference
+from std_msgs.msg import Float64MultiArray
+
+RATE = 93750.0  # Hz
+SPEED = 40.0  # Hz
+PATTERN = 9375  # samples, four revolutions: the vibration repeats
+ORDERS = (211.0, 401.0, 701.0)
+TRIGGER_CYCLES = 10
+MESSAGE_BYTES = 296_000  # at most
+MARGIN = 10  # samples behind a cycle that its interpolation reads
+KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'averages_dropped', 'gaps')
+NODE = ('from sa_jitter_ros.nodes.synchronous_averager import main; raise SystemExit(main())')
+
+
+def block_samples(channels: int, seconds: float) -> int:
+    """Return how many samples of a channel go into a message."""
+    return min(round(seconds * RATE), MESSAGE_BYTES // (8 * channels))
+
+
+# --- the source ----------------------------------------------------------------------------------
+
+def publish(channels: int, seconds: float, length: int) -> None:
+    """Publish in real time; print when sample 0 was due and how late messages were, as JSON."""
+    context = rclpy.Context()
+    context.init(args=[])
+    node = rclpy.create_node('source', context=context)
+    vibration = node.create_publisher(Float64MultiArray, 'vibration', INPUT_QOS)
+    tach = node.create_publisher(TimeReference, 'tach_pulse', INPUT_QOS)
+    while not (vibration.get_subscription_count() and tach.get_subscription_count()):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    angle = 2.0 * np.pi * SPEED / RATE * np.arange(PATTERN)
+    wave = sum(np.cos(order * angle + np.arange(channels)[:, None]) for order in ORDERS)
+    wave = np.concatenate([wave, wave], axis=1)
+    late, sent = [], 0
+    start = time.monotonic()
+    for first in range(0, round(seconds * RATE), length):
+        samples = np.concatenate(  # a block may be longer than the pattern
+            [wave[:, at % PATTERN:at % PATTERN + min(PATTERN, first + length - at)]
+             for at in range(first, first + length, PATTERN)], axis=1)
+        block = SampleBlock(samples, first / RATE, RATE, first)
+        due = start + (first + length) / RATE
+        time.sleep(max(due - time.monotonic(), 0.0))
+        vibration.publish(encode_samples(block))
+        while sent / SPEED < (first + length) / RATE:
+            tach.publish(encode_pulse_reference(sent / SPEED, 'keyphasor'))
+            sent += 1
+        late.append(time.monotonic() - due)
+    cpu = sum(os.times()[:2])
+    print(json.dumps({'start': start, 'late': float(np.percentile(late, 99)), 'latest': max(late),
+                      'cpu': cpu}), flush=True)
+    time.sleep(3.0)  # reliable messages may be asked for again
+    context.try_shutdown()
+
+
+# --- one measurement -----------------------------------------------------------------------------
+
+def free_domain() -> int:
+    """Return a ROS domain whose discovery port is free on this host."""
+    for domain in random.sample(range(1, 100), 99):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind(('', 7410 + 250 * domain))
+            except OSError:
+                continue
+            return domain
+    raise RuntimeError('no free ROS domain on this host')
+
+
+def usage(process: int) -> tuple[float, float]:
+    """CPU seconds of a process, and the most megabytes that it held."""
+    fields = Path(f'/proc/{process}/stat').read_text().rsplit(')', 1)[1].split()
+    ticks = os.sysconf('SC_CLK_TCK')
+    status = Path(f'/proc/{process}/status').read_text()
+    peak = next(line for line in status.splitlines() if line.startswith('VmHWM'))
+    return (int(fields[11]) + int(fields[12])) / ticks, int(peak.split()[1]) / 1e3
+
+
+class Sink:
+    """Takes averages and diagnostics, with their times of arrival."""
+
+    def __init__(self, context: rclpy.Context) -> None:
+        self.node = rclpy.create_node('sink', context=context)
+        self.ends: list[float] = []
+        self.arrivals: list[float] = []
+        self.status: list[tuple[float, int, str, dict[str, str]]] = []
+        self.node.create_subscription(Float64MultiArray, 'shaft/synchronous_average',
+                                      self._on_average, RESULT_QOS)
+        self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+
+    def _on_average(self, message: Float64MultiArray) -> None:
+        self.arrivals.append(time.monotonic())
+        self.ends.append(message.data[1])
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith('synchronous_averager'):
+                self.status.append((
+                    time.monotonic(), int.from_bytes(status.level, 'little'), status.message,
+                    {item.key: item.value for item in status.values}))
+
+
+def measure(channels: int, seconds: float, *, block_seconds: float = 0.05, settle: float = 2.0,
+            environment: dict[str, str] | None = None, **parameters: object) -> dict[str, Any]:
+    """Run source and averager for `seconds`; the first 2 s do not count."""
+    cores = sorted(os.sched_getaffinity(0))
+    length = block_samples(channels, block_seconds)
+    names = {'trigger_cycles': TRIGGER_CYCLES, 'shaft.orders': list(ORDERS), **parameters}
+    arguments = ['--ros-args', '--log-level', 'error']
+    for name, value in names.items():
+        arguments += ['-p', f'{name}:={str(value).lower()}']
+    context = rclpy.Context()
+    context.init(args=[])
+    sink = Sink(context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(sink.node)
+    averager = subprocess.Popen(
+        [sys.executable, '-c', NODE, *arguments], env={**os.environ, **(environment or {})},
+        preexec_fn=partial(os.sched_setaffinity, 0, {cores[-1]}))
+    source = subprocess.Popen(
+        [sys.executable, __file__, '--publish', str(channels), str(seconds), str(length)],
+        stdout=subprocess.PIPE, text=True,
+        preexec_fn=partial(os.sched_setaffinity, 0, {cores[0]}))
+
+    def spin(until: Any, limit: float) -> None:
+        end = time.monotonic() + limit
+        while not until() and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.2)
+
+    try:
+        spin(lambda: sink.arrivals, 60.0)
+        if not sink.arrivals:
+            raise RuntimeError(f'no average of {channels} channels arrived within 60 s')
+        begin = sink.arrivals[0] + 2.0
+        spin(lambda: time.monotonic() > begin, 3.0)
+        cpu, _ = usage(averager.pid)
+        spin(lambda: time.monotonic() > begin + seconds - 3.0, seconds)
+        elapsed = time.monotonic() - begin
+        used, peak = usage(averager.pid)
+        spin(lambda: source.poll() is not None, settle + 5.0)
+        report = json.loads(source.communicate(timeout=60.0)[0])
+        spin(lambda: False, settle)
+    finally:
+        for child in (averager, source):
+            if child.poll() is None:
+                child.send_signal(signal.SIGINT)
+            child.wait(timeout=30.0)
+        context.try_shutdown()
+    return {'channels': channels, 'block_milliseconds': 1e3 * length / RATE,
+            'megabytes_per_second': 8e-6 * channels * RATE, 'cpu_share': (used - cpu) / elapsed,
+            'source_late': report['late'], 'source_cpu': report['cpu'] / seconds,
+            'peak_megabytes': peak, **_latency(sink, report['start'], length, seconds),
+            'diagnostics': _diagnostics(sink)}
+
+
+def _latency(sink: Sink, start: float, length: int, seconds: float) -> dict[str, float]:
+    """Milliseconds to the arrival from the last pulse, and from when all it needs was sent."""
+    ends, arrivals = np.array(sink.ends), np.array(sink.arrivals)
+    counts = arrivals > arrivals[0] + 2.0
+    ends, arrivals = ends[counts], arrivals[counts]
+    needed = np.ceil((ends * RATE + MARGIN) / length) * length / RATE
+    quantiles = {}
+    for name, origin in (('pulse', ends), ('data', needed)):
+        delays = 1e3 * (arrivals - start - origin)
+        for label, value in (('median', np.median(delays)), ('99', np.percentile(delays, 99)),
+                             ('last', delays[-1])):
+            quantiles[f'{name}_{label}'] = float(value)
+    return {'averages': len(sink.ends), 'expected': int((seconds * SPEED - 1) / TRIGGER_CYCLES),
+            **quantiles}
+
+
+def _diagnostics(sink: Sink) -> dict[str, Any]:
+    """Return the worst level, the last counts, and what the user read."""
+    if not sink.status:
+        return {'level': 0, 'counts': {}, 'messages': []}
+    return {'level': max(status[1] for status in sink.status),
+            'counts': {key: int(sink.status[-1][3].get(key, 0)) for key in KEYS},
+            'messages': list(dict.fromkeys(status[2] for status in sink.status if status[1]))[:3]}
+
+
+def sustained(run: dict[str, Any]) -> bool:
+    """Whether nothing was lost and averages kept coming in time."""
+    return (not any(run['diagnostics']['counts'].values()) and run['pulse_last'] < 500.0
+            and run['averages'] >= run['expected'])
+
+
+def main() -> int:
+    """Measure and print JSON; progress goes to the standard error."""
+    parser = argparse.ArgumentParser(description='Measure the averager over DDS.')
+    parser.add_argument('--seconds', type=float, default=20.0, help='of each run')
+    parser.add_argument('--channels', type=int, nargs='+', default=[1, 8, 16, 32, 64, 96, 128])
+    parser.add_argument('--latency-seconds', type=float, default=60.0,
+                        help='of the two runs at 8 channels from which latency is taken')
+    parser.add_argument('--publish', nargs=3, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.publish:
+        channels, seconds, length = options.publish
+        publish(int(channels), float(seconds), int(length))
+        return 0
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
+    found: dict[str, Any] = {'load': f'{os.getloadavg()[0]:.1f}', 'runs': [], 'latency': []}
+    for channels in options.channels:
+        print(f'graph: {channels} channels', file=sys.stderr, flush=True)
+        found['runs'].append(measure(channels, options.seconds))
+        found['runs'][-1]['sustained'] = sustained(found['runs'][-1])
+    for block_seconds in (0.05, 0.01) if options.latency_seconds else ():
+        print(f'graph: latency, blocks of {block_seconds:g} s', file=sys.stderr, flush=True)
+        found['latency'].append(measure(8, options.latency_seconds, block_seconds=block_seconds))
+    print(json.dumps(found))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""
+Speed of prediction, recovery, Monte Carlo and the loop off line.
+
+`python benchmarks/loop_speed.py` writes its figures as JSON to the standard output.
+"""
+
+import argparse
+from functools import partial
+import json
+import os
+from pathlib import Path
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh
+from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
+from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
+from sa_jitter_ros.statistics.distributions import Uniform
+from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
+from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
+from timing import interleaved, machine
+
+RATIO = 2.40789
+SPEED = 16.6  # Hz
+RATE = 10000.0  # Hz
+KEYPHASOR_RATE = 5000.0  # Hz
+CHANNELS = 4
+MODEL = f"""\
+jitter_predictor:
+  ros__parameters:
+    keyphasor_rate: {KEYPHASOR_RATE}
+    trigger_speed: {SPEED}
+    trigger_cycles: 20
+    ratio: {RATIO}
+    orders: [19.0, 38.0, 57.0]
+"""
+
+
+def prediction(orders: int, rounds: int) -> dict[str, float]:
+    """Milliseconds for all moments and quantiles of orders 1, 2, ..."""
+    def model(cycles: int, **options: Any) -> DeclaredModel:
+        return DeclaredModel(keyphasor_rate=10000.0, trigger_speed=40.0, trigger_cycles=cycles,
+                             orders=tuple(np.arange(1.0, orders + 1.0)), **options)
+
+    table = tuple(np.random.default_rng(1).normal(scale=3e-5, size=50).tolist())
+    models = {
+        'uniform, 40 trigger cycles': model(40),
+        'normal, 40 trigger cycles': model(40, jitter_distribution='normal'),
+        'table of 50 errors, 40 trigger cycles': model(
+            40, jitter_distribution='table', jitter_table=table),
+        'uniform, 1000 trigger cycles': model(1000),
+        'uniform, 5 trigger cycles (law is sampled)': model(5)}
+    timings = interleaved({name: partial(predict, item) for name, item in models.items()},
+                          rounds=rounds)
+    return {name: 1e3 * timing.median for name, timing in timings.items()}
+
+
+def trigger_cycles(count: int, channels: int, samples: int = 512) -> tuple[Any, Any, float]:
+    """Return cycles (cycle, sample, channel) between jittered pulses, periods, the jitter (s)."""
+    rng = np.random.default_rng(2)
+    width = 0.2 / (19.0 * RATIO * SPEED)
+    true = np.cumsum(1.0 + 2e-4 * rng.standard_normal(count + 1)) / SPEED
+    pulses = true + rng.uniform(-0.5, 0.5, count + 1) * width
+    times = pulses[:-1, None] + np.diff(pulses)[:, None] * np.arange(samples) / samples
+    turns = RATIO * np.interp(times, true, np.arange(count + 1.0))[:, :, None]
+    gains = 1.0 / (1.0 + np.arange(channels))
+    cycles = gains * (np.cos(2.0 * np.pi * 19.0 * turns) + 0.5 * np.cos(2.0 * np.pi * 38.0 * turns)
+                      + 0.25 * np.cos(2.0 * np.pi * 57.0 * turns))
+    return (cycles + 0.3 * rng.standard_normal(cycles.shape), np.diff(pulses),
+            width / np.sqrt(12.0))
+
+
+def recovery(count: int, rounds: int) -> dict[str, float]:
+    """Milliseconds for one recovery of the pulse errors of an average."""
+    calls = {}
+    for channels in (1, 8, 64):
+        cycles, periods, jitter = trigger_cycles(count, channels)
+        call = partial(recover_pulse_errors, cycles, periods=periods, ratio=RATIO,
+                       declared_standard_deviation=jitter)
+        assert call().accepted
+        calls[f'{count} trigger cycles x {channels} channels'] = call
+    return {name: 1e3 * timing.median
+            for name, timing in interleaved(calls, rounds=rounds).items()}
+
+
+def iterations(count: int, rounds: int) -> dict[str, float]:
+    """Monte Carlo iterations per second: averages of 40 trigger cycles at one order."""
+    signal = AveragedSignal(trigger_cycles=40, cycle_length=RATIO, order=19.0)
+    law = Uniform(RATIO * SPEED / KEYPHASOR_RATE)
+    rng = np.random.default_rng(3)
+
+    def one_by_one() -> None:
+        for _ in range(count // 100):
+            signal.whole_trigger_cycles(law.draw(rng, (1, 41)))
+
+    calls = {name: partial(monte_carlo, method, law, 40, count, seed=1) for name, method in (
+        ('whole trigger cycles', signal.whole_trigger_cycles),
+        ('whole fundamental cycles', signal.whole_fundamental_cycles),
+        ('majority assignment', signal.majority_assignment))}
+    timings = interleaved({**calls, 'whole trigger cycles, one by one': one_by_one},
+                          rounds=rounds)
+    return {name: (count // 100 if 'one by one' in name else count) / timing.best
+            for name, timing in timings.items()}
+
+
+def close_loop(megabytes: float) -> dict[str, Any]:
+    """Seconds that the command takes on a recording with an effect that is not declared."""
+    samples = round(megabytes * 1e6 / 8 / CHANNELS)
+    gearbox = Gearbox(
+        mesh('shaft', 19, harmonics=(1.0, 0.5, 0.25), channel_gains=(1.0, 0.8, 0.6, 0.4), seed=1),
+        RATE, shafts={'shaft': RATIO}, speed=((0.0, SPEED),), keyphasor=Keyphasor(),
+        effects=(AdditiveNoise(0.1, name='noise'),
+                 DeclaredJitter('uniform', 1.0 / np.sqrt(12.0) / KEYPHASOR_RATE),
+                 *make_effects({'excess_jitter': {'std': 1e-4}})), seed=1)
+    with tempfile.TemporaryDirectory() as folder:
+        recording, model = Path(folder, 'rig.npz'), Path(folder, 'model.yaml')
+        np.savez(recording, vibration=gearbox.vibration(0, samples), sample_rate=RATE,
+                 pulse_times=gearbox.pulses(0.0, samples / RATE).times, ratio=RATIO,
+                 orders=[19.0, 38.0, 57.0])
+        model.write_text(MODEL)
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+        subprocess.run(
+            [sys.executable, '-c', 'from sa_jitter_ros.commands.close_loop import main; '
+             'raise SystemExit(main())', str(recording), '--declared', str(model), '--output',
+             str(Path(folder, 'report')), '--quiet'],
+            check=True, stdout=subprocess.DEVNULL)
+        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - start
+        report = json.loads(Path(folder, 'report', 'report.json').read_text())
+        return {'megabytes': recording.stat().st_size / 1e6, 'wall': wall,
+                'cpu': after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+                'seconds': samples / RATE, 'channels': CHANNELS, 'verdict': report['verdict'],
+                'missing': [effect['name'] for effect in report['missing_effects']]}
+
+
+def main() -> int:
+    """Measure and print JSON; progress goes to the standard error."""
+    parser = argparse.ArgumentParser(description='Measure prediction, recovery and the loop.')
+    parser.add_argument('--scale', type=float, default=1.0, help='of all sizes')
+    parser.add_argument('--rounds', type=int, default=9, help='turns of every call')
+    options = parser.parse_args()
+    scale, rounds = options.scale, options.rounds
+    found: dict[str, Any] = {'machine': machine()}
+    for name, measure in (
+            ('prediction', partial(prediction, max(round(64 * scale), 2), rounds)),
+            ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
+            ('iterations', partial(iterations, round(200000 * scale), rounds)),
+            ('close_loop', partial(close_loop, max(10.0 * scale, 3.0)))):
+        print(f'loop: {name}', file=sys.stderr, flush=True)
+        found[name] = measure()
+    found['load'] = f'{os.getloadavg()[0]:.1f}'
+    print(json.dumps(found))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

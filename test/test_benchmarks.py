@@ -1,0 +1,83 @@
+"""The benchmarks run, on small sizes, and find the accuracy that their page tells."""
+
+import json
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDER = ROOT / 'benchmarks'
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """Return a function that imports a module of the benchmarks."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return pytest.importorskip
+
+
+def test_core_is_as_accurate_as_its_page_says(benchmark):
+    record_module, peers = benchmark('record'), benchmark('peers')
+    for ratio in (1.0, 2.40789):
+        record = record_module.make_record(channels=2, seconds=1.0, ratio=ratio)
+        gain = {name: record_module.gains(record, method(record))
+                for name, method in peers.METHODS.items()}
+        for name in ('sa_jitter_ros, on line', 'sa_jitter_ros, resampling and mean'):
+            assert np.abs(gain[name]).max() < 0.01
+        assert np.all(gain['quintic spline'][-1] < -0.03)
+        # sinc^2, the loss of linear interpolation, and what of it MATLAB's algorithm shows
+        bands = np.array(record.orders) * ratio * record_module.SPEED / record.rate
+        expected = 40.0 * np.log10(np.sinc(bands))
+        for name in ('tsa linear', 'sa_jitter_ros, resampling and mean, linear'):
+            np.testing.assert_allclose(gain[name], expected, rtol=0.05)
+
+
+def test_methods_are_timed_in_turns(benchmark):
+    calls = []
+    timings = benchmark('timing').interleaved(
+        {'a': lambda: calls.append('a'), 'b': lambda: calls.append('b')}, rounds=3)
+    assert calls == ['a', 'b'] * 3
+    assert timings['a'].runs == 3
+    assert 0.0 <= timings['a'].best <= timings['a'].median
+
+
+def test_memory_does_not_grow_with_the_record(benchmark):
+    short, *_, long = benchmark('core_speed').memory(0.1).values()
+    assert long < 1.1 * short
+
+
+def run(script, *arguments, environment):
+    """Run a benchmark and return what it found."""
+    done = subprocess.run([sys.executable, FOLDER / script, *arguments], capture_output=True,
+                          env={**environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)},
+                          text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_page_is_written_from_small_runs(benchmark, process_environment, tmp_path):
+    page = benchmark('performance_page')
+    small = '--scale', '0.03', '--rounds', '1'
+    found = {
+        'core': run('core_speed.py', *small, environment=process_environment),
+        'loop': run('loop_speed.py', *small, environment=process_environment),
+        'graph': run('graph_speed.py', '--channels', '2', '--seconds', '5', '--latency-seconds',
+                     '0', environment=process_environment)}
+    graph, = found['graph']['runs']
+    assert graph['sustained'], graph
+    assert 0.0 < graph['data_median'] < graph['pulse_99']
+    assert found['loop']['prediction'].keys() >= {'uniform, 40 trigger cycles'}
+    text = page.fill((ROOT / 'docs' / 'performance.md').read_text(), page.sections(found))
+    assert '| quintic spline |' in text
+    assert page.fill(text, page.sections(found)) == text
+    page.draw(found, tmp_path)
+    assert len(list(tmp_path.glob('performance-*.png'))) == 3
+
+
+def test_page_without_a_section_is_refused(benchmark):
+    with pytest.raises(ValueError, match='no section'):
+        benchmark('performance_page').fill('nothing', {'core': ''})
