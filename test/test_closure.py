@@ -1,5 +1,6 @@
 """The loop off line on simulated machines: what is observed, what is left, and what is traced."""
 
+from dataclasses import replace
 import json
 import math
 
@@ -78,6 +79,21 @@ def test_observation_finds_the_true_errors_and_attenuation():
         assert np.all(np.abs(item.attenuation - other.attenuation) < 5.0 * spread)
     mean = found.stacked('attenuation').mean(axis=0)
     assert np.all(np.diff(mean, axis=1) < 0.0)
+
+
+def test_reference_serves_unless_the_vibration_moves_against_it():
+    wander = make_effects({'phase_wander': {'std': 0.02}})
+    moved = simulated(*wander, acquisitions=4, reference=True)
+    assert not observe(moved, MODEL).against_reference
+    jitter = make_effects({'excess_jitter': {'std': 80e-6}})
+    recording = simulated(*jitter, acquisitions=10, reference=True)
+    found = trace([observe(recording, MODEL)], [recording])
+    assert found.observation.against_reference
+    assert [item.name for item in found.findings] == ['excess_jitter']
+    swapped = replace(recording, pulse_times=recording.reference_pulse_times,
+                      reference_pulse_times=recording.pulse_times)
+    with pytest.raises(RecordingError, match='the worse one'):
+        observe(swapped, MODEL)
 
 
 def test_declared_model_suffices():

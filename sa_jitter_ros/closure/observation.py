@@ -27,6 +27,8 @@ Progress = Callable[[float], None]
 
 MOST_SAMPLES = 200_000_000
 _OTHER_MACHINE = 5.0
+# Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
+_TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
 
 
 @dataclass(frozen=True)
@@ -101,9 +103,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     Observe a recording's acquisitions.
 
     `sources` are the declared orders and after them others that may leak; without it they are
-    looked for.
-    Raises RecordingError where there is no whole acquisition, ModelError where the declared model
-    does not fit the recording, SignalError where no order of it stands above the noise.
+    looked for. A better keyphasor is left aside where the vibration itself moves against it, or
+    inside its cycles, so much that its own average loses amplitude.
+    Raises RecordingError where there is no whole acquisition or the better keyphasor is a worse
+    one, ModelError where the declared model does not fit the recording.
     """
     if recording.samples * recording.channels > MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
@@ -127,6 +130,9 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     declared = tuple(float(g) for g in model.orders)
     orders = np.array(sources if len(sources) else [
         *declared, *_other_sources(reader, pulses, model, starts, rows, declared)])
+    if pulses.reference is not None and not _reference_serves(
+            reader, pulses, model, starts, np.array(declared), rows):
+        pulses = replace(pulses, reference=None)
     found = []
     for count, first in enumerate(starts):
         found.append(_acquire(reader, pulses, model, first, orders, rows))
@@ -198,6 +204,30 @@ def _starts(pulses: TriggerPulses, cycles: int, reader: CycleReader) -> list[int
         else:
             first += 1
     return found
+
+
+def _reference_serves(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel,
+                      starts: Sequence[int], orders: FloatArray, rows: tuple[int, ...]) -> bool:
+    """Tell, by a few acquisitions, whether the better keyphasor keeps the amplitudes."""
+    bare = replace(pulses, reference=None)
+    kept, gained = [], []
+    for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
+        item = _acquire(reader, pulses, model, first, orders, rows)
+        other = _acquire(reader, bare, model, first, orders, rows)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            best = other if other.recovered else item
+            clear = best.noise < _CLEAR * np.abs(best.corrected)
+            gained.append(np.where(clear, item.attenuation, np.nan))
+            if other.recovered:
+                kept.append(np.where(clear, np.abs(item.corrected) / np.abs(other.corrected),
+                                     np.nan))
+    gain = np.median(gained, axis=0)
+    if np.any(gain > 1.0 + _LOSS):
+        raise RecordingError(
+            f'reference_pulse_times keep less amplitude than pulse_times (raw over reference '
+            f'amplitude {np.nanmax(gain):.3f}): the reference keyphasor is the worse one; give '
+            'the better one or none')
+    return not kept or not bool(np.any(np.median(kept, axis=0) < 1.0 - _LOSS))
 
 
 def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, first: int,

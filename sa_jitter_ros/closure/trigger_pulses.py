@@ -134,10 +134,12 @@ def _every(times: FloatArray, missing: IntArray, step: int) -> tuple[FloatArray,
 def _matched(times: FloatArray, missing: IntArray, better: FloatArray) -> FloatArray:
     """Return the pulse of the better keyphasor for each of `times`, NaN where it has none."""
     count = np.concatenate(([0], np.cumsum(1 + missing)))
+    other = np.concatenate(([0], np.cumsum(1 + missing_pulses(better))))
     nearest = np.argmin(np.abs(better[:, None] - times[None, :_NEIGHBOURHOOD]), axis=0)
-    index = int(np.median(nearest - count[:nearest.size])) + count
-    inside = (index >= 0) & (index < better.size)
-    matched = np.where(inside, better[np.clip(index, 0, better.size - 1)], np.nan)
+    wanted = int(np.median(other[nearest] - count[:nearest.size])) + count
+    index = np.clip(np.searchsorted(other, wanted), 0, better.size - 1)
+    inside = other[index] == wanted
+    matched = np.where(inside, better[index], np.nan)
     if inside.sum() < 0.5 * times.size:
         raise RecordingError(f'reference_pulse_times cover {inside.mean():.0%} of the pulses: '
                              'give the same stretch of time')
