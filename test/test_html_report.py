@@ -193,6 +193,18 @@ def test_evidence_follows_the_effect_that_it_convicted(traces):
     assert (seen > 2.0 * curve(axes, 'declared model')[1]).all()
 
 
+def test_declared_effects_belong_to_the_declared_model(traces):
+    trace = traces['grid']
+    (clock,) = trace.findings
+    declared = replace(
+        trace, findings=(), verdict='none', evidence=replace(
+            trace.evidence, explained=(clock.effect,), errors=trace.evidence.errors - np.array(
+                [item.errors - item.errors.mean() for item in trace.evidence.pulses])))
+    for case, label in ((trace, 'with keyphasor_quantisation'), (declared, 'declared model')):
+        axes = panel(case, 'trigger_cycle', 'over the trigger cycle')
+        np.testing.assert_allclose(curve(axes, 'recovered')[1], curve(axes, label)[1], rtol=0.1)
+
+
 def test_target_is_folded_by_its_own_period(traces):
     trace = traces['geometry']
     period = len(trace.findings[0].effect.pulse_angles)

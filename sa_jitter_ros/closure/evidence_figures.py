@@ -1,52 +1,30 @@
 """Figures of the evidence: pulse errors, the trigger cycle, amplitudes; expected and seen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
+from sa_jitter_ros.closure.expected_errors import (
+    cycle_places, lags_of, Version, versions_of, whole)
+from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, predict_with
-from sa_jitter_ros.statistics.angle_error import joint_characteristic
-from scipy.linalg import toeplitz
+from sa_jitter_ros.effects.prediction import predict_with
 
 Array = NDArray[Any]
 
 _MICRO = 1e6
 _MOST_POINTS = 3000
-_MOST_LAGS = 25
 _STEPS = 16  # places in a trigger cycle
-_DRAWS, _SEED = 20_000, 3
-
-
-@dataclass(frozen=True)
-class _Version:
-    """
-    What one model expects of the pulse errors; times in s.
-
-    `autocovariance` (lag,) of errors of mean 0 in each acquisition, `std` their size, `draws` of
-    them, `profile` (u,) the RMS angle error over the trigger cycle, `patterns` (acquisition,
-    N_t + 1) what is known of each pulse.
-    """
-
-    label: str
-    colour: str
-    effects: tuple[Effect, ...]
-    autocovariance: Array
-    std: float
-    draws: Array
-    profile: Array
-    patterns: Array
 
 
 def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the pulse errors: over time, their law, memory, lattice, origin and steadiness."""
-    versions = _versions(evidence, effects)
+    evidence, versions = whole(evidence), versions_of(evidence, effects)
     figure, axes = panels(8, columns=4)
     _over_time(axes[0], evidence, versions[-1])
     _law(axes[1], evidence, versions)
@@ -61,7 +39,7 @@ def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
 
 def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
-    versions = _versions(evidence, effects)
+    evidence, versions = whole(evidence), versions_of(evidence, effects)
     figure, axes = panels(3, columns=3)
     _profile(axes[0], evidence, versions)
     _dependence_on_cycles(axes[1], evidence, versions)
@@ -96,66 +74,9 @@ def amplitudes(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     return figure
 
 
-# --- expectations --------------------------------------------------------------------------------
-
-def _versions(evidence: Evidence, effects: Sequence[Effect]) -> list[_Version]:
-    """Return what declared model and, if there are any, added effects expect."""
-    found = [_version('declared model', BEFORE, evidence, ())]
-    if effects:
-        label = with_effects([effect.name for effect in effects])
-        found.append(_version(label, AFTER, evidence, tuple(effects)))
-    return found
-
-
-def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect, ...]) -> _Version:
-    model = evidence.model
-    count = evidence.errors.shape[1]
-    # The recovery repairs gaps itself, so that its errors do not hold them.
-    timing = [effect for effect in effects if effect.name != 'missing_pulses']
-    patterns = np.zeros(evidence.errors.shape)
-    for row, pulses in zip(patterns, evidence.pulses):
-        known = known_errors(model, timing, pulses)
-        if known is not None:
-            row += known - known.mean()
-    random = replace(evidence, explained=effects).expected_autocovariance(np.arange(count))
-    noise = _noise(evidence)
-    covariance = toeplitz(random) + noise**2 * np.eye(count)
-    centred = covariance - covariance.mean(axis=0) - covariance.mean(axis=1)[:, None]
-    centred += covariance.mean() + patterns.T @ patterns / len(patterns)
-    total = np.array([np.trace(centred, lag) / (count - lag) for lag in range(_lags(evidence))])
-    rng = np.random.default_rng(_SEED)
-    replaced = any(effect.replaces_jitter(model) for effect in effects)
-    jitter = np.zeros(_DRAWS) if replaced else model.distribution.draw(rng, _DRAWS)
-    rest = max(random[0] - (0.0 if replaced else model.distribution.variance), 0.0) + noise**2
-    draws = jitter + np.sqrt(rest) * rng.standard_normal(_DRAWS)
-    draws += rng.choice(patterns.ravel(), _DRAWS)
-    u = _places()
-    small = 1e-2 / max(np.sqrt(random[0]) * model.fundamental_frequency, 1e-12)
-    first = np.abs(joint_characteristic(jitter_processes(model, effects), [small], [u], [0]))
-    variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
-    path = patterns[:, :-1, None] * (1.0 - u) + patterns[:, 1:, None] * u
-    profile = np.sqrt(np.maximum(variance, 0.0) + np.mean(path**2, axis=(0, 1)))
-    return _Version(label, colour, effects, total, float(np.sqrt(total[0])), draws, profile,
-                    patterns)
-
-
-def _noise(evidence: Evidence) -> float:
-    """Return the mean standard error of the pulse errors, 0 where it is unknown."""
-    known = evidence.standard_errors[np.isfinite(evidence.standard_errors)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else 0.0
-
-
-def _lags(evidence: Evidence) -> int:
-    return min(_MOST_LAGS + 1, int(evidence.errors.shape[1]) // 2 + 1)
-
-
-def _places() -> Array:
-    return np.linspace(0.0, 1.0, 41)
-
-
 # --- panels of pulse errors ----------------------------------------------------------------------
 
-def _over_time(axes: Axes, evidence: Evidence, version: _Version) -> None:
+def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
     """Draw the errors over the length of an acquisition: what they have in common is a trend."""
     times = evidence.times - evidence.times[:, :1]
     for row in range(min(len(times), 8)):
@@ -171,7 +92,7 @@ def _over_time(axes: Axes, evidence: Evidence, version: _Version) -> None:
     axes.legend(fontsize='x-small')
 
 
-def _law(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+def _law(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the histogram of the errors against the expected laws."""
     errors = _MICRO * evidence.errors.ravel()
     top = max(np.abs(errors).max(), *(_MICRO * np.quantile(np.abs(item.draws), 0.999)
@@ -185,10 +106,10 @@ def _law(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
     axes.legend(fontsize='x-small')
 
 
-def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the autocorrelation of the errors with its standard error."""
     errors = evidence.errors
-    lags = np.arange(_lags(evidence))
+    lags = np.arange(lags_of(evidence))
     rows = np.array([[np.mean(row[:row.size - k] * row[k:]) for k in lags] for row in errors])
     scale = rows[:, 0].mean()
     error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows)) / scale
@@ -244,7 +165,7 @@ def _origin(axes: Axes, evidence: Evidence) -> None:
     axes.legend(fontsize='x-small')
 
 
-def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the size of the errors over the record."""
     size = np.sqrt(np.mean(evidence.errors**2, axis=1))
     axes.plot(evidence.times.mean(axis=1), _MICRO * size, 'o', markersize=3, color=MEASURED,
@@ -261,14 +182,15 @@ def _intervals(axes: Axes, evidence: Evidence) -> None:
     intervals = np.diff(evidence.record_times)
     axes.hist(intervals / np.median(intervals), 60, color='0.6')
     axes.set_yscale('log')
+    axes.set_ylim(bottom=0.5)
     axes.set(title='pulse intervals', xlabel='interval over their median', ylabel='number')
 
 
 # --- panels of the trigger cycle -----------------------------------------------------------------
 
-def _profile(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the RMS angle error over the trigger cycle: large at its ends or in the middle."""
-    u = _places()
+    u = cycle_places()
     for item in versions:
         axes.plot(u, _MICRO * item.profile, color=item.colour, label=item.label)
     size = np.sqrt(np.mean(_angle_errors(evidence, u) ** 2, axis=(0, 1)))
@@ -286,7 +208,7 @@ def _angle_errors(evidence: Evidence, u: Array) -> Array:
     return np.asarray(start * (1.0 - u) + end * u + ripple * u * (1.0 - u))
 
 
-def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[_Version]) -> None:
+def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the attenuation that the pulse errors make in averages of fewer cycles."""
     model = evidence.model
     counts = np.unique(np.geomspace(1, model.trigger_cycles, 7).astype(int))
@@ -315,7 +237,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[_Ve
     axes.legend(fontsize='x-small')
 
 
-def _folded(axes: Axes, evidence: Evidence, version: _Version) -> None:
+def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     """Draw the mean error over the pulse index, folded by the target or a few pulses."""
     model = evidence.model
     step = model.pulses_per_trigger or model.pulses_per_revolution

@@ -47,6 +47,7 @@ class MeasuredNoise(Effect):
 
     name: ClassVar[str] = 'measured_noise'
     summary: ClassVar[str] = 'noise that the averages report'
+    scatters: ClassVar[bool] = True
     variance: tuple[float, ...]
 
     def line_variance(self, model: DeclaredModel) -> Array:
