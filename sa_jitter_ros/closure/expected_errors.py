@@ -16,6 +16,7 @@ from scipy.linalg import toeplitz
 Array = NDArray[Any]
 
 _MOST_LAGS = 25
+_SMALL = 1e-5  # s, an error that a small coefficient of the characteristic function is for
 _DRAWS, _SEED = 20_000, 3
 # Effects that recovered errors do not show: gaps are repaired first, samples come as they are.
 _NOT_IN_ERRORS = ('missing_pulses', 'interpolation_loss')
@@ -88,7 +89,7 @@ def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect,
     draws = jitter + np.sqrt(rest) * rng.standard_normal(_DRAWS)
     draws += rng.choice(patterns.ravel(), _DRAWS)
     u = cycle_places()
-    small = 1e-2 / max(np.sqrt(random[0]) * model.fundamental_frequency, 1e-12)
+    small = 1e-2 / (max(np.sqrt(random[0]), _SMALL) * model.fundamental_frequency)
     processes = jitter_processes(model, effects)
     first = np.abs(joint_characteristic(processes, [small], [u], [0]))
     variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
