@@ -283,6 +283,14 @@ def test_too_few_acquisitions_and_no_pulses_are_refused():
         trigger_pulses(bare, MODEL)
 
 
+def test_noise_alone_is_refused(rng):
+    machine = simulated(acquisitions=5)
+    noise = Recording(ArraySource(rng.normal(size=(2, machine.samples))), RATE,
+                      pulse_times=machine.pulse_times)
+    with pytest.raises(SignalError, match='cannot be recovered'):
+        observe(noise, MODEL)
+
+
 def test_recordings_of_different_machines_are_refused():
     one = simulated(acquisitions=4)
     louder = Recording(ArraySource(20.0 * one.read()), RATE, pulse_times=one.pulse_times)

@@ -21,6 +21,7 @@ METHODS = ('linear', 'cubic', 'spline')
 _PLACES = 32
 _CERTAIN = 1e-9
 _DEEPEST = 1.15
+_POOR = 6.0  # mean square misfit of the depths, in their errors, that is no interpolator's
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     for name in METHODS:
         mean, swing = _interpolated(name, frequency)
         misfit, size = _misfit(depth, swing / mean, error)
-        if misfit < best and 0.0 < size <= _DEEPEST:
+        if misfit < min(best, _POOR * lines) and 0.0 < size <= _DEEPEST:
             best, method = misfit, name
             gain = 1.0 - (1.0 - mean) * np.clip(depth / (size * swing / mean), 0.5, 1.5)
     return Beat(method, p_value, gain, depth)

@@ -16,6 +16,8 @@ ComplexArray = NDArray[np.complex128]
 # effect may be larger than the declared jitter, and orders may have slipped a cycle.
 _SUSPICIOUS, _WIDER = 1.3, 4.0
 _LEAST = 1e-9
+_WHOLE = 1e-9
+_SEPARATIONS = 6
 
 
 @dataclass(frozen=True)
@@ -101,3 +103,26 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
         information = np.nansum(2.0 * signal / recovery.noise**2) / 180.0
     cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
     return float(cycles / model.fundamental_frequency)
+
+
+def separated(cycles: ComplexArray, ratio: float, orders: FloatArray) -> ComplexArray:
+    """
+    Return complex peaks (cycle, channel, order) without what the other orders leak into each.
+
+    A trigger cycle of `ratio` fundamental cycles, not a whole number, does not keep its orders
+    apart, nor an order from its own mirror image.
+    """
+    if abs(ratio - round(ratio)) < _WHOLE:
+        return cycles
+    middle = np.arange(len(cycles))[:, None, None] + 0.5
+    apart = ratio * np.subtract.outer(orders, orders)
+    leak = np.exp(-2j * np.pi * apart * middle) * np.sinc(apart)
+    leak[:, np.eye(orders.size, dtype=np.bool_)] = 0.0
+    both = ratio * np.add.outer(orders, orders)
+    image = np.exp(-2j * np.pi * both * middle) * np.sinc(both)
+    clean = cycles
+    for _ in range(_SEPARATIONS):
+        mean = clean.mean(axis=0)
+        clean = cycles - np.einsum('kgs,cs->kcg', leak, mean) - np.einsum(
+            'kgs,cs->kcg', image, mean.conj())
+    return clean

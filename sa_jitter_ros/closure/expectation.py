@@ -25,6 +25,7 @@ from sa_jitter_ros.statistics.moments import AverageMoments, cycle_moments, nois
 Array = NDArray[Any]
 
 _NODES, _MOST_NODES = 32, 800
+_WHOLE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -142,9 +143,15 @@ def _known(observation: Observation, processes: Sequence[AngleErrorProcess], err
 
 def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
              errors: Array | None) -> Array:
-    """Return the mean amplitude (order, source) that each unit source shows at each order."""
+    """
+    Return the mean amplitude (order, source) that each unit source shows at each order.
+
+    A ratio that is not whole has the mirror images of the sources after them.
+    """
     model, sources = observation.model, observation.sources
     r, count = model.cycle_length, model.trigger_cycles
+    if abs(r - round(r)) > _WHOLE:
+        sources = np.concatenate((sources, -sources))
     e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()
     u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
@@ -167,6 +174,8 @@ def _of_lines(item: Acquisition, lines: Lines, rows: Sequence[tuple[AverageMomen
     pseudo = np.zeros(lines.count, complex)
     for i, (moments, leakage) in enumerate(rows):
         amplitude = item.corrected
+        if leakage.shape[1] > amplitude.shape[1]:
+            amplitude = np.concatenate((amplitude, amplitude.conj()), axis=1)
         own = leakage.shape[0]
         foreign = leakage - np.where(np.eye(*leakage.shape, dtype=np.bool_), leakage, 0.0)
         with np.errstate(divide='ignore', invalid='ignore'):

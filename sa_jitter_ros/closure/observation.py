@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import grid_points
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.cycle_reader import (
-    amplitudes, CycleReader, recover, repaired, ripple_error)
+    amplitudes, CycleReader, recover, repaired, ripple_error, separated)
 from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, TriggerPulses
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
@@ -29,6 +29,8 @@ MOST_SAMPLES = 200_000_000
 _OTHER_MACHINE = 5.0
 # Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
+# A ripple of this many times its noise in power is taken out of the corrected average.
+_RIPPLE = 3.0
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     looked for. A better keyphasor is left aside where the vibration itself moves against it, or
     inside its cycles, so much that its own average loses amplitude.
     Raises RecordingError where there is no whole acquisition or the better keyphasor is a worse
-    one, ModelError where the declared model does not fit the recording.
+    one, ModelError where the declared model does not fit the recording, SignalError where nothing
+    is there to compare with.
     """
     if recording.samples * recording.channels > MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
@@ -138,6 +141,12 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         found.append(_acquire(reader, pulses, model, first, orders, rows))
         if progress is not None:
             progress((count + 1) / len(starts))
+    if pulses.reference is None:
+        reason = found[0].reason
+        found = [item for item in found if item.recovered]
+        if not found:
+            raise SignalError('the pulse errors cannot be recovered from the vibration: '
+                              f'{reason}; give reference_pulse_times or orders that stand above the noise')
     return Observation(
         model, tuple(found), np.array(declared), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, recording.description)
@@ -238,15 +247,17 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
     fixed, keep = repaired(times, missing)
     points = grid_points(float(np.diff(fixed).max()), reader.rate)
     recovery = recover(reader, fixed, model, rows, with_ripple=True)
+    with_ripple = recovery.accepted and not missing.any()
+    if not recovery.accepted:
+        recovery = recover(reader, fixed, model, rows, with_ripple=False)
     errors = np.full(times.size, np.nan)
     standard_errors, ripple = errors.copy(), np.full(count, np.nan)
     bend_error = float('nan')
     better: FloatArray = fixed
     if recovery.accepted:
         errors, standard_errors = recovery.errors[keep], recovery.standard_errors[keep]
-        if not missing.any():
-            ripple = recovery.ripple
-        bend_error = ripple_error(recovery, model)
+        if with_ripple:
+            ripple, bend_error = recovery.ripple, ripple_error(recovery, model)
         better = fixed - recovery.errors
     reference = None
     if pulses.reference is not None:
@@ -256,12 +267,12 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
     errors = errors - errors.mean()
     orders = tuple(sources.tolist())
     bend = None
-    if reference is None and recovery.accepted and np.mean(recovery.ripple**2) > (
-            3.0 * bend_error**2):
-        bend = recovery.ripple
+    if reference is None and with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2:
+        bend = ripple
     raw = amplitudes(reader.cycles(times, points, ends=True), model.cycle_length, orders)
     clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend),
                        model.cycle_length, orders)
+    clean = separated(clean, model.cycle_length, sources)
     return Acquisition(
         first, times, missing, errors, standard_errors, reference, raw.mean(axis=0),
         clean.mean(axis=0), clean, radial_noise(clean), ripple, bend_error, recovery.accepted,

@@ -242,12 +242,12 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
         gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
             kind.scatters) else ('attenuation', score.score, current.score)
         p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
-        needed = p_value < SIGNIFICANT or (
+        needed = p_value < SIGNIFICANT or kind.seen or (
             not kind.scatters and _decisive(finding, current, score))
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
-        if not rejected and not new > old:
+        if not rejected and not (new > old or (kind.seen and new == old)):
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
         found.append(Candidate(name, number, finding, new, rejected))

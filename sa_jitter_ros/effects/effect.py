@@ -84,6 +84,8 @@ class Effect:
     summary: ClassVar[str]
     #: Whether amplitudes scatter while the attenuation, raw over corrected, stays as it is.
     scatters: ClassVar[bool] = False
+    #: Whether it is seen in the pulses themselves, so that it is reported whatever it does.
+    seen: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check every parameter."""
