@@ -146,7 +146,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         found = [item for item in found if item.recovered]
         if not found:
             raise SignalError('the pulse errors cannot be recovered from the vibration: '
-                              f'{reason}; give reference_pulse_times or orders that stand above the noise')
+                              f'{reason}; give reference_pulse_times or orders above the noise')
     return Observation(
         model, tuple(found), np.array(declared), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, recording.description)

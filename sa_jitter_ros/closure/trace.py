@@ -33,6 +33,8 @@ SIGNIFICANT = 0.02
 _EVIDENCE = 1e-3
 _DECISIVE, _MATERIAL = 1e-6, 0.01
 _MOST_EFFECTS = 4
+# Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
+_SAME = 0.01
 _FEWEST = 4
 # Most specific evidence first: what one sees in the pulse times themselves, then in the order of
 # the pulse errors, then in their size, then in amplitudes.
@@ -247,7 +249,7 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
-        if not rejected and not (new > old or (kind.seen and new == old)):
+        if not rejected and not (new > old or (kind.seen and new > old - _SAME)):
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
         found.append(Candidate(name, number, finding, new, rejected))
