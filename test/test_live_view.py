@@ -266,7 +266,7 @@ def test_an_envelope_keeps_every_peak(values, half):
     assert shown.shape[1] <= 2 * half
     np.testing.assert_array_equal(shown.max(axis=1), values.max(axis=1))
     np.testing.assert_array_equal(shown.min(axis=1), values.min(axis=1))
-    limit = 1e-5 * np.abs(values).max()
+    limit = 1e-5 * np.abs(values).max() + 1e-300  # where digits of a float end
     np.testing.assert_allclose(board.rounded(values), values, atol=limit, rtol=0.0)
 
 
@@ -542,7 +542,7 @@ def test_the_demo_prints_an_address_that_answers(process_environment, tmp_path):
         assert parts['settings']['content']['channel_names'] == ['channel 0', 'channel 1']
     finally:
         demo.send_signal(signal.SIGINT)
-        demo.stdout.close()
-        assert demo.wait(timeout=30.0) == 130
+        demo.communicate(timeout=30.0)  # reads on: it may be printing
+        assert demo.returncode == 130
     with socket.socket() as probe:
         assert probe.connect_ex(('127.0.0.1', int(address[1]))) != 0

@@ -215,7 +215,7 @@ def test_result_with_an_impossible_count_is_refused(position, value):
     header = [0.0, 1.0, 3.0, 40.0, 40.0, 25.0]
     header[position] = value
     message = messages.encode_array(np.zeros((1, 4)), ('channel', 'angle'), tuple(header))
-    with pytest.raises(MessageError, match='is .*: send a whole number'):
+    with pytest.raises(MessageError, match=r'is .*: send a whole number'):
         messages.decode_average('synchronous_average', message)
 
 

@@ -2,9 +2,9 @@
 The beat that an interpolator leaves: how much amplitude it cost, from the samples alone.
 
 Samples that were read between the samples of another clock lose amplitude most half-way between
-two of them and nothing on one of them. As the two clocks drift through each other, every line beats
-at one common frequency, the more the higher its own frequency is. The depth of the beat tells the
-mean loss, which raw and corrected amplitudes share and their ratio does not show.
+two of them and nothing on one of them. As the two clocks drift through each other, every line
+beats at one common frequency, the more the higher its own frequency is. The depth of the beat
+tells the mean loss, which raw and corrected amplitudes share and their ratio does not show.
 """
 
 from dataclasses import dataclass
