@@ -18,6 +18,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sa_jitter_ros.errors import MessageError, SaJitterError
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.nodes.parameters import Parameter, ParameterSet
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
@@ -127,6 +128,7 @@ class MonitoringNode(Node):
 
 def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Spin one node until SIGINT or SIGTERM; 0, or 2 with one line on unusable arguments."""
+    use_one_thread()
     try:
         rclpy.init(args=args)
     except RuntimeError as error:  # rcl could not read the command line or a parameter file
