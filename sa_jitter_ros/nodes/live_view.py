@@ -43,6 +43,8 @@ PARAMETERS = (
 class LiveView(MonitoringNode):
     """Serves a page with the latest results of the other nodes."""
 
+    _server: PageServer | None = None  # until the parameters have been found good
+
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('live_view', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
@@ -73,7 +75,8 @@ class LiveView(MonitoringNode):
 
     def destroy_node(self) -> None:
         """Close the page, too."""
-        self._server.close()
+        if self._server is not None:
+            self._server.close()
         super().destroy_node()
 
     def _apply(self, values: Values) -> None:
