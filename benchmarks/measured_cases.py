@@ -24,6 +24,7 @@ from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.recordings import open_recording
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ChannelSelection, Recording
+from scipy import stats
 import yaml
 
 CLOCKS = (3300.0, 4700.0, 5120.0, 6000.0, 9100.0)
@@ -156,16 +157,34 @@ def table(cases: Sequence[Case], first: str) -> str:
     return '\n'.join(lines)
 
 
+def clock_errors(clock: float, data: Path) -> tuple[Any, Any]:
+    """Return the pulse errors in periods of the clock, and the true times of the pulses in s."""
+    recording = gear0(clock)(data)
+    pulses, truth = recording.pulse_times, recording.reference_pulse_times
+    assert pulses is not None
+    assert truth is not None
+    return clock * (pulses - truth), truth
+
+
+def clock_table(data: Path) -> str:
+    """Return what the clocks do to the pulses of the gearbox."""
+    lines = ['| clock | ticks a revolution | correlation of neighbouring errors '
+             '| KS distance from uniform |', '|---|---|---|---|']
+    for clock in CLOCKS:
+        errors, truth = clock_errors(clock, data)
+        lines.append(f'| {clock:.0f} Hz | {clock * np.diff(truth).mean():.2f} | '
+                     f'{np.corrcoef(errors[1:], errors[:-1])[0, 1]:.2f} | '
+                     f'{stats.kstest(errors, "uniform").statistic:.2f} |')
+    return '\n'.join(lines)
+
+
 def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
     """Draw what the clock does to the pulses, and the lines before and after it is known."""
     figure = Figure(figsize=(10.0, 3.6), layout='constrained')
     left, right = figure.subplots(1, 2)
     for clock, colour in ((FITTED, 'tab:orange'), (6000.0, 'tab:purple')):
-        recording = gear0(clock)(data)
-        pulses, truth = recording.pulse_times, recording.reference_pulse_times
-        assert pulses is not None
-        assert truth is not None
-        left.plot(clock * (pulses - truth)[:_SHOWN], '.-', color=colour, linewidth=0.6,
+        errors, _ = clock_errors(clock, data)
+        left.plot(errors[:_SHOWN], '.-', color=colour, linewidth=0.6,
                   markersize=4, label=f'clock of {clock:.0f} Hz')
     left.set(xlabel='revolution', ylabel='pulse error in periods of the clock', ylim=(-0.05, 1.25),
              title='Errors of a steady machine repeat')
@@ -206,6 +225,7 @@ def main() -> None:
     parser.add_argument('--data', type=Path, required=True, help='folder of the recordings')
     parser.add_argument('--figures', type=Path, help='folder for the figures')
     options = parser.parse_args()
+    print(f'{clock_table(options.data)}\n', flush=True)
     gearbox = [run(case, options.data) for case in gearbox_cases()]
     print(table(gearbox, 'gearbox, clock'), flush=True)
     source = run(Case('', [gear0(FITTED, _FIRST_HALF)], {**GEAR0, 'keyphasor_rate': FITTED}),
