@@ -10,6 +10,7 @@ import json
 import os
 from pathlib import Path
 import resource
+from statistics import median
 import subprocess
 import sys
 import tempfile
@@ -89,6 +90,30 @@ def recovery(count: int, rounds: int) -> dict[str, float]:
             for name, timing in interleaved(calls, rounds=rounds).items()}
 
 
+def recovery_by_threads(count: int, rounds: int) -> dict[str, float]:
+    """Milliseconds on the clock for one recovery, by the threads of linear algebra."""
+    found = {}
+    for threads in sorted({1, os.cpu_count() or 1}):
+        done = subprocess.run(
+            [sys.executable, __file__, '--clock', str(count), '--rounds', str(rounds)],
+            env={**os.environ, 'OMP_NUM_THREADS': str(threads)}, stdout=subprocess.PIPE,
+            check=True)
+        found[str(threads)] = float(done.stdout)
+    return found
+
+
+def clock(count: int, rounds: int) -> float:
+    """Return the median milliseconds on the clock for one recovery of 8 channels."""
+    cycles, periods, jitter = trigger_cycles(count, 8)
+    elapsed = []
+    for _ in range(rounds + 1):
+        start = time.perf_counter()
+        recover_pulse_errors(cycles, periods=periods, ratio=RATIO,
+                             declared_standard_deviation=jitter)
+        elapsed.append(1e3 * (time.perf_counter() - start))
+    return median(elapsed[1:])
+
+
 def iterations(count: int, rounds: int) -> dict[str, float]:
     """Monte Carlo iterations per second: averages of 40 trigger cycles at one order."""
     signal = AveragedSignal(trigger_cycles=40, cycle_length=RATIO, order=19.0)
@@ -143,12 +168,17 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Measure prediction, recovery and the loop.')
     parser.add_argument('--scale', type=float, default=1.0, help='of all sizes')
     parser.add_argument('--rounds', type=int, default=9, help='turns of every call')
+    parser.add_argument('--clock', type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     scale, rounds = options.scale, options.rounds
+    if options.clock:
+        print(clock(options.clock, rounds))
+        return 0
     found: dict[str, Any] = {'machine': machine()}
     for name, measure in (
             ('prediction', partial(prediction, max(round(64 * scale), 2), rounds)),
             ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
+            ('threads', partial(recovery_by_threads, max(round(100 * scale), 20), rounds)),
             ('iterations', partial(iterations, round(200000 * scale), rounds)),
             ('close_loop', partial(close_loop, max(10.0 * scale, 3.0)))):
         print(f'loop: {name}', file=sys.stderr, flush=True)

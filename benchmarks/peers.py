@@ -14,7 +14,6 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 from record import make_record, RATE, Record, SPEED, SPEED_VARIATION
-from sa_jitter_ros.angle.laws import angle_law, cycle_times
 from sa_jitter_ros.angle.pulses import PulseValidator
 from sa_jitter_ros.angle.resampling import interpolate, margin
 from sa_jitter_ros.averaging.shaft import AverageSettings, SynchronousAverage
@@ -61,22 +60,6 @@ def on_line(record: Record, interpolation: str = 'band_limited') -> FloatArray:
     return next(stream(record, interpolation=interpolation)).waveform
 
 
-def resampled(record: Record, interpolation: str = 'band_limited') -> FloatArray:
-    """Resample a record that is there and take the mean, as the peers do."""
-    law, pulses = angle_law('linear'), record.fundamental_pulses()
-    u = np.arange(record.cycle_samples) / record.cycle_samples
-    total = np.zeros((record.cycle_samples, record.channels))
-    reach = margin(interpolation) + 1
-    for cycle in range(len(pulses) - 1):
-        positions = cycle_times(law, pulses, cycle, u) * record.rate
-        start = max(int(positions[0]) - reach, 0)
-        total += interpolate(record.frames[start:int(positions[-1]) + reach + 1],
-                             positions - start, method=interpolation)
-    return total.T / (len(pulses) - 1)
-
-
-# --- MATLAB's tsa, and scipy's other interpolators in its place ----------------------------------
-
 def _grid(record: Record) -> tuple[FloatArray, int, int]:
     """Positions (samples) of equal steps of time in every cycle; cycles and points in each."""
     pulses, points = record.fundamental_pulses(), record.cycle_samples
@@ -84,6 +67,24 @@ def _grid(record: Record) -> tuple[FloatArray, int, int]:
     times = pulses[:-1, None] + np.diff(pulses)[:, None] * u
     return times.ravel() * record.rate, len(pulses) - 1, points
 
+
+def resampled(record: Record, interpolation: str = 'band_limited', together: int = 9600
+              ) -> FloatArray:
+    """Resample a record that is there, some cycles `together`, and take the mean, as peers do."""
+    positions, cycles, points = _grid(record)
+    total = np.zeros((points, record.channels))
+    length = max(together // points, 1) * points
+    reach = margin(interpolation) + 1
+    for first in range(0, len(positions), length):
+        part = positions[first:first + length]
+        start = max(int(part[0]) - reach, 0)
+        values = interpolate(record.frames[start:int(part[-1]) + reach + 1], part - start,
+                             method=interpolation)
+        total += values.reshape(-1, points, record.channels).sum(axis=0)
+    return total.T / cycles
+
+
+# --- MATLAB's tsa, and scipy's other interpolators in its place ----------------------------------
 
 def tsa_linear(record: Record) -> FloatArray:
     """`tsa` with its default method 'linear'."""

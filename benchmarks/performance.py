@@ -3,7 +3,7 @@ Measure everything that docs/performance.md says, and write it there.
 
     .venv/bin/python benchmarks/performance.py
 
-takes about ten minutes. Peers are installed into `benchmarks/.venv` (phonometry needs a
+takes a quarter of an hour. Peers are installed into `benchmarks/.venv` (phonometry needs a
 `python3.13` in PATH); what cannot be installed is skipped and named. The tables between the
 markers of the page are replaced, the figures drawn again, and all numbers kept in
 `out/performance.json`.

@@ -33,6 +33,9 @@ def sections(found: Mapping[str, Any]) -> dict[str, str]:
     return {
         'machine': _machine(core, loop, graph), 'core': _comparisons(core['comparisons']),
         'limits': _limits(core), 'growth': _growth(core), 'loop': _loop(loop),
+        'threads': table(('threads of linear algebra', 'recovery of 100 trigger cycles x 8 '
+                          'channels, on the clock'),
+                         [(name, f'{value:.0f} ms') for name, value in loop['threads'].items()]),
         'graph': _graph(graph['runs']), 'latency': _latency(graph['latency']),
         'saturation': _saturation(graph['runs'])}
 
@@ -139,9 +142,9 @@ def _saturation(runs: Iterable[Mapping[str, Any]]) -> str:
     for run in failed:
         diagnostics = run['diagnostics']
         counts = ', '.join(f'{key} {value}' for key, value in diagnostics['counts'].items())
-        messages = '\n'.join(f'    {message}' for message in diagnostics['messages'])
         texts.append(f'{run["channels"]} channels: level {diagnostics["level"]} (1 = WARN), '
-                     f'{counts}\n\n{messages}')
+                     f'{counts}')
+        texts += [f'    {message}' for message in diagnostics['messages']]
     return '\n\n'.join(texts)
 
 
@@ -160,10 +163,12 @@ def _draw_core(comparison: Mapping[str, Any]) -> Figure:
         if row['gains'] is None:
             continue
         own = name.startswith('sa_jitter')
+        below = name in (OURS, 'tsa linear')  # their labels would meet another
         error = abs(row['gains'][-1])
         axes.loglog(row['nanoseconds'], error, 'o', color='tab:blue' if own else 'tab:gray')
         axes.annotate(name.replace('sa_jitter_ros, ', ''), (row['nanoseconds'], error),
-                      xytext=(5, 4), textcoords='offset points', fontsize='small',
+                      xytext=(5, -12 if below else 4), textcoords='offset points',
+                      fontsize='small',
                       color='tab:blue' if own else 'black')
     axes.set_xlabel('CPU time per sample and channel [ns]')
     axes.set_ylabel('gain error at 0.30 of the sampling rate [dB]')
@@ -180,6 +185,8 @@ def _draw_growth(core: Mapping[str, Any]) -> Figure:
     panels = figure.subplots(2, 3).ravel()
     for axes, (name, values) in zip(panels, growth):
         axes.semilogx([float(key) for key in values], list(values.values()), 'o-')
+        axes.set_xticks([float(key) for key in values], list(values), fontsize='small')
+        axes.minorticks_off()
         limit = max(core['limits']['memory'], core['limits']['arithmetic'])
         axes.axhline(limit, color='tab:red', linewidth=1.0, label='limit of the machine')
         axes.set_xlabel(name)
@@ -188,7 +195,7 @@ def _draw_growth(core: Mapping[str, Any]) -> Figure:
     panels[4].plot([float(key) for key in memory], list(memory.values()), 'o-')
     panels[4].set_xlabel('record length in s')
     panels[4].set_ylabel('peak memory [MB]')
-    panels[4].set_ylim(bottom=0.0)
+    panels[4].set_ylim(0.0, 1.3 * max(memory.values()))
     averaging = core['growth']['averaging']
     panels[5].bar(list(averaging), list(averaging.values()))
     panels[5].set_xlabel('averaging')

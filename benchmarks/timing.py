@@ -23,7 +23,7 @@ class Timing:
 
 
 def interleaved(calls: Mapping[str, Callable[[], object]], *, rounds: int = 5,
-                budget: float = 20.0) -> dict[str, Timing]:
+                budget: float = 8.0) -> dict[str, Timing]:
     """
     Time calls in turns (A, B, A, B, ...), so that all of them see the same machine.
 
