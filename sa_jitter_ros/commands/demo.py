@@ -140,7 +140,8 @@ def main(args: Sequence[str] | None = None) -> int:
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
     context = rclpy.Context()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends the nodes as Ctrl-C does
+    for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores SIGINT
+        signal.signal(number, signal.default_int_handler)
     try:
         plan = SIMULATED
         if options.recording:
