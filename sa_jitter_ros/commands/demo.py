@@ -75,7 +75,7 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
 
     print('waiting for the nodes ...', flush=True)
     end = time.monotonic() + START_TIMEOUT
-    listeners = ['vibration', 'tach_waveform' if plan.waveform else 'tach_pulse']
+    listeners = ['vibration', 'tach_pulse', *(['tach_waveform'] if plan.waveform else [])]
     started, address = None, ''
     while started is None:
         spin(0.2)
@@ -88,6 +88,7 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
         elif watcher.prediction is not None and all(
                 watcher.count_subscribers(topic) and watcher.count_publishers(topic)
                 for topic in listeners):
+            spin(1.0)  # the graph knows of them before they know of each other
             started = watcher.set_parameter(plan.source, 'playing', True)
     end = time.monotonic() + plan.seconds + START_TIMEOUT
     last, count = time.monotonic(), 0
