@@ -4,9 +4,9 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
+from sa_jitter_ros.averaging.gear_signals import gear_lines, GearSettings, separate
 from sa_jitter_ros.averaging.indicators import (
     condition_indicators, INDICATORS, RunningIndicators)
-from sa_jitter_ros.averaging.residual import gear_lines, GearSettings, separate
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sa_jitter_ros.averaging.residual import GearSettings, separate
+from sa_jitter_ros.averaging.gear_signals import GearSettings, separate
 from sa_jitter_ros.errors import SignalError
 
 Array = NDArray[Any]

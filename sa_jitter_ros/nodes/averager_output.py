@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.publisher import Publisher
+from sa_jitter_ros.averaging.gear_signals import GearSettings
 from sa_jitter_ros.averaging.indicators import INDICATORS, RunningIndicators
-from sa_jitter_ros.averaging.residual import GearSettings
 from sa_jitter_ros.averaging.shaft import SynchronousAverage
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode

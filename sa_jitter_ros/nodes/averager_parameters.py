@@ -5,7 +5,7 @@ from math import prod
 from sa_jitter_ros.angle.laws import LAWS
 from sa_jitter_ros.angle.pulses import PulseValidator
 from sa_jitter_ros.angle.resampling import METHODS
-from sa_jitter_ros.averaging.residual import GearSettings
+from sa_jitter_ros.averaging.gear_signals import GearSettings
 from sa_jitter_ros.averaging.shaft import AverageSettings, AVERAGING
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.parameters import Parameter, Values

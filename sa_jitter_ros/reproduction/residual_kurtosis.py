@@ -7,8 +7,8 @@ from typing import Any
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.gear_signals import GearSettings, separate
 from sa_jitter_ros.averaging.indicators import condition_indicators
-from sa_jitter_ros.averaging.residual import GearSettings, separate
 from sa_jitter_ros.averaging.shaft import AverageSettings
 from sa_jitter_ros.reproduction.bench import (
     acquire, FAST, machine, PINION_SPEED, RATIO, TEETH, TRIGGER_CYCLES)
