@@ -78,6 +78,29 @@ def test_page_is_written_from_small_runs(benchmark, process_environment, tmp_pat
     assert len(list(tmp_path.glob('performance-*.png'))) == 3
 
 
+def test_machines_of_another_simulator_attenuate_as_theory_says(benchmark):
+    effects, machines = benchmark('independent_effects'), benchmark('independent_machines')
+    machine = effects.draw_case((), 0).machine
+    observed = machines.attenuation(machine, machines.Disturbance(), np.random.default_rng(1))
+    width = machine.orders * machine.ratio * machine.speed / machine.keyphasor_rate
+    # E|X|, not |E X|: Var Im of the average adds half of itself over N_t
+    share = (np.arange(1000) + 0.5) / 1000
+    gain = np.mean(np.sinc(width[:, None] * (1.0 - share)) * np.sinc(width[:, None] * share),
+                   axis=1)
+    extra = (2.0 * np.pi * width) ** 2 / 24.0 / machine.trigger_cycles
+    error = observed.std(axis=0) / np.sqrt(len(observed))
+    assert np.all(np.abs(observed.mean(axis=0) - gain - extra) < 4.0 * error + 0.2 * extra)
+
+
+@pytest.mark.slow
+def test_loop_is_judged_on_a_machine_of_another_simulator(benchmark, tmp_path):
+    confusion = benchmark('independent_confusion')
+    run = confusion.judge(('excess_jitter',), 0, tmp_path)
+    assert run.right, run
+    assert run.after < 0.2 * run.before
+    assert '| excess_jitter | 1 | 1 | 1 excess_jitter |' in confusion.table([run])
+
+
 def test_page_without_a_section_is_refused(benchmark):
     with pytest.raises(ValueError, match='no section'):
         benchmark('performance_page').fill('nothing', {'core': ''})

@@ -1,0 +1,201 @@
+"""
+The loop on machines of another simulator: what it finds, and how wrong its numbers are.
+
+`python benchmarks/independent_confusion.py` draws machines (`independent_machines`), lets happen
+to them what their declared model lacks (`independent_effects`), closes the loop on recording and
+parameter file as a user does, and judges the report. It writes one line of JSON a run to the
+standard error and prints a table at the end.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping, Sequence
+import contextlib
+from dataclasses import asdict, dataclass
+import io
+import json
+from pathlib import Path
+import sys
+import tempfile
+import time
+from typing import Any
+
+from independent_effects import draw_case, KNOWN, UNKNOWN
+from independent_machines import declared, record
+import numpy as np
+from sa_jitter_ros.closure.report import report as make_report
+from sa_jitter_ros.commands import close_loop
+from sa_jitter_ros.errors import SaJitterError
+
+PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('excess_jitter', 'amplitude_modulation'),
+         ('speed_fluctuation', 'additive_noise'), ('phase_wander', 'interfering_tone'))
+_SCATTER = ('additive_noise', 'amplitude_modulation', 'interfering_tone')
+
+
+@dataclass(frozen=True)
+class Run:
+    """
+    What the loop said of one machine.
+
+    `before` and `after` are RMS residuals less their standard errors, in quadrature; `errors` are
+    those of the parameters in stated standard errors.
+    """
+
+    effects: tuple[str, ...]
+    seed: int
+    machine: str
+    seconds: float
+    status: int
+    message: str
+    verdict: str
+    found: tuple[str, ...]
+    rivals: tuple[str, ...]
+    before: float
+    after: float
+    chi2_before: float
+    chi2_after: float
+    errors: Mapping[str, float]
+
+    @property
+    def right(self) -> bool:
+        """Tell whether the loop named what happened, or said that it knows none of it."""
+        if set(self.effects) & set(UNKNOWN):
+            return self.verdict == 'unexplained' and not self.found
+        return self.status == 0 and set(self.found) == set(self.effects) and (
+            self.verdict == ('traced' if self.effects else 'none'))
+
+
+def judge(effects: tuple[str, ...], seed: int, folder: Path, *, pictures: bool = False) -> Run:
+    """
+    Draw a case, run `close_loop` on it in `folder` and read its report.
+
+    Without `pictures`, which take most of its time, the command stops short of drawing them.
+    """
+    case = draw_case(effects, seed)
+    fields = record(case.machine, case.what, np.random.default_rng([seed, 1]))
+    np.savez(folder / 'machine.npz', **fields)
+    (folder / 'model.yaml').write_text(declared(case.machine))
+    arguments = [str(folder / 'machine.npz'), '--declared', str(folder / 'model.yaml'),
+                 '--output', str(folder / 'report'), '--quiet']
+    error = io.StringIO()
+    start = time.perf_counter()
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
+            status, report = _closed(arguments, pictures)
+    except Exception as crash:  # a crash is a finding, too
+        status, report = 1, {}
+        error.write(f'crashed: {crash!r}')
+    seconds = time.perf_counter() - start
+    item = case.machine
+    text = (f'fs {item.sample_rate:g}, {item.speed:.1f} Hz, r {item.cycle_length:.3g} '
+            f'({item.pulses_per_trigger}/{item.pulses_per_revolution}), '
+            f'{item.trigger_cycles}x{item.acquisitions}, {len(item.peaks)} ch, '
+            f'orders {np.round(item.orders, 1).tolist()}, gD '
+            f'{item.top / item.keyphasor_rate:.2f}, top {item.top / item.sample_rate:.2f}, '
+            f'noise {item.noise_std:.2g}/{item.noise_colour:.1f}'
+            f'{", reference" * item.reference}{", waveform" * item.waveform}')
+    if status:
+        nan = float('nan')
+        return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', (), (),
+                   nan, nan, nan, nan, {})
+    found = report['missing_effects']
+    return Run(
+        effects, seed, text, seconds, status, error.getvalue().strip(), report['verdict'],
+        tuple(one['name'] for one in found),
+        tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
+        _rms(report['error_before']), _rms(report['error_after']),
+        report['error_before']['chi2_per_dof'], report['error_after']['chi2_per_dof'],
+        {f'{one["name"]}.{name}': _standard_errors(value, case.truth[one['name']][name])
+         for one in found for name, value in one['parameters'].items()
+         if name in case.truth.get(one['name'], {}) and value['standard_error'] is not None})
+
+
+def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str, Any]]:
+    """Run the command; return its exit status and report."""
+    options = close_loop.make_parser().parse_args(arguments)
+    if pictures:
+        status = close_loop.main(arguments)
+        return status, {} if status else json.loads((options.output / 'report.json').read_text())
+    try:
+        return 0, make_report(close_loop.run(options))
+    except SaJitterError as error:
+        print(error, file=sys.stderr)
+        return 2, {}
+
+
+def _rms(error: Mapping[str, Any]) -> float:
+    return float(np.sqrt(max(error['rms']**2 - error['rms_standard_error']**2, 0.0)))
+
+
+def _standard_errors(stated: Mapping[str, Any], truth: Any) -> float:
+    """Return the error of a parameter in standard errors, of a list its root mean square."""
+    value, error = np.array(stated['value']), np.array(stated['standard_error'])
+    if value.shape != np.shape(truth):
+        return float('nan')
+    off = value - truth
+    off = off - off.mean() if off.ndim else off
+    with np.errstate(divide='ignore', invalid='ignore'):
+        z = off / error
+    return float(np.sqrt(np.nanmean(z**2))) if z.ndim else float(z)
+
+
+def table(runs: Sequence[Run]) -> str:
+    """Return the confusion matrix and what became of the numbers, in Markdown."""
+    lines = ['| undeclared | runs | right | found | RMS before, after (median) | five-fold | '
+             'chi2 per dof before, after (median) | parameters within 3 standard errors |',
+             '|---|---|---|---|---|---|---|---|']
+    for effects in dict.fromkeys(run.effects for run in runs):
+        rows = [run for run in runs if run.effects == effects]
+        found = Counter(f'exit {run.status}' if run.status else (
+            '+'.join(run.found) or '-') + {'unexplained': ' *unexplained*'}.get(run.verdict, '')
+            for run in rows)
+        good = [run for run in rows if not run.status]
+        errors = [z for run in good for z in run.errors.values() if np.isfinite(z)]
+        fall = [run.after <= 0.2 * run.before for run in good]
+        numbers = np.median(np.array([[run.before, run.after, run.chi2_before, run.chi2_after]
+                                      for run in good] or [[np.nan] * 4]), axis=0)
+        lines.append(
+            f'| {" + ".join(effects) or "declared model"} | {len(rows)} | '
+            f'{sum(run.right for run in rows)} | '
+            f'{", ".join(f"{count} {name}" for name, count in found.most_common())} | '
+            f'{numbers[0]:.4f}, {numbers[1]:.4f} | '
+            f'{"-" if set(effects) <= {*_SCATTER, *UNKNOWN} else f"{sum(fall)} of {len(fall)}"} | '
+            f'{numbers[2]:.3g}, {numbers[3]:.3g} | '
+            f'{f"{sum(abs(z) < 3 for z in errors)} of {len(errors)}" if errors else "-"} |')
+    return '\n'.join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the campaign."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, default=6, help='machines an effect')
+    parser.add_argument('--null', type=int, default=40, help='machines that are as declared')
+    parser.add_argument('--unknown', type=int, default=6, help='machines an effect in no module')
+    parser.add_argument('--pairs', type=int, default=3, help='machines a pair of effects')
+    parser.add_argument('--first', type=int, default=0, help='first seed')
+    parser.add_argument('--only', help='one case, effects joined by +')
+    parser.add_argument('--pictures', action='store_true', help='run the whole command')
+    parser.add_argument('--keep', type=Path, help='folder for all files of the runs')
+    options = parser.parse_args(arguments)
+    plan = [((), options.null), *(((name,), options.seeds) for name in KNOWN),
+            *(((name,), options.unknown) for name in UNKNOWN),
+            *((pair, options.pairs) for pair in PAIRS)]
+    if options.only is not None:
+        plan = [(tuple(name for name in options.only.split('+') if name), options.seeds)]
+    runs = []
+    for effects, count in plan:
+        for seed in range(options.first, options.first + count):
+            with tempfile.TemporaryDirectory() as temporary:
+                folder = Path(temporary)
+                if options.keep:
+                    folder = options.keep / f'{"+".join(effects) or "none"}_{seed}'
+                    folder.mkdir(parents=True, exist_ok=True)
+                run = judge(effects, seed, folder, pictures=options.pictures)
+            runs.append(run)
+            print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
+    print(table(runs))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,276 @@
+"""
+Machines of another simulator: nothing of `sa_jitter_ros` is used or known here.
+
+A machine turns by a closed-form angle, so that pulses and samples are exact at any time: a tach
+shaft whose marks make pulses, gears on a shaft of interest whose orders, sidebands and strangers
+make the vibration. It is drawn at random. `Disturbance` holds what may happen to it beyond the
+declared model, which is: steady speed, pulses off by independent uniform errors of one keyphasor
+sample, white noise.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+Array = NDArray[Any]
+Generator = np.random.Generator
+
+_NODES = 24
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A sum of sinusoids: `rate` (Hz), peak `size` and `phase` (rad), all (wave,)."""
+
+    rate: Array
+    size: Array
+    phase: Array
+
+    def __call__(self, time: Array, *, slope: bool = False) -> Array:
+        """Return the value, or the slope per second, at `time` (any shape)."""
+        total = np.zeros(np.shape(time))
+        for rate, size, phase in zip(2.0 * np.pi * self.rate, self.size, self.phase):
+            total += size * rate * np.cos(rate * time + phase) if slope else (
+                size * np.sin(rate * time + phase))
+        return total
+
+    def scaled(self, factor: float) -> 'Waves':
+        """Return the waves times a factor."""
+        return replace(self, size=factor * self.size)
+
+
+def band(rng: Generator, low: float, high: float, count: int = 24) -> Waves:
+    """Return nearly normal noise of standard deviation 1 between two frequencies (Hz)."""
+    edges = np.linspace(low, high, count + 1)
+    return Waves(rng.uniform(edges[:-1], edges[1:]), np.full(count, np.sqrt(2.0 / count)),
+                 rng.uniform(0.0, 2.0 * np.pi, count))
+
+
+NOTHING = Waves(np.zeros(0), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Machine:
+    """
+    A machine that follows its declared model; frequencies in Hz.
+
+    `components` (component,) are orders of the shaft of interest, the first of them the declared
+    `orders`; `peaks` (channel, component) complex amplitudes; `drift` the angle of the tach shaft
+    in revolutions beyond its mean speed. `noise_colour` is the pole of a first-order low pass.
+    """
+
+    sample_rate: float
+    speed: float
+    ratio: float
+    pulses_per_revolution: int
+    pulses_per_trigger: int
+    trigger_cycles: int
+    acquisitions: int
+    keyphasor_rate: float
+    orders: Array
+    components: Array
+    peaks: Array
+    noise_std: float
+    noise_colour: float
+    drift: Waves
+    relative_drift: float
+    start_time: float
+    reference: bool
+    waveform: bool
+
+    @property
+    def trigger_period(self) -> float:
+        """Return the trigger period in s."""
+        return self.pulses_per_trigger / self.pulses_per_revolution / self.speed
+
+    @property
+    def cycle_length(self) -> float:
+        """Return the fundamental cycles in a trigger cycle."""
+        return self.ratio * self.pulses_per_trigger / self.pulses_per_revolution
+
+    @property
+    def average(self) -> float:
+        """Return the length of an average in s."""
+        return self.trigger_cycles * self.trigger_period
+
+    @property
+    def top(self) -> float:
+        """Return the frequency of the highest declared order."""
+        return float(self.orders.max() * self.ratio * self.speed)
+
+    @property
+    def levels(self) -> Array:
+        """Return the peaks (channel, order) of the declared orders."""
+        return np.abs(self.peaks[:, :self.orders.size])
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """
+    What happens beyond the declared model.
+
+    `ripple` (revolutions of the tach shaft), `wander` (cycles of the shaft of interest) and `gain`
+    (relative) act on the motion and the source; `marks` (rad), `errors` (a function of generator,
+    machine and true times, s), `clock` (Hz), `skew` and `lost` on the pulses; `resampled` is the
+    relative offset of the clock from whose samples the record was interpolated linearly; `paths`
+    (channel, component, state) and `dwell` (s) switch the peaks; `resonance` is a natural
+    frequency in Hz and its damping.
+    """
+
+    ripple: Waves = NOTHING
+    wander: Waves = NOTHING
+    gain: Waves = NOTHING
+    marks: Array | None = None
+    errors: Callable[[Generator, Machine, Array], Array] | None = None
+    clock: float = 0.0
+    skew: float = 0.0
+    lost: float = 0.0
+    resampled: float = 0.0
+    noise: float = 0.0
+    tone: tuple[float, float] = (0.0, 0.0)
+    paths: Array | None = None
+    dwell: float = 0.0
+    resonance: tuple[float, float] = (0.0, 0.0)
+
+
+def revolutions(machine: Machine, what: Disturbance, time: Array) -> Array:
+    """Return the angle of the tach shaft."""
+    return np.asarray(machine.speed * time + machine.drift(time) + what.ripple(time))
+
+
+def crossings(machine: Machine, what: Disturbance, angle: Array) -> Array:
+    """Return when the tach shaft is at `angle` (revolutions): a quickly contracting iteration."""
+    time = angle / machine.speed
+    for _ in range(60):
+        step = (revolutions(machine, what, time) - angle) / machine.speed
+        time = time - step
+        if np.max(np.abs(step)) < 1e-14 * max(1.0, float(np.max(np.abs(time)))):
+            break
+    return np.asarray(time)
+
+
+def pulses(machine: Machine, what: Disturbance, rng: Generator) -> tuple[Array, Array]:
+    """Return measured and true pulse times; only the measured ones lack the lost pulses."""
+    per = machine.pulses_per_revolution
+    count = per + int(per * machine.speed * machine.average * machine.acquisitions
+                      * 1.002) + machine.pulses_per_trigger
+    base = revolutions(machine, what, np.array(machine.start_time + 0.01)) + rng.uniform() / per
+    angle = base + np.arange(count) / per
+    true = crossings(machine, what, angle)
+    late = np.zeros(count) if what.marks is None else np.resize(what.marks, count) / (2.0 * np.pi)
+    time = crossings(machine, what, angle + late)
+    jitter = rng.uniform(-0.5, 0.5, count) / machine.keyphasor_rate
+    if what.errors is not None:
+        time = time + what.errors(rng, machine, true)
+    if what.clock:
+        time = np.ceil(time * what.clock) / what.clock
+    else:
+        time = time + jitter
+    time = time + what.skew * (time - machine.start_time)
+    return time[rng.uniform(size=count) >= what.lost], true
+
+
+def attenuation(machine: Machine, what: Disturbance, rng: Generator) -> Array:
+    """
+    Return |X| (acquisition, order) of unit components, by the definition.
+
+    The angle is read linearly between the measured pulses and the source followed at those times.
+    """
+    times = pulses(machine, what, rng)[0][::machine.pulses_per_trigger]
+    per = machine.trigger_cycles
+    count = (times.size - 1) // per
+    u = (np.arange(_NODES) + 0.5) / _NODES
+    starts = times[:-1, None] + np.diff(times)[:, None] * u
+    angle = machine.ratio * revolutions(machine, what, starts) + what.wander(starts)
+    error = angle - machine.cycle_length * (np.arange(times.size - 1)[:, None] + u)
+    waves = np.exp(2j * np.pi * machine.orders[:, None, None] * error)[:, :count * per]
+    return np.abs(waves.reshape(machine.orders.size, count, -1).mean(axis=2)).T
+
+
+def vibration(machine: Machine, what: Disturbance, rng: Generator) -> Array:
+    """Return what every channel measures (channel, sample)."""
+    duration = machine.average * machine.acquisitions + 3.0 * machine.trigger_period + 0.1
+    time = machine.start_time + np.arange(int(duration * machine.sample_rate)
+                                          ) / machine.sample_rate
+    if not what.resampled:
+        samples = _clean(machine, what, time, rng)
+    else:
+        rate = machine.sample_rate * (1.0 + what.resampled)
+        place = (1.0 + what.resampled) * np.arange(time.size)
+        samples = _clean(machine, what, time[0] + np.arange(int(place[-1]) + 2) / rate, rng)
+        index = place.astype(int)
+        samples = samples[:, index] + (place - index) * (
+            samples[:, index + 1] - samples[:, index])
+    for std, pole in ((machine.noise_std, machine.noise_colour), (what.noise, 0.0)):
+        if std:
+            noise = rng.standard_normal(samples.shape)
+            samples += std * np.sqrt(1.0 - pole**2) * signal.lfilter([1.0], [1.0, -pole], noise)
+    return samples
+
+
+def _clean(machine: Machine, what: Disturbance, time: Array, rng: Generator) -> Array:
+    turns = machine.ratio * revolutions(machine, what, time) + what.wander(time)
+    fundamental = machine.ratio * (machine.speed + machine.drift(time, slope=True)
+                                   + what.ripple(time, slope=True))
+    state = np.zeros(time.size, int)
+    if what.paths is not None:
+        stays = rng.exponential(what.dwell, 3 * int(np.ptp(time) / what.dwell) + 50)
+        state = np.searchsorted(time[0] + np.cumsum(stays), time) % 2
+    total = np.zeros((machine.peaks.shape[0], time.size))
+    for i, order in enumerate(machine.components):
+        wave = np.exp(2j * np.pi * order * turns)
+        natural, damping = what.resonance
+        if natural:
+            x = order * fundamental / natural
+            wave = wave * 2.0 * damping / (1.0 - x**2 + 2j * damping * x)
+        for c, peak in enumerate(machine.peaks[:, i]):
+            factor = peak if what.paths is None else peak * what.paths[c, i][state]
+            total[c] += (factor * wave).real
+    frequency, amplitude = what.tone
+    total *= 1.0 + what.gain(time)
+    if amplitude:
+        phase = rng.uniform(0.0, 2.0 * np.pi, (total.shape[0], 1))
+        total += amplitude * np.cos(2.0 * np.pi * frequency * time + phase)
+    return total
+
+
+def record(machine: Machine, what: Disturbance, rng: Generator) -> dict[str, Any]:
+    """Return the fields of a `.npz` recording."""
+    measured, true = pulses(machine, what, rng)
+    fields: dict[str, Any] = {
+        'vibration': vibration(machine, what, rng), 'sample_rate': machine.sample_rate,
+        'start_time': machine.start_time, 'ratio': machine.ratio,
+        'pulses_per_revolution': machine.pulses_per_revolution,
+        'pulses_per_trigger': machine.pulses_per_trigger}
+    if machine.reference:
+        fields['reference_pulse_times'] = true + rng.uniform(
+            -0.005, 0.005, true.size) / machine.keyphasor_rate
+    if machine.waveform:
+        time = machine.start_time + np.arange(fields['vibration'].shape[1]) / machine.sample_rate
+        width, ramp = 0.2 * float(np.diff(true).min()), 3.0 / machine.sample_rate
+        last = np.clip(np.searchsorted(measured - ramp, time) - 1, 0, measured.size - 1)
+        since = time - measured[last]
+        level = np.clip(since / ramp + 0.5, 0.0, 1.0) - np.clip(
+            (since - width) / ramp + 0.5, 0.0, 1.0)
+        fields['tach'] = 5.0 * level + 0.02 * rng.standard_normal(time.size)
+        fields['tach_rate'] = machine.sample_rate
+    else:
+        fields['pulse_times'] = measured
+    return fields
+
+
+def declared(machine: Machine) -> str:
+    """Return the parameter file of `jitter_predictor` that declares the machine."""
+    values = {
+        'keyphasor_rate': machine.keyphasor_rate, 'trigger_speed': machine.speed,
+        'pulses_per_revolution': machine.pulses_per_revolution,
+        'pulses_per_trigger': machine.pulses_per_trigger,
+        'trigger_cycles': machine.trigger_cycles, 'ratio': machine.ratio,
+        'orders': [float(g) for g in machine.orders], 'sample_rate': machine.sample_rate,
+        'noise_std': 0.0 if machine.noise_colour else machine.noise_std}
+    return 'jitter_predictor:\n  ros__parameters:\n' + ''.join(
+        f'    {name}: {value}\n' for name, value in values.items())
