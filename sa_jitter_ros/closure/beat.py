@@ -3,8 +3,9 @@ The beat that an interpolator leaves: how much amplitude it cost, from the sampl
 
 Samples that were read between the samples of another clock lose amplitude most half-way between
 two of them and nothing on one of them. As the two clocks drift through each other, every line
-beats at one common frequency, the more the higher its own frequency is. The depth of the beat
-tells the mean loss, which raw and corrected amplitudes share and their ratio does not show.
+beats at one common frequency and in step, the more the higher its own frequency is. The depth of
+the beat tells the mean loss, which raw and corrected amplitudes share and their ratio does not
+show.
 """
 
 from dataclasses import dataclass
@@ -55,25 +56,30 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     total = np.sum(power / floor, axis=1)
     peak = int(np.argmax(total))
     p_value = float(min(1.0, count * stats.gamma.sf(total[peak], lines)))
-    depth = 2.0 * np.sqrt(power[peak]) / window.sum()
+    swings = 2.0 * spectrum[peak] / window.sum()
+    depth = np.abs(swings)
     error = 2.0 * np.sqrt(floor) / window.sum()
     if p_value > _CERTAIN:
         return Beat('', p_value, np.ones(lines), depth)
-    best, method, gain = _misfit(depth, np.ones(lines), error)[0], '', np.ones(lines)
+    best, method, gain = _misfit(swings, np.ones(lines), error)[0], '', np.ones(lines)
     for name in METHODS:
         mean, swing = _interpolated(name, frequency)
-        misfit, size = _misfit(depth, swing / mean, error)
+        misfit, size = _misfit(swings, swing / mean, error)
         if misfit < min(best, _POOR * lines) and 0.0 < size <= _DEEPEST:
             best, method = misfit, name
             gain = 1.0 - (1.0 - mean) * np.clip(depth / (size * swing / mean), 0.5, 1.5)
     return Beat(method, p_value, gain, depth)
 
 
-def _misfit(depth: Array, shape: Array, error: Array) -> tuple[float, float]:
-    """Return the sum of squares that a shape of any size leaves, and its best size."""
-    weight = 1.0 / (error**2 + (0.05 * depth) ** 2)
-    size = float(np.sum(weight * depth * shape) / np.sum(weight * shape**2))
-    return float(np.sum(weight * (depth - size * shape) ** 2)), size
+def _misfit(swings: Array, shape: Array, error: Array) -> tuple[float, float]:
+    """
+    Return the sum of squares that a shape of any size and phase leaves, and its best size.
+
+    `swings` (line,) are complex; lines that swing out of step fit no shape.
+    """
+    weight = 1.0 / (error**2 + (0.05 * np.abs(swings)) ** 2)
+    size = np.sum(weight * swings * shape) / np.sum(weight * shape**2)
+    return float(np.sum(weight * np.abs(swings - size * shape) ** 2)), float(np.abs(size))
 
 
 def _interpolated(method: str, frequency: Array) -> tuple[Array, Array]:

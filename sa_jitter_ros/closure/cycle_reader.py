@@ -15,6 +15,7 @@ ComplexArray = NDArray[np.complex128]
 # Errors of this many declared standard deviations are tried again as if more had been declared: an
 # effect may be larger than the declared jitter, and orders may have slipped a cycle.
 _SUSPICIOUS, _WIDER = 1.3, 4.0
+_WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
 _LEAST = 1e-9
 _WHOLE = 1e-9
 _SEPARATIONS = 6
@@ -73,9 +74,17 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
     if found.accepted and found.errors.std() < _SUSPICIOUS * declared:
         return found
     wider = attempt(_WIDER)
-    if not found.accepted or (wider.accepted and _strength(wider) > _strength(found)):
+    if not found.accepted:
+        return wider if _stands_out(wider) else found
+    if wider.accepted and _strength(wider) > _strength(found):
         return wider
     return found
+
+
+def _stands_out(recovery: PulseErrorRecovery) -> bool:
+    """Tell whether the errors themselves, not only those expected, exceed their standard error."""
+    power = float(np.mean(recovery.standard_errors**2))
+    return recovery.accepted and power < _WORTHWHILE**2 * (float(recovery.errors.var()) - power)
 
 
 def _strength(recovery: PulseErrorRecovery) -> float:

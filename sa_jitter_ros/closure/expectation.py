@@ -7,8 +7,8 @@ each other with the amplitudes that the channel has.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,19 @@ from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
 from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.statistics.distributions import Normal
-from sa_jitter_ros.statistics.moments import AverageMoments, cycle_moments, noise_line_variance
+from sa_jitter_ros.statistics.moments import (
+    AverageMoments, cycle_moments, noise_line_variance, normal_mean)
+from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 Array = NDArray[Any]
 
+#: What resampling leaves of uncertainty in an amplitude, in parts of it.
+RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
 _WHOLE = 1e-9
+# Speeds closer than this are the same.
+_SPEED_STEP = 1e-3
+_SHARPEST = 2.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ class Expectation:
 
     `attenuation` and `attenuation_variance` are those of raw over corrected amplitude, without
     noise; `amplitude` and `amplitude_variance` those of the raw amplitude over its level, noise
-    included, of which `law` (flattened) is the distribution.
+    and unsteadiness included, of which `law` (flattened) is the distribution.
     """
 
     attenuation: Array
@@ -63,54 +70,101 @@ class Expectation:
 
 
 def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Effect],
-           pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int]) -> Expectation:
+           pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int], *,
+           unsteadiness: float = 0.0) -> Expectation:
     """
-    Predict the `chosen` acquisitions.
+    Predict the `chosen` acquisitions, each at its own speed.
 
     `level` (line,) are mean amplitudes, which noise is compared with; `pulses[a][i]` is what is
-    known of the pulses of acquisition a for the channels whose `group` (channel,) is i.
+    known of the pulses of acquisition a for the channels whose `group` (channel,) is i;
+    `unsteadiness` is what the amplitudes scatter by themselves, in parts of the level.
     """
-    model = observation.model
-    processes = jitter_processes(model, effects)
-    gain = np.ones(len(model.orders))
-    added = np.zeros(len(model.orders))
-    for effect in effects:
-        gain = gain * effect.gain(model)
-        added = added + effect.line_variance(model)
-    if model.noise_std:
-        added = added + noise_line_variance(model.noise_std, observation.sample_rate,
-                                            model.duration)
-    noise = added[lines.order] / level**2
-    shared: tuple[AverageMoments, Array] | None = None
-    means, variances, pseudos = [], [], []
+    settings: dict[float, _Setting] = {}
+    rows = []
     for a in chosen:
         item = observation.acquisitions[a]
-        rows = []
-        for each in pulses[a]:
-            errors = known_errors(model, effects, each)
-            if errors is None:
-                shared = shared or (_unknown(observation, effects, processes),
-                                    _leakage(observation, processes, None))
-                rows.append(shared)
-            else:
-                unsure = processes
-                if each.error_std and any(effect.replaces_jitter(model) for effect in effects):
-                    unsure = (*processes, IndependentPulseJitter(
-                        Normal(each.error_std), model.fundamental_frequency))
-                rows.append((_known(observation, unsure, errors),
-                             _leakage(observation, unsure, errors)))
-        mean, variance, pseudo = _of_lines(item, lines, rows, group)
-        means.append(mean)
-        variances.append(variance)
-        pseudos.append(pseudo)
-    moments = AverageMoments(np.concatenate(means), np.concatenate(variances),
-                             np.concatenate(pseudos)).scaled(
-        np.tile(gain[lines.order], len(means)))
-    shape = (len(means), lines.count)
+        speed = _speed(item, observation.model)
+        if speed not in settings:
+            settings[speed] = _setting(observation, speed, effects)
+        setting = settings[speed]
+        each = _of_lines(item, lines, [setting.moments(known) for known in pulses[a]], group)
+        rows.append((each.scaled(setting.gain[lines.order]), setting.noise[lines.order]))
+    moments = AverageMoments(*(np.concatenate([getattr(each, name) for each, _ in rows])
+                               for name in ('mean', 'variance', 'pseudo_variance')))
+    noise = np.array([noise for _, noise in rows]) / level**2
+    own = 2.0 * (unsteadiness**2 + RESOLUTION**2)  # half of it along the radius
     bare = normal_law(moments)
-    full = normal_law(moments.with_noise(np.tile(noise, len(means))))
-    return Expectation(bare.mean.reshape(shape), bare.variance.reshape(shape),
+    full = normal_law(moments.with_noise((noise + own).ravel()))
+    shape = noise.shape
+    return Expectation(bare.mean.reshape(shape), bare.variance.reshape(shape) + RESOLUTION**2,
                        full.mean.reshape(shape), full.variance.reshape(shape), full)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What is predicted at one speed; `gain` and `noise` (order,), E|n|^2 of peak amplitudes."""
+
+    observation: Observation
+    effects: Sequence[Effect]
+    processes: tuple[AngleErrorProcess, ...]
+    gain: Array
+    noise: Array
+
+    def moments(self, pulses: Pulses) -> tuple[AverageMoments, Array]:
+        """Return what unit components show of themselves and (order, source) of each other."""
+        model = self.observation.model
+        errors = known_errors(model, self.effects, pulses)
+        if errors is None:
+            return self._of_unknown_pulses
+        blur = 0.0
+        if any(effect.replaces_jitter(model) for effect in self.effects):
+            blur = pulses.error_std * model.fundamental_frequency
+        unsure = (*self.processes, IndependentPulseJitter(Normal(blur))) if blur else (
+            self.processes)
+        found = _known(self.observation, unsure, errors)
+        leakage = _leakage(self.observation, unsure, errors)
+        if blur:
+            found = replace(found, mean=found.mean * _sharpening(self.observation.orders, blur))
+            leakage = leakage * np.resize(_sharpening(self.observation.sources, blur),
+                                          leakage.shape[1])
+        return found, leakage
+
+    @cached_property
+    def _of_unknown_pulses(self) -> tuple[AverageMoments, Array]:
+        """What is predicted where nothing is known of the pulses."""
+        return (_unknown(self.observation, self.effects, self.processes),
+                _leakage(self.observation, self.processes, None))
+
+
+def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) -> _Setting:
+    model = replace(observation.model, trigger_speed=speed)
+    gain = np.ones(len(model.orders))
+    noise = np.zeros(len(model.orders))
+    for effect in effects:
+        gain = gain * effect.gain(model)
+        noise = noise + effect.line_variance(model)
+    if model.noise_std:
+        noise = noise + noise_line_variance(model.noise_std, observation.sample_rate,
+                                            model.duration)
+    return _Setting(replace(observation, model=model), effects, jitter_processes(model, effects),
+                    gain, noise)
+
+
+def _speed(item: Acquisition, model: DeclaredModel) -> float:
+    """Return the speed of an acquisition in Hz, the declared one unless it differs."""
+    cycles = item.missing.size + item.missing.sum()
+    ratio = model.trigger_period * cycles / (item.times[-1] - item.times[0])
+    return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))
+
+
+def _sharpening(orders: Array, blur: float) -> Array:
+    """
+    Return the factor on moments that allow for being unsure by `blur` (fundamental cycles).
+
+    Errors that are off scatter more than the true ones, so that they attenuate too much already;
+    allowing for being unsure attenuates once more. Two-fold at most: beyond, nothing is known.
+    """
+    return np.asarray(np.minimum(normal_mean(orders * blur) ** -2.0, _SHARPEST))
 
 
 @lru_cache(maxsize=8)
@@ -167,8 +221,8 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
 
 
 def _of_lines(item: Acquisition, lines: Lines, rows: Sequence[tuple[AverageMoments, Array]],
-              group: Array) -> tuple[Array, Array, Array]:
-    """Return mean, variance and pseudo-variance (line,) of unit components, with leakage."""
+              group: Array) -> AverageMoments:
+    """Return the moments (line,) of unit components, with leakage."""
     mean = np.zeros(lines.count, complex)
     variance = np.zeros(lines.count)
     pseudo = np.zeros(lines.count, complex)
@@ -186,4 +240,4 @@ def _of_lines(item: Acquisition, lines: Lines, rows: Sequence[tuple[AverageMomen
         mean[here] = moments.mean[order] + extra[channel, order]
         variance[here] = moments.variance[order]
         pseudo[here] = moments.pseudo_variance[order]
-    return mean, variance, pseudo
+    return AverageMoments(mean, variance, pseudo)

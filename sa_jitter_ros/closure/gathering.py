@@ -93,17 +93,17 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     again = [None if motion is None or smooth is None else _unskewed(observation, motion, smooth)
              for motion in again]
     spread = [motion for motion in again if motion is not None]
-    error_std = np.sqrt(np.mean(np.var(spread, axis=0, ddof=1), axis=1)) if len(spread) > 1 else (
-        np.zeros(len(observation.acquisitions)))
+    error_std = [0.0 if motion is None else _uncertainty(observation, motion, spread)
+                 for motion in again]
     known = []
     for a, item in enumerate(observation.acquisitions):
         grid = None if smooth is None else smooth[item.first:item.first + item.times.size]
         rows = []
-        for motion in again:
+        for motion, uncertain in zip(again, error_std):
             errors, std = grid, 0.0
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
             if motion is not None and precise and np.all(np.isfinite(motion[a])):
-                errors, std = _on_grid(motion[a], clock), float(np.nan_to_num(error_std[a]))
+                errors, std = _on_grid(motion[a], clock), uncertain
             rows.append(Pulses(item.times, item.first, errors, item.missing, std))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), period_std, known
@@ -204,6 +204,22 @@ def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) 
             count * model.trigger_period)),
         tone_p_value=min(1.0, count * cycles.shape[2] * float(np.exp(
             -max(height[peak, line], 0.0)))))
+
+
+def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:
+    """
+    Return how uncertain recovered errors (acquisition, pulse) are, in s.
+
+    Against a better keyphasor, what they differ from it by, its own errors included. Else the
+    delete-a-group jackknife: recoveries that leave out one group of channels each share the rest.
+    """
+    if observation.against_reference:
+        apart = motion - observation.stacked('errors')
+        variance = np.var(apart, axis=1, ddof=1)
+    else:
+        variance = (len(others) - 1) * np.var(others, axis=0, ddof=min(1, len(others) - 1))
+    variance = variance[np.isfinite(variance)]
+    return float(np.sqrt(variance.mean())) if variance.size else 0.0
 
 
 def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:

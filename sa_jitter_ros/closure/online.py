@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.closure.expectation import RESOLUTION
 from sa_jitter_ros.closure.residual import Residual, residual
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
@@ -136,8 +137,8 @@ def compare(averages: Sequence[Average], published: Published) -> tuple[Array, R
     variance = np.sum((weight * np.where(weight > 0.0, error, 0.0)) ** 2, axis=1)
     index = places(averages[-1].orders[common], published.order)
     expected = np.broadcast_to(published.mean[index], attenuation.shape)
-    total = variance + published.standard_deviation[index] ** 2
-    z = (attenuation - expected) / np.sqrt(np.maximum(total, 1e-12))
+    total = variance + published.standard_deviation[index] ** 2 + RESOLUTION**2
+    z = (attenuation - expected) / np.sqrt(total)
     found = residual(attenuation, expected, total, attenuation, expected, total, ndtr(z))
     table = np.stack((
         averages[-1].orders[common], attenuation.mean(axis=0), expected[0], found.mean,

@@ -36,6 +36,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'candidates': [_candidate(item) for item in trace.candidates],
         'error_before': errors(trace.before),
         'error_after': errors(trace.after),
+        'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
         'lines': lines,
     })

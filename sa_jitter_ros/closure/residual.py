@@ -16,10 +16,8 @@ from scipy import stats
 
 Array = NDArray[Any]
 
-#: What the observation itself may be wrong by, in parts of an amplitude.
-ACCURACY = 5e-4
-_BIAS = 3e-3
-_SCATTER = 3e-3
+#: What a predicted attenuation may be wrong by: smaller residuals are no cause for a verdict.
+ACCURACY = 3e-3
 _DRAWS, _SEED = 4000, 17
 
 
@@ -67,17 +65,17 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
     """
     Compare observed with predicted, all arrays (acquisition, line).
 
-    `variance` holds the observation's own; `probability` is the predicted distribution function at
-    the amplitudes; `sensitivities` (line,) are the changes of the prediction by one standard error
-    of each fitted parameter.
+    The variances hold those of the observation itself; `probability` is the predicted distribution
+    function at the amplitudes; `sensitivities` (line,) are the changes of the prediction by one
+    standard error of each fitted parameter.
     """
     difference = attenuation - expected
     count = len(difference)
-    scale = np.sqrt(variance + ACCURACY**2)
+    scale = np.sqrt(variance)
     mean = difference.mean(axis=0)
     error = np.sqrt(np.mean(scale**2, axis=0) / count)
     shift = amplitude - amplitude_expected
-    width = np.sqrt(amplitude_variance + ACCURACY**2)
+    width = np.sqrt(amplitude_variance)
     z = shift / width
     inside = np.clip(probability.ravel(), 1e-12, 1.0 - 1e-12)
     uniform = stats.cramervonmises(inside, 'uniform') if inside.size > 1 else None
@@ -89,8 +87,8 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         cramer_von_mises=float(uniform.statistic) if uniform is not None else float('nan'),
         coverage=float(np.mean((inside > 0.025) & (inside < 0.975))),
         p_mean=_mean_p_value(difference / scale, scale, sensitivities),
-        p_scatter=_scatter_p_value(difference - mean, scale, _BIAS),
-        p_amplitude=_scatter_p_value(shift - shift.mean(axis=0), width, _SCATTER),
+        p_scatter=_scatter_p_value(difference - mean, scale, ACCURACY),
+        p_amplitude=_scatter_p_value(shift - shift.mean(axis=0), width, ACCURACY),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)
 
@@ -117,7 +115,7 @@ def _mean_p_value(z: Array, scale: Array, sensitivities: Sequence[Array]) -> flo
     """
     count = len(z)
     bias = [np.asarray(item) / np.sqrt(np.mean(scale**2, axis=0)) for item in sensitivities]
-    bias.append(_BIAS / np.sqrt(np.mean(scale**2, axis=0)))
+    bias.append(ACCURACY / np.sqrt(np.mean(scale**2, axis=0)))
     total = np.sqrt(1.0 / count + sum(item**2 for item in bias))
     statistic = float(np.mean((z.mean(axis=0) / total) ** 2))
     centred = z - z.mean(axis=0)

@@ -17,7 +17,7 @@ from sa_jitter_ros.closure.expectation import expect, Expectation, Lines
 from sa_jitter_ros.closure.gathering import (
     channel_groups, choose_lines, gather, gather_pulses, line_evidence)
 from sa_jitter_ros.closure.observation import Observation, together
-from sa_jitter_ros.closure.residual import Residual, residual
+from sa_jitter_ros.closure.residual import ACCURACY, Residual, residual
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, LineEvidence
@@ -31,7 +31,11 @@ Progress = Callable[[str], None]
 #: A residual with a smaller p value is no chance.
 SIGNIFICANT = 0.02
 _EVIDENCE = 1e-3
-_DECISIVE, _MATERIAL = 1e-6, 0.01
+_DECISIVE, _MATERIAL = 1e-6, 2.0 * ACCURACY
+#: Scatter from average to average that is the machine's own, in parts of an amplitude: what steady
+#: machines were measured to have that no effect describes (docs/measured_cases.md).
+STEADY = 0.02
+_CHANCE = 3.0
 _MOST_EFFECTS = 4
 # Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
 _SAME = 0.01
@@ -62,7 +66,8 @@ class Trace:
 
     `prediction_before` and `prediction_after` are those of all acquisitions (acquisition, line) of
     the `lines`; `attenuation` and `amplitude` what was observed. `evidence` is that of the first
-    round, with nothing explained.
+    round, with nothing explained. `unsteadiness` is how much the amplitudes scatter by themselves,
+    in parts of their level: part of the scale of both residuals.
     """
 
     observation: Observation
@@ -81,6 +86,7 @@ class Trace:
     prediction_after: Expectation
     evidence: Evidence | None
     verdict: str
+    unsteadiness: float
 
 
 @dataclass(frozen=True)
@@ -100,10 +106,11 @@ class Bench:
     declared: tuple[Effect, ...]
     untold: Mapping[str, str] = field(default_factory=dict)
 
-    def expect(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Expectation:
+    def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
+               unsteadiness: float = 0.0) -> Expectation:
         """Predict some acquisitions."""
         return expect(self.observation, self.lines, self.level, [*self.declared, *effects],
-                      self.pulses, self.group, chosen)
+                      self.pulses, self.group, chosen, unsteadiness=unsteadiness)
 
     def observed(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Return attenuation, its variance and amplitude over level (acquisition, line)."""
@@ -117,10 +124,30 @@ class Bench:
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
                 kept * np.abs(of('raw')) / self.level)
 
-    def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Residual:
+    def unsteadiness(self, effects: Sequence[Effect]) -> float:
+        """
+        Return what the corrected amplitudes scatter by beyond what noise and effects predict.
+
+        It is the root mean square over acquisitions and lines, in parts of the level: 0 where it
+        may be chance, and not more than a steady machine has.
+        """
+        orders = self.observation.orders.size
+        amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
+        power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
+        model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
+        scattering = [effect for effect in (*self.declared, *effects) if effect.scatters]
+        known = expect(replace(self.observation, model=model), self.lines, self.level, scattering,
+                       self.pulses, self.group, [0]).amplitude_variance[0]
+        chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
+        if np.mean(power / known) < 1.0 + chance:
+            return 0.0
+        return min(float(np.sqrt(max(np.mean(power - known), 0.0))), STEADY)
+
+    def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
+              unsteadiness: float) -> Residual:
         """Return the residual of the held-out acquisitions."""
         attenuation, variance, amplitude = self.observed(self.held_out)
-        expected = self.expect(effects, self.held_out)
+        expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
         probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
         base = expected.attenuation.mean(axis=0)
         moved = []
@@ -161,7 +188,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     observation, declared = bench.observation, bench.declared
     count = len(observation.acquisitions)
     say = progress or (lambda text: None)
-    before = after = bench.score(())
+    own = bench.unsteadiness(())
+    after = bench.score((), unsteadiness=own)
     chosen: list[Finding] = []
     candidates: list[Candidate] = []
     first_evidence: Evidence | None = None
@@ -177,7 +205,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
             break
         first_evidence = first_evidence or evidence
         say(f'round {len(chosen) + 1}: p = {after.p_value:.2g}, RMS residual {after.rms:.4f}')
-        round_ = _try_all(bench, evidence, chosen, after, significant)
+        round_ = _try_all(bench, evidence, chosen, after, own, significant)
         winner = _best(round_)
         if winner is None and not significant:
             candidates += round_
@@ -189,7 +217,9 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
             break
         chosen.append(winner.finding)
         say(f'added {winner.name}: {winner.finding.evidence}')
-        after = bench.score([item.effect for item in chosen if item.effect is not None], chosen)
+        effects = [finding.effect for finding in chosen if finding.effect is not None]
+        own = bench.unsteadiness(effects)
+        after = bench.score(effects, chosen, unsteadiness=own)
     if reason and after.p_value < SIGNIFICANT:
         candidates += [Candidate(name, 1, Finding(name, None, {}, 1.0, reason, reason), None,
                                  reason) for name in EFFECTS]
@@ -197,10 +227,12 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     everything = range(count)
     attenuation, _, amplitude = bench.observed(everything)
     verdict = ('unexplained' if after.p_value < SIGNIFICANT else 'traced' if chosen else 'none')
+    before = bench.score((), unsteadiness=own) if chosen else after
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         tuple(chosen), tuple(candidates), before, after, attenuation, amplitude,
-        bench.expect((), everything), bench.expect(effects, everything), first_evidence, verdict)
+        bench.expect((), everything, unsteadiness=own),
+        bench.expect(effects, everything, unsteadiness=own), first_evidence, verdict, own)
 
 
 def _bench(observation: Observation, observations: Sequence[Observation],
@@ -221,7 +253,7 @@ def _bench(observation: Observation, observations: Sequence[Observation],
 
 
 def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
-             significant: bool) -> list[Candidate]:
+             own: float, significant: bool) -> list[Candidate]:
     """Fit every effect that is not there yet and score it on the held-out acquisitions."""
     effects = [finding.effect for finding in chosen if finding.effect is not None]
     taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
@@ -237,15 +269,17 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
             found.append(Candidate(name, number, finding, None,
                                    finding.against if significant else unneeded))
             continue
-        score = bench.score([*effects, finding.effect], [*chosen, finding])
+        left = bench.unsteadiness([*effects, finding.effect]) if kind.scatters else own
+        score = bench.score([*effects, finding.effect], [*chosen, finding], unsteadiness=left)
         rejected = finding.against
         if not rejected and finding.p_value > _EVIDENCE:
             rejected = f'its evidence may be chance: {finding.evidence}'
         gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
             kind.scatters) else ('attenuation', score.score, current.score)
         p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
-        needed = p_value < SIGNIFICANT or kind.seen or (
-            not kind.scatters and _decisive(finding, current, score))
+        decisive = own > ACCURACY and left < 0.5 * own if kind.scatters else (
+            _decisive(finding, current, score))
+        needed = p_value < SIGNIFICANT or kind.seen or decisive
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
