@@ -257,3 +257,13 @@ def test_whose_error_it_is(rng):
         error_origin(pulses[:7], found[:7])
     with pytest.raises(SignalError, match='nothing was recovered'):
         error_origin(pulses, np.zeros_like(pulses))
+
+
+def test_neighbours_of_strong_orders_take_no_room_from_weaker_ones(rng):
+    """A coarse clock's errors widen each order so that few fit into a short cycle."""
+    width = 0.4 / 32.0 * PERIOD
+    lines = {8: [1.0], 16: [0.8], 24: [0.6], 32: [0.5]}
+    for errors in rng.uniform(-0.5, 0.5, (12, 21)) * width:
+        cycles, pulses = simulate(rng, errors, lines, samples=240, ratio=1.0, noise=0.05)
+        found = recover(cycles, pulses, ratio=1.0, declared=width / np.sqrt(12.0))
+        np.testing.assert_array_equal(found.orders, list(lines))

@@ -157,7 +157,7 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
                       else search.strongest(errors, most_orders, below=reach))
         # no more unknowns than half of what a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
-        candidates = candidates[room]
+        candidates = np.sort(candidates[room])
         if not len(candidates):
             break
         model = compress(samples, ratio=ratio, first_angle=first_angle, orders=candidates,

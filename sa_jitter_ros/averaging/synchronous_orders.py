@@ -62,7 +62,7 @@ class LineSearch:
 
     def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
         """
-        Orders up to `below` that stand out most from their neighbourhood, at most `most` of them.
+        The at most `most` orders up to `below` that stand out from their neighbourhood, best first.
 
         `errors` (pulse,) of the average, in fundamental cycles, are taken out of the phases.
         """
@@ -86,7 +86,7 @@ class LineSearch:
         power = np.abs(line) ** 2
         background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
         contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
-        return np.asarray(np.sort(g[np.argsort(contrast)[-most:]]))
+        return np.asarray(g[np.argsort(-contrast)[:most]])
 
 
 def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
