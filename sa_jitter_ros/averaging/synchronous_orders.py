@@ -62,9 +62,10 @@ class LineSearch:
 
     def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
         """
-        The at most `most` orders up to `below` that stand out from their neighbourhood, best first.
+        Return the orders up to `below` that stand out most from their neighbourhood, best first.
 
-        `errors` (pulse,) of the average, in fundamental cycles, are taken out of the phases.
+        They are at most `most`; `errors` (pulse,) of the average, in fundamental cycles, are taken
+        out of the phases.
         """
         count = self.spectra.shape[1]
         g = self.orders[self.orders <= below]

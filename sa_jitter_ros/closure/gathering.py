@@ -16,15 +16,13 @@ from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording
-from scipy import stats
+from scipy import optimize, stats
 
 Array = NDArray[Any]
 
 _STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
 _TWIN = 4.0
-# What the phases of the acquisitions leave uncertain of a tone's amplitude.
-_ROUGH = 0.03
 _CERTAIN = 1e-4
 _GROUPS = 3
 # A clock this much faster than the declared one is no cause of anything.
@@ -139,7 +137,8 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
         against_reference=observation.against_reference,
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
         clock=clock, clock_period_std=period_std,
-        lines=replace(tone, radial=tone.radial[list(usable)]), explained=tuple(effects))
+        lines=replace(tone, radial=tone.radial[list(usable)],
+                      noise_density=tone.noise_density[list(usable)]), explained=tuple(effects))
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
@@ -150,8 +149,9 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     mean = cycles.mean(axis=1, keepdims=True)
     level = np.abs(mean).mean(axis=(0, 1))
     along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
-    noise = np.sqrt(np.mean([radial_noise(row) ** 2 for row in cycles], axis=0))
-    density = noise * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
+    noises = np.array([radial_noise(row) for row in cycles])
+    noise = np.sqrt(np.mean(noises**2, axis=0))
+    density = noises * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     evidence = LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
         noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
@@ -188,20 +188,28 @@ def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) 
     single = spectrum - _TWIN * spectrum[(-np.arange(4 * count)) % (4 * count)]
     height = single / floor
     peak, line = np.unravel_index(int(np.argmax(height)), height.shape)
-    ratio = float(spectrum[peak, line] / floor[line])
     # Along the radius only: the pulse errors have been fitted to what turns.
-    finer = turns[peak] + np.linspace(-0.25, 0.25, 51) / count
-    fine = np.abs(np.exp(-2j * np.pi * np.outer(finer, np.arange(count))) @ (
-        series[:, line].real * window))
-    turn = float(finer[np.argmax(fine)])
-    amplitude = float(2.0 * fine.max() / window.sum() / np.sinc(turn))
+    along = series[:, line].real * window
+    middle = np.arange(count) - 0.5 * (count - 1)
+
+    def size(turn: float) -> float:
+        return float(np.abs(np.exp(-2j * np.pi * turn * middle) @ along))
+
+    turn = float(optimize.minimize_scalar(
+        lambda x: -size(x), bounds=turns[peak] + np.array((-0.25, 0.25)) / count,
+        method='bounded', options={'xatol': 1e-5 / count}).x)
+    amplitude = 2.0 * size(turn) / window.sum()
+    # White noise of variance s2 leaves s2 sum(window^2) in a bin of the spectrum.
+    power = np.abs(np.fft.rfft(along)[1:]) ** 2
+    s2 = float(np.median(power)) / np.log(2.0) / float(window @ window)
+    error = np.sqrt(2.0 * s2 * (window @ window)) / window.sum()
+    bend = np.sqrt(2.0 * s2 * np.sum((window * middle) ** 2)) / (window @ middle**2) / amplitude
     return replace(
-        evidence, tone_amplitude=amplitude,
+        evidence, tone_amplitude=float(amplitude / np.sinc(turn)),
         tone_frequency=float(evidence.order[line] * model.fundamental_frequency
                              + turn / model.trigger_period),
-        tone_standard_error=amplitude * float(np.sqrt(0.5 / ratio + _ROUGH**2)),
-        tone_frequency_error=float((np.sqrt(1.5 / ratio) / np.pi + 0.005) / (
-            count * model.trigger_period)),
+        tone_standard_error=float(error / np.sinc(turn)),
+        tone_frequency_error=float(bend / (2.0 * np.pi * model.trigger_period)),
         tone_p_value=min(1.0, count * cycles.shape[2] * float(np.exp(
             -max(height[peak, line], 0.0)))))
 

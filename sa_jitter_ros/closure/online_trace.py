@@ -171,5 +171,5 @@ def _scatter(observation: Observation, lines: Lines, level: Array) -> LineEviden
     noise = np.sqrt(np.mean(lines.of(np.asarray(observation.stacked('noise'))) ** 2, axis=0))
     return LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
-        noise_density=np.full(lines.count, np.nan), radial=(amplitude / level - 1.0)[:, None],
+        noise_density=np.full(amplitude.shape, np.nan), radial=(amplitude / level - 1.0)[:, None],
         radial_noise=noise / level)

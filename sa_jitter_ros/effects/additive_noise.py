@@ -5,10 +5,13 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.moments import noise_line_variance
 from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy import stats
+
+_SIGNIFICANT = 1e-4
 
 
 @dataclass(frozen=True)
@@ -36,14 +39,17 @@ class AdditiveNoise(Effect):
         lines = evidence.lines
         known = evidence.model.noise_std**2 + sum(
             effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
-        excess = lines.noise_density**2 - known
-        value = float(np.median(excess))
-        count = lines.radial.shape[0] * lines.radial.shape[1]
-        error = 1.5 * float(np.median(lines.noise_density**2)) * np.sqrt(
-            2.0 / count / max(excess.size, 1))
-        if value <= 4.0 * error:
-            return absent(cls.name, 'the noise around the lines is the declared one')
-        std = float(np.sqrt(value))
+        power = lines.noise_density**2
+        count, width = power.shape
+        value = float(np.median(power.mean(axis=0))) - known
+        # Of a median over lines of means over acquisitions; lines of other noise do not count.
+        scatter = float(np.median(power.std(axis=0, ddof=1)))
+        error = scatter * np.sqrt(max(1.0, 0.5 * np.pi * (width > 2)) / (count * width))
+        p_value = float(stats.norm.sf(value / error)) if error > 0.0 else 1.0
+        if not p_value < _SIGNIFICANT:
+            return absent(cls.name, 'the noise around the lines is the declared one',
+                          p_value=p_value)
+        std, std_error = root(value, error)
         text = (f'the lines scatter as white noise of {np.sqrt(value + known):.3g} per sample '
                 f'would make them, {np.sqrt(known):.3g} was declared')
-        return Finding(cls.name, cls(std), {'std': error / (2.0 * std)}, 1e-9, text)
+        return Finding(cls.name, cls(std), {'std': std_error}, p_value, text)

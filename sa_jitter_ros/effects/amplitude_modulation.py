@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, unit_nodes
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
@@ -75,12 +75,12 @@ class AmplitudeModulation(Effect):
         if variance <= 0.0 or p_value > _SIGNIFICANT:
             return absent(cls.name, 'the amplitudes of the lines do not move together: '
                           f'p = {p_value:.2g}', p_value=p_value)
-        std = float(np.sqrt(variance))
+        std, std_error = root(variance, error)
         text = (f'the amplitudes of all lines grow and shrink together by {std:.2%}, '
                 f'p = {p_value:.2g}')
         slow = np.mean((common.mean(axis=1) / weight.sum()) ** 2) / variance
         return Finding(cls.name, cls(std, _band_of(float(slow), radial.shape[1])),
-                       {'std': error / (2.0 * std)}, p_value, text)
+                       {'std': std_error}, p_value, text)
 
 
 def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:

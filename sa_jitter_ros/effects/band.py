@@ -1,9 +1,14 @@
-"""Autocorrelation of slow random motions whose spectrum is flat up to a limit."""
+"""
+Slow random motions whose spectrum is flat in a band, and what recovered pulse errors show of them.
+
+Frequencies are in units of the trigger rate, times in trigger cycles.
+"""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.statistics.angle_error import unit_nodes
 
 Array = NDArray[Any]
 
@@ -12,6 +17,8 @@ SLOW_BAND = (0.02, 0.4)
 #: Of an acceleration, which is nearly constant within a trigger cycle.
 ACCELERATION_BAND = (0.05, 0.2)
 
+_RULE = unit_nodes(256)  # enough for the turns of some hundred lags
+
 
 def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
     """Return the autocorrelation of a flat spectrum in `band` at `lag`, inverse units."""
@@ -19,3 +26,44 @@ def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
     x = np.asarray(lag, float)
     return np.asarray((high * np.sinc(2.0 * high * x) - low * np.sinc(2.0 * low * x))
                       / (high - low))
+
+
+def recovered_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
+    """
+    Return the autocovariance, at whole `lag`, of the pulse errors recovered from a unit motion.
+
+    A motion that is fast enough to bend within a cycle pulls the fitted errors beyond itself.
+    """
+    frequency, weight = _even(band)
+    gain = _recovered(frequency)[0] ** 2
+    return np.asarray(np.cos(2.0 * np.pi * np.multiply.outer(lag, frequency)) @ (weight * gain))
+
+
+def ripple_of_acceleration(band: tuple[float, float]) -> float:
+    """
+    Return the standard deviation of the recovered ripple for a unit acceleration.
+
+    It is 1/2, that of a constant one, less what changes within the cycle.
+    """
+    frequency, weight = _even(band)
+    return float(np.sqrt(weight @ (_recovered(frequency)[1] / (2.0 * np.pi * frequency)**2)**2))
+
+
+def _even(band: tuple[float, float]) -> tuple[Array, Array]:
+    u, weight = _RULE
+    return band[0] + (band[1] - band[0]) * u, weight
+
+
+def _recovered(frequency: Array) -> tuple[Array, Array]:
+    """
+    Return pulse errors and ripple, as factors, that the recovery fits to exp(2 pi j frequency t).
+
+    It fits hats between the pulses and a bump u (1 - u) in every cycle by least squares; both
+    are in phase with the motion, the bump in the middle of its cycle.
+    """
+    u, weight = _RULE
+    bump = (weight * u * (1.0 - u)) @ np.cos(2.0 * np.pi * np.multiply.outer(u - 0.5, frequency))
+    half = np.cos(np.pi * frequency)
+    hats = (np.sinc(frequency) ** 2 - 5.0 * half * bump) / (
+        0.25 - np.cos(2.0 * np.pi * frequency) / 12.0)
+    return hats, 30.0 * (bump - half * hats / 6.0)

@@ -7,9 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, goodness_of_fit, require_tach_side, white)
+    fit_covariance, goodness_of_fit, white)
+from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -51,7 +52,7 @@ class CorrelatedJitter(Effect):
         plain = fit_covariance(evidence, white)
         fit = fit_covariance(evidence, lambda lags, rho: rho ** np.abs(lags),
                              bounds=(-0.98, 0.98))
-        std = float(np.sqrt(fit.variance))
+        std, error = root(fit.variance, fit.variance_error)
         if std == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
         p_value = fit.p_value_over(plain)
@@ -62,5 +63,5 @@ class CorrelatedJitter(Effect):
                           p_value=p_value)
         against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
         return Finding(cls.name, cls(std, fit.shape),
-                       {'std': fit.variance_error / (2.0 * std), 'correlation': fit.shape_error},
+                       {'std': error, 'correlation': fit.shape_error},
                        min(p_value, fit.p_value), text, against)

@@ -7,12 +7,14 @@ were added before are taken out of it (`explained`). A `Finding` is what an effe
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 Array = NDArray[Any]
@@ -23,11 +25,12 @@ class LineEvidence:
     """
     How the amplitudes of the lines (an order on a channel) scatter, pulse errors taken out.
 
-    `order` and `channel` (line,); `level` (line,) mean peak amplitudes; `noise_density` (line,)
-    the standard deviation per sample of white noise that makes the line's noise, in the units of
-    the recording; `radial` (acquisition, cycle, line) each cycle's amplitude over `level`, less 1,
-    and `radial_noise` (line,) its standard deviation by noise alone. `tone_frequency` (Hz) and
-    `tone_amplitude` are those of the line that stands out most between the synchronous ones;
+    `order` and `channel` (line,); `level` (line,) mean peak amplitudes; `noise_density`
+    (acquisition, line) the standard deviation per sample of white noise that makes the line's
+    noise, in the units of the recording; `radial` (acquisition, cycle, line) each cycle's
+    amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
+    alone. `tone_frequency` (Hz) and `tone_amplitude` are those of the line that stands out most
+    between the synchronous ones;
     `beat_method` is the interpolator whose beat the lines show, '' for none, and
     `beat_gain` (line,) what it has left of the amplitudes.
     """
@@ -89,6 +92,13 @@ class Evidence:
         """Return when the pulses were measured (acquisition, N_t + 1), in s."""
         return np.array([pulses.times for pulses in self.pulses])
 
+    @property
+    def times_left(self) -> Array:
+        """Return the times (acquisition, N_t + 1) less what `explained` knows of each pulse."""
+        known = [known_errors(self.model, self.explained, pulses) for pulses in self.pulses]
+        return np.array([times if errors is None else times - errors
+                         for times, errors in zip(self.times, known)])
+
     def expected_autocovariance(self, lags: Array) -> Array:
         """Return what declared jitter and added effects explain at `lags`, in s^2."""
         total = np.zeros(lags.shape)
@@ -118,6 +128,16 @@ class Finding:
     against: str = ''
     rivals: Sequence[str] = ()
     decider: str = ''
+
+
+def root(variance: float, error: float) -> tuple[float, float]:
+    """
+    Return the standard deviation of an estimated variance and its standard error.
+
+    A variance that is small beside its `error` has a root as uncertain as the root of that.
+    """
+    std = math.sqrt(max(variance, 0.0))
+    return std, error / (std + math.sqrt(std**2 + error)) if error else 0.0
 
 
 def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:

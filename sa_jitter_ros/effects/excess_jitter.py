@@ -6,9 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, goodness_of_fit, require_tach_side, white)
+    fit_covariance, goodness_of_fit, white)
+from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.prediction import DeclaredModel
@@ -35,10 +36,9 @@ class ExcessJitter(Effect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit the variance that the pulse errors have beyond the expected one."""
         fit = fit_covariance(evidence, white)
-        std = float(np.sqrt(fit.variance))
+        std, error = root(fit.variance, fit.variance_error)
         if std == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
-        error = fit.variance_error / (2.0 * std)
         text = (f'the pulse errors have {fit.observed_std:.3g} s where '
                 f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
         against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)

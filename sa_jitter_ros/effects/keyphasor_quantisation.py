@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
@@ -60,7 +60,7 @@ class KeyphasorQuantisation(Effect):
         errors, known = evidence.errors.ravel(), known - known.mean(axis=1, keepdims=True)
         correlation, p_value = stats.pearsonr(errors, known.ravel())
         slope = float(errors @ known.ravel() / np.sum(known**2))
-        std = evidence.clock_period_std
+        std, std_error = _period_std(evidence)
         text = (f'the pulse times lie on a grid of {clock:.6g} Hz, and the errors that the grid '
                 f'imposes on a smooth motion are the recovered ones: correlation '
                 f'{correlation:.3f}, slope {slope:.2f}, p = {p_value:.2g}')
@@ -68,6 +68,18 @@ class KeyphasorQuantisation(Effect):
             return absent(cls.name, f'the pulse times lie on a grid of {clock:.6g} Hz, but their '
                           f'errors are others: correlation {correlation:.3f}', p_value=p_value)
         return Finding(cls.name, cls(clock, std),
-                       {'clock_rate': evidence.clock.standard_error,
-                        'period_std': std / np.sqrt(2.0 * evidence.record_missing.size)},
+                       {'clock_rate': evidence.clock.standard_error, 'period_std': std_error},
                        float(p_value), text)
+
+
+def _period_std(evidence: Evidence) -> tuple[float, float]:
+    """
+    Return the standard deviation of the trigger period in s and its standard error.
+
+    True pulses are the measured ones less their errors, whose noise is taken out of the periods'
+    variance. A slow speed moves neighbouring periods together: acquisitions count, not periods.
+    """
+    periods = np.diff(evidence.times_left - evidence.errors, axis=1)
+    noise = np.nan_to_num(evidence.standard_errors) ** 2
+    rows = np.mean((periods - periods.mean()) ** 2 - noise[:, 1:] - noise[:, :-1], axis=1)
+    return root(float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(rows.size)))

@@ -57,12 +57,14 @@ def find_clock(times: Array) -> Clock:
         if count == times.size - 1:
             break
     ticks = np.rint(elapsed / tick)
-    misfit = elapsed / tick - ticks
-    scatter = float(np.sqrt(np.mean(misfit**2)))
-    if scatter > _TOLERANCE or np.gcd.reduce(ticks.astype(np.int64)) > 1:
+    centred = ticks - ticks.mean()
+    tick = float(elapsed @ centred / (centred @ centred))
+    scatter = float(np.std(elapsed - tick * ticks))
+    if scatter > _TOLERANCE * tick or np.gcd.reduce(ticks.astype(np.int64)) > 1:
         return none
-    error = max(scatter, resolution / tick) / float(np.sqrt(ticks @ ticks)) / tick
-    return Clock(1.0 / tick, error)
+    # Rounding is no chance: it need not average out over the pulses.
+    error = np.hypot(scatter / np.sqrt(centred @ centred), resolution / ticks[-1]) / tick**2
+    return Clock(1.0 / tick, float(error))
 
 
 def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Array:

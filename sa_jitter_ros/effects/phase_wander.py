@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
+from sa_jitter_ros.effects.band import flat_band_correlation, recovered_correlation, SLOW_BAND
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
-from sa_jitter_ros.effects.pulse_covariance import fit_covariance, slope_test
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.pulse_covariance import fit_covariance
+from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -36,18 +37,18 @@ class PhaseWander(Effect):
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return what the wander looks like when it is taken for pulse errors."""
         seconds = self.std / (2.0 * np.pi * model.fundamental_frequency)
-        return np.asarray(seconds**2 * flat_band_correlation(lags, SLOW_BAND))
+        return np.asarray(seconds**2 * recovered_correlation(lags, SLOW_BAND))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit slow errors that the measured pulse times do not have."""
         if evidence.against_reference:
             return absent(cls.name, 'against a better keyphasor the source cannot move')
-        fit = fit_covariance(evidence, lambda lags, _: flat_band_correlation(lags, SLOW_BAND))
+        fit = fit_covariance(evidence, lambda lags, _: recovered_correlation(lags, SLOW_BAND))
         if fit.variance == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
         slope = slope_test(evidence)
-        seconds = float(np.sqrt(fit.variance))
+        seconds, error = root(fit.variance, fit.variance_error)
         rad = 2.0 * np.pi * evidence.model.fundamental_frequency
         text = (f'the vibration moves by {seconds:.3g} s against the pulses and the pulse times '
                 f'follow with slope {slope.slope:.2f} +- {slope.standard_error:.2f} only, '
@@ -58,6 +59,6 @@ class PhaseWander(Effect):
                           p_value=slope.p_value)
         rivals = () if slope.decided else ('correlated_jitter',)
         return Finding(cls.name, cls(rad * seconds),
-                       {'std': rad * fit.variance_error / (2.0 * seconds)},
+                       {'std': rad * error},
                        max(fit.p_value, 1e-300), text, rivals=rivals,
                        decider='a second keyphasor, or a steadier speed' if rivals else '')

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.band import ACCELERATION_BAND, flat_band_correlation
+from sa_jitter_ros.effects.band import (
+    ACCELERATION_BAND, flat_band_correlation, ripple_of_acceleration)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
@@ -45,19 +46,20 @@ class SpeedFluctuation(Effect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit the ripple inside the cycles, which the true pulse times must show as well."""
         model = evidence.model
-        curve = np.diff(evidence.times - evidence.errors, 2, axis=1)
+        curve = np.diff(evidence.times_left - evidence.errors, 2, axis=1)
         expected = 0.25 * (curve[:, :-1] + curve[:, 1:])  # s, at all cycles but the outer two
         ripple = evidence.ripple[:, 1:-1]
         if not np.all(np.isfinite(ripple)) or expected.size < 12:
             return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
         noise = evidence.ripple_standard_error**2
-        variance = float(np.mean(evidence.ripple**2) - noise)
-        slope, _, r, p_value, slope_error = stats.linregress(expected.ravel(), ripple.ravel())
-        cycles = 2.0 * np.sqrt(max(variance, 0.0)) / model.trigger_period**3
-        std = cycles * 2.0 * np.pi * model.trigger_revolutions
         rows = np.mean(evidence.ripple**2, axis=1)
-        error = float(rows.std(ddof=1) / np.sqrt(len(rows)) / max(variance, 1e-300) * 0.5 * std)
-        text = (f'an error u (1 - u) of {np.sqrt(max(variance, 0.0)):.3g} s inside the cycles '
+        variance = float(rows.mean() - noise)
+        size, error = root(variance, float(rows.std(ddof=1) / np.sqrt(rows.size)))
+        slope, _, r, p_value, slope_error = stats.linregress(expected.ravel(), ripple.ravel())
+        # Radians of the tach shaft per s^2 for a ripple of 1 s.
+        unit = 2.0 * np.pi * model.trigger_revolutions / model.trigger_period**3 / (
+            ripple_of_acceleration(ACCELERATION_BAND))
+        text = (f'an error u (1 - u) of {size:.3g} s inside the cycles '
                 f'follows the acceleration between the pulses with slope {slope:.2f} +- '
                 f'{slope_error:.2f}, p = {p_value:.2g}')
         if variance <= 0.0 or p_value > _SIGNIFICANT or slope <= 0.0:
@@ -68,8 +70,8 @@ class SpeedFluctuation(Effect):
         if r**2 * (1.0 + noise / variance) < 0.4:
             against = (f'the acceleration between the pulses explains {r**2:.0%} of the error '
                        'inside the cycles: something faster moves')
-        return Finding(cls.name, cls(std), {'acceleration_std': error}, float(p_value), text,
-                       against)
+        return Finding(cls.name, cls(unit * size), {'acceleration_std': unit * error},
+                       float(p_value), text, against)
 
 
 def _cycles(model: DeclaredModel, acceleration: float) -> float:

@@ -1,0 +1,230 @@
+"""Fitted parameters lie within their stated standard errors, on drawn evidence."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from sa_jitter_ros.effects import EFFECTS, make_effect
+from sa_jitter_ros.effects.band import (
+    ACCELERATION_BAND, flat_band_correlation, recovered_correlation, ripple_of_acceleration,
+    SLOW_BAND)
+from sa_jitter_ros.effects.effect import Pulses
+from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
+from sa_jitter_ros.effects.lattice import Clock, find_clock
+from sa_jitter_ros.effects.slope_test import slope_test
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+from scipy.linalg import toeplitz
+
+MODEL = DeclaredModel(keyphasor_rate=5_000.0, trigger_speed=25.0, trigger_cycles=20,
+                      orders=(8.0, 16.0), sample_rate=6_000.0)
+ACQUISITIONS, PULSES = 12, 21
+PERIOD = 0.04
+NOISE = 1.5e-6
+
+
+def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noise_density=None,
+                radial=None, explained=(), speed=None, known=0.0):
+    """
+    Return evidence of pulse `errors` (acquisition, pulse) in s, recovered with some noise.
+
+    `moving` is what of them the vibration does, not the pulses; `known` what is explained of the
+    pulses; `speed` (acquisition, pulse) moves the true pulses (s).
+    """
+    count, pulses = errors.shape
+    true = PERIOD * np.arange(count * (pulses - 1) + 1)
+    rows = np.array([true[a * (pulses - 1):(a + 1) * (pulses - 1) + 1] for a in range(count)])
+    late = errors + known - (0.0 if moving is None else moving)
+    times = rows + late + (0.0 if speed is None else speed)
+    seen = errors + rng.normal(0.0, NOISE, errors.shape)
+    radial = np.zeros((count, pulses - 1, 4)) if radial is None else radial
+    lines = LineEvidence(
+        order=np.full(4, 8.0), channel=np.arange(4), level=np.ones(4),
+        noise_density=np.zeros((count, 4)) if noise_density is None else noise_density,
+        radial=radial, radial_noise=np.full(4, 0.01))
+    return Evidence(
+        model=MODEL, pulses=tuple(Pulses(row, a * (pulses - 1), row * 0.0)
+                                  for a, row in enumerate(times)),
+        errors=seen - seen.mean(axis=1, keepdims=True),
+        standard_errors=np.full(errors.shape, NOISE),
+        ripple=np.full((count, pulses - 1), np.nan) if ripple is None else ripple,
+        ripple_standard_error=ripple_error, against_reference=False, record_times=times.ravel(),
+        record_missing=np.zeros(times.size - 1, int), clock=Clock(5_000.0, 1e-9),
+        clock_period_std=np.nan, lines=lines, explained=tuple(explained))
+
+
+def declared(rng):
+    """Return the declared jitter."""
+    return rng.uniform(-1e-4, 1e-4, (ACQUISITIONS, PULSES))
+
+
+def stationary(rng, covariance, draws=ACQUISITIONS):
+    """Return normal rows (draw, pulse) of an autocovariance (lag,)."""
+    matrix = toeplitz(covariance) + 1e-18 * np.eye(len(covariance))
+    return rng.multivariate_normal(np.zeros(len(covariance)), matrix, draws, method='cholesky')
+
+
+def check(z):
+    """Mean and root mean square of z scores are those of chance, within 3.5 standard errors."""
+    z = np.asarray(z)
+    assert abs(z.mean()) < 3.5 / np.sqrt(z.size)
+    assert abs(np.sqrt(np.mean(z**2)) - 1.0) < 3.5 / np.sqrt(2.0 * z.size)
+
+
+def z_scores(findings, **truth):
+    """Return (fitted - true) / standard error of each parameter."""
+    return {name: [(item.effect.values[name] - value) / item.standard_errors[name]
+                   for item in findings] for name, value in truth.items()}
+
+
+LAGS = np.arange(PULSES)
+
+
+@pytest.mark.parametrize(('name', 'truth', 'covariance'), [
+    ('excess_jitter', {'std': 60e-6}, np.where(LAGS == 0, 60e-6**2, 0.0)),
+    ('excess_jitter', {'std': 120e-6}, np.where(LAGS == 0, 120e-6**2, 0.0)),
+    ('correlated_jitter', {'std': 100e-6, 'correlation': 0.7}, 1e-8 * 0.7**LAGS),
+    ('correlated_jitter', {'std': 100e-6, 'correlation': -0.6}, 1e-8 * (-0.6)**LAGS),
+])
+def test_pulse_errors_are_fitted_within_their_errors(rng, name, truth, covariance):
+    found = [EFFECTS[name].fit(evidence_of(rng, declared(rng) + stationary(rng, covariance)))
+             for _ in range(30)]
+    assert all(item.effect is not None for item in found)
+    for z in z_scores(found, **truth).values():
+        check(z)
+
+
+def test_uniform_jitter_tells_more_of_its_variance_than_normal_one(rng):
+    found = [EFFECTS['excess_jitter'].fit(evidence_of(
+        rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))) for _ in range(4)]
+    stated = np.mean([item.standard_errors['std'] for item in found])
+    # of the whole variance, whose fourth cumulant is that of the uniform part
+    total, uniform = 60e-6**2 + 1e-8 / 3.0, 1e-8 / 3.0
+    expected = np.sqrt((2.0 * total**2 - 1.2 * uniform**2) / (ACQUISITIONS * (PULSES - 1)))
+    assert stated == pytest.approx(expected / (2.0 * 60e-6), rel=0.1)
+
+
+def recovered(motion):
+    """Return pulse errors and ripple that least squares fits to `motion` (time in cycles)."""
+    steps = 16
+    u = (np.arange(steps) + 0.5) / steps
+    cycles = np.arange(PULSES - 1)
+    design = np.zeros((PULSES - 1, steps, 2 * PULSES - 1))
+    for k in cycles:  # hats, and a bump inside each cycle
+        design[k, :, k], design[k, :, k + 1] = 1.0 - u, u
+        design[k, :, PULSES + k] = u * (1.0 - u)
+    values = motion((cycles[:, None] + u).ravel())
+    fitted = np.linalg.lstsq(design.reshape(-1, 2 * PULSES - 1), values.T, rcond=None)[0].T
+    return fitted[:, :PULSES], fitted[:, PULSES:]
+
+
+def sines(rng, band, draws=ACQUISITIONS):
+    """Return a normal motion with a flat spectrum in `band`, as a function of time in cycles."""
+    frequency = rng.uniform(*band, (draws, 60))
+    a, b = rng.normal(0.0, 1.0 / np.sqrt(60.0), (2, draws, 60))
+
+    def motion(time, *, derivative=0):
+        turns = 2.0 * np.pi * frequency[..., None] * time
+        factor = (2.0 * np.pi * frequency[..., None]) ** -derivative
+        return np.sum(factor * (a[..., None] * np.cos(turns) + b[..., None] * np.sin(turns)),
+                      axis=1)
+    return motion
+
+
+def test_recovery_sees_a_motion_as_least_squares_does(rng):
+    errors, _ = recovered(sines(rng, SLOW_BAND, 600))
+    seen = np.mean(errors[:, 5:12] * errors[:, 8:9], axis=0)
+    expected = recovered_correlation(np.arange(5, 12) - 8, SLOW_BAND)
+    assert seen == pytest.approx(expected, abs=4.0 * np.sqrt(2.0 / 600.0))
+    assert expected[3] == pytest.approx(1.06, abs=0.005)
+    assert flat_band_correlation(0, SLOW_BAND) == pytest.approx(1.0)
+    narrow = (0.1999, 0.2001)
+    assert ripple_of_acceleration((1e-4, 2e-4)) == pytest.approx(0.5, rel=1e-6)
+    _, ripple = recovered(sines(rng, narrow, 600))
+    size = np.sqrt(np.mean(ripple[:, 10] ** 2)) / (2.0 * np.pi * 0.2) ** 2
+    assert size == pytest.approx(ripple_of_acceleration(narrow), rel=4.0 / np.sqrt(1200.0))
+
+
+def test_wander_is_fitted_within_its_error(rng):
+    found = []
+    for _ in range(30):
+        moving = 1e-4 * recovered(sines(rng, SLOW_BAND))[0]
+        found.append(EFFECTS['phase_wander'].fit(evidence_of(
+            rng, declared(rng) + moving, moving=moving)))
+    check(z_scores(found, std=1e-4 * 2.0 * np.pi * 25.0)['std'])
+
+
+def test_acceleration_is_fitted_within_its_error(rng):
+    std = 80.0 / (2.0 * np.pi) * PERIOD**3  # s per cycle^2
+    found = []
+    for _ in range(40):
+        motion = sines(rng, ACCELERATION_BAND)
+        errors, bump = (std * item for item in recovered(partial(motion, derivative=2)))
+        true = std * motion(np.arange(float(PULSES)), derivative=2)
+        found.append(EFFECTS['speed_fluctuation'].fit(evidence_of(
+            rng, declared(rng) + errors - true, ripple=bump + rng.normal(0.0, 1e-5, bump.shape),
+            ripple_error=1e-5, speed=-true)))
+    check(z_scores(found, acceleration_std=80.0)['acceleration_std'])
+
+
+def test_noise_is_fitted_within_its_error(rng):
+    found = []
+    for _ in range(60):
+        power = rng.chisquare(9.0, (ACQUISITIONS, 4)) / 9.0
+        found.append(EFFECTS['additive_noise'].fit(evidence_of(
+            rng, declared(rng), noise_density=np.sqrt(power))))
+    check(z_scores(found, std=1.0)['std'])
+    quiet = EFFECTS['additive_noise'].fit(evidence_of(rng, declared(rng), noise_density=np.zeros(
+        (ACQUISITIONS, 4))))
+    assert quiet.effect is None
+
+
+def test_period_of_a_clock_is_fitted_within_its_error(rng):
+    off = []
+    for _ in range(40):
+        # many acquisitions: a standard error that follows from their scatter is itself uncertain
+        speed = np.cumsum(stationary(rng, 16e-12 * 0.5**LAGS, 6 * ACQUISITIONS), axis=1)
+        grid = rng.uniform(-1e-4, 1e-4, speed.shape)
+        evidence = evidence_of(rng, grid, speed=speed)
+        evidence = replace(evidence, pulses=tuple(
+            replace(item, errors=row) for item, row in zip(evidence.pulses, grid)))
+        found = EFFECTS['keyphasor_quantisation'].fit(evidence)
+        off.append((found.effect.period_std - 4e-6) / found.standard_errors['period_std'])
+    check(off)
+
+
+def test_what_is_known_of_the_pulses_is_no_slope(rng):
+    """Marks that were explained are in the measured times and not in the errors that are left."""
+    angles = (0.03, -0.02, 0.01, -0.02)
+    geometry = make_effect('target_geometry', pulse_angles=angles)
+    index = np.add.outer(20 * np.arange(ACQUISITIONS), LAGS)
+    known = np.array(angles)[index % 4] / (2.0 * np.pi * MODEL.trigger_speed)
+    jitter = declared(rng) + rng.normal(0.0, 60e-6, known.shape)
+    test = slope_test(evidence_of(rng, jitter, known=known, explained=[geometry]))
+    assert test.decided
+    assert test.tach_side
+    assert abs(test.slope - 1.0) < 4.0 * test.standard_error + 0.01
+
+
+@pytest.mark.parametrize('resolution', [0.0, 1e-9])
+def test_rate_of_a_clock_is_known_as_well_as_its_times_are_written(rng, resolution):
+    off = []
+    for _ in range(40):
+        ticks = np.cumsum(rng.integers(195, 206, 400))
+        rate = 5_000.0 * (1.0 + 1e-4 * rng.uniform(-1.0, 1.0))
+        times = ticks / rate
+        if resolution:
+            times = np.rint(times / resolution) * resolution
+        clock = find_clock(times)
+        off.append((clock.rate - rate) / clock.standard_error)
+    if resolution:
+        check(off)
+    else:  # rounding of the times is all that is left: a bound
+        assert np.max(np.abs(off)) < 3.0
+
+
+def test_root_of_a_variance_near_zero_is_uncertain_by_the_root_of_its_error():
+    assert root(4.0, 0.04) == pytest.approx((2.0, 0.01), rel=3e-3)
+    assert root(-1.0, 0.04) == (0.0, pytest.approx(0.2))
+    assert root(1.0, 0.0) == (1.0, 0.0)
