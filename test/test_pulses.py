@@ -1,7 +1,7 @@
 """Pulse validation: what is dropped, what is bridged, what breaks a run, for any cutting."""
 
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -361,3 +361,11 @@ def test_uneven_cam_locks(shared_data, channel):
     assert runs[-1].size >= 55
     # four teeth a cam revolution, half the speed of the crank: 20 crank revolutions a second
     assert 4.0 * np.median(np.diff(runs[-1])) == pytest.approx(0.102, rel=0.03)
+
+
+@given(st.lists(st.sampled_from([-1.0, 0.0, 1.0, 3.0, 3.3]), max_size=40))
+@example([3.3, 1.0, -1.0, 0.0, 1.0, -1.0, -1.0, 1.0, 3.0, 3.3, 3.3, 3.3, 3.3, 3.0, 1.0, 3.0, -1.0,
+          3.0, 1.0, -1.0, 3.3, -1.0, 0.0, 3.0])
+def test_a_few_times_over_and_over_in_any_order(times):
+    _, runs, *_ = validate(times, cuts=range(1, len(times)))
+    assert all((np.diff(run) > 0.0).all() for run in runs)

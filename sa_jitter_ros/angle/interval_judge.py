@@ -166,8 +166,9 @@ class IntervalJudge:
     def _agree(self) -> bool:
         """Whether the latest pulses follow an interval of their own."""
         intervals = np.diff(self._recent)
+        # Strictly less: the intervals of 0 of a repeated pulse are none to follow.
         return len(intervals) == _AGREEING and bool(np.all(
-            np.abs(np.diff(intervals)) <= self._tolerance * intervals[:-1]))
+            np.abs(np.diff(intervals)) < self._tolerance * intervals[:-1]))
 
     def _slots_passed(self, teeth: int) -> int:
         """Return how many teeth present lie so many teeth ahead, 0 if that tooth is missing."""

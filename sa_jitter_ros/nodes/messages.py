@@ -40,6 +40,7 @@ PULSE_TYPES: dict[str, type] = {
     'std_msgs/Float64MultiArray': Float64MultiArray,
 }
 INDEX_BASE = 1 << 24  # largest power of two below which every integer is a float32
+_LARGEST = 1 << 32  # elements, of an empty array as well: numpy knows no larger shapes
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,7 @@ def decode_array(message: Float64MultiArray | Float32MultiArray, labels: tuple[s
     if layout.data_offset != header_size:
         raise MessageError(f'data_offset {layout.data_offset} received, {header_size} expected: '
                            'put exactly that many header elements in front')
-    if math.prod(shape) != data.size - header_size:
+    if math.prod(shape) != data.size - header_size or math.prod(filter(None, shape)) > _LARGEST:
         raise MessageError(
             f'layout {"x".join(map(str, shape))} behind {header_size} header elements does not '
             f'fit {data.size} elements: send the size that the layout says')
@@ -231,7 +232,7 @@ class SampleDecoder:
             return self._count(_block_samples(message, 0)[1])
         header, samples = _block_samples(message, 2)
         high, low = (_whole('index of the first sample', float(item)) for item in header)
-        index = high * INDEX_BASE + low
+        index = _whole('index of the first sample', high * INDEX_BASE + low)
         rate = self._known_rate()
         return SampleBlock(samples, self._start_time + index / rate, rate, index)
 
