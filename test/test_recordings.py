@@ -211,6 +211,39 @@ def test_zip_bomb_is_refused(tmp_path, monkeypatch):
         open_recording(path)
 
 
+def peak_of(call):
+    """Return the bytes that a call held at most at a time."""
+    tracemalloc.start()
+    try:
+        call()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_long_header_is_not_unpacked(tmp_path):
+    path = tmp_path / 'header.npz'
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_DEFLATED) as archive:
+        for name in ('vibration', 'sample_rate'):
+            with archive.open(f'{name}.npy', 'w') as member:
+                member.write(b'\x93NUMPY\x02\x00' + struct.pack('<I', 1 << 26))
+                member.write(b' ' * (1 << 26))
+
+    def refused():
+        with pytest.raises(RecordingError, match='EOF: reading array header'):
+            open_recording(path)
+    assert peak_of(refused) < 1 << 20
+
+
+def test_zip_methods_that_numpy_does_not_write_are_refused(tmp_path):
+    path = tmp_path / 'lzma.npz'
+    with zipfile.ZipFile(path, 'w', zipfile.ZIP_LZMA) as archive:
+        archive.writestr('vibration.npy', npy_header((1,)) + bytes(8))
+        archive.writestr('sample_rate.npy', npy_header(()) + struct.pack('<d', 1.0))
+    with pytest.raises(RecordingError, match='zip method 14 is not read'):
+        open_recording(path)
+
+
 def test_flipped_bits_in_samples_are_found(tmp_path):
     path = save(tmp_path / 'flip.npz', vibration=np.ones(1000), sample_rate=1.0)
     data = bytearray(path.read_bytes())
@@ -269,6 +302,25 @@ def test_mat_bomb_is_refused(tmp_path):
     scipy.io.savemat(path, {'vibration': np.zeros((1, 1 << 24)), 'sample_rate': 1.0},
                      do_compression=True)
     with pytest.raises(RecordingError, match='zip bomb'):
+        open_recording(path)
+
+
+def test_a_long_text_among_many_cells_is_refused(tmp_path):
+    path = tmp_path / 'cells.mat'
+    names = np.array(['a' * 20000, *['b'] * 5000], dtype=object)
+    scipy.io.savemat(path, {'vibration': np.zeros((1, 9)), 'sample_rate': 1.0, 'units': names})
+
+    def refused():
+        with pytest.raises(RecordingError, match='units: 400080000 bytes exceed its limit'):
+            open_recording(path)
+    assert peak_of(refused) < 1 << 24
+
+
+def test_a_text_that_is_too_long_is_refused(tmp_path):
+    path = tmp_path / 'text.mat'
+    scipy.io.savemat(path, {'vibration': np.zeros((1, 9)), 'sample_rate': 1.0,
+                            'units': np.array(['a' * (1 << 20) + 'a'], dtype=object)})
+    with pytest.raises(RecordingError, match='a text of 1048577 bytes exceeds its limit'):
         open_recording(path)
 
 
@@ -393,6 +445,16 @@ def test_broken_csv(tmp_path, text, options, message):
         open_recording(tmp_path / 'bad.csv', **options).read()
 
 
+def test_a_table_of_a_million_columns_gets_a_short_line(tmp_path):
+    path = tmp_path / 'wide.csv'
+    path.write_text('1,' * 1_000_000 + '1\n')
+    with pytest.raises(RecordingError, match='needs 1 to 4096 channels'):
+        open_recording(path, sample_rate=1.0)
+    with pytest.raises(RecordingError, match='no time column') as refused:
+        open_recording(path)
+    assert len(str(refused.value)) < 1000
+
+
 def test_a_rate_that_contradicts_the_file_is_refused(recording, tmp_path):
     write_npz(tmp_path / 'rig.npz', recording)
     with pytest.raises(RecordingError, match='500 Hz given, but the file says 2000'):
@@ -507,6 +569,7 @@ def test_a_bag_block_without_header_is_counted(tmp_path):
     (float64_block(100, shape=(3, 100)), 'become 3'),
     (float64_block(100, time=9.0), 'a second run; split the bag'),
     (float64_block(10**9), 'more than 3600 s'),
+    (float64_block(2**53 - 100), 'more than 3600 s'),
     (float64_block(100.5), 'index 100.5 is no whole number'),
     (float64_block(-100), 'index -100.0 is no whole number'),
     (float64_block(100, time=np.nan), 'time nan'),
@@ -520,6 +583,25 @@ def test_bags_that_do_not_go_on(tmp_path, second, message):
                           [float64_block(0), second])
     with pytest.raises(RecordingError, match=message):
         open_recording(path, sample_rate=RATE if 'offset' in message else None)
+
+
+def test_a_gap_at_an_absurd_rate_is_no_gap_to_fill(tmp_path):
+    path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray', [
+        float64_block(index, time=0.0, rate=1e300) for index in (0, 2**53 - 100)])
+    with pytest.raises(RecordingError, match='more than 3600 s or 536870912 values'):
+        open_recording(path)
+
+
+def test_a_type_that_only_bears_the_name_is_refused(tmp_path):
+    rosbag2, typesys = (pytest.importorskip(f'rosbags.{name}') for name in ('rosbag2', 'typesys'))
+    kind = 'std_msgs/msg/Float64MultiArray'
+    store = typesys.get_typestore(typesys.Stores.EMPTY)
+    store.register(typesys.get_types_from_msg('float64 only', kind))
+    with rosbag2.Writer(tmp_path / 'bag', version=9) as bag:
+        connection = bag.add_connection('/vibration', kind, typestore=store)
+        bag.write(connection, 0, store.serialize_cdr(store.types[kind](1.0), kind))
+    with pytest.raises(RecordingError, match='is not that of ROS 2'):
+        open_recording(tmp_path / 'bag')
 
 
 def test_imu_bag_with_a_lost_message(tmp_path):

@@ -1,18 +1,20 @@
 """The declared model from a ROS parameter file of `jitter_predictor`, read without ROS."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 import re
+import sys
 from typing import Any
 
+from sa_jitter_ros.commands.parameter_file import one_line, read_parameters
 from sa_jitter_ros.effects import Effect, EFFECTS, enabled_effects, parameter_ranges
-from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
-import yaml
 
 _NODE = 'jitter_predictor'
-_INTEGERS = ('pulses_per_revolution', 'pulses_per_trigger', 'trigger_cycles')
+_INTEGERS = {'pulses_per_revolution': 100_000, 'pulses_per_trigger': 100_000,
+             'trigger_cycles': 1_000_000}  # and the largest that the node takes
 _LISTS = ('orders', 'jitter_table')
 _TEXTS = ('jitter_distribution',)
 # Parameters of the node that say nothing about the model.
@@ -20,7 +22,6 @@ _OTHERS = ('follow_shaft_speed', 'speed_tolerance', 'use_sim_time')
 _DEFAULTS: Mapping[str, Any] = {
     'keyphasor_rate': 10000.0, 'trigger_speed': 25.0, 'trigger_cycles': 40,
     'orders': (1.0, 2.0, 3.0)}
-_LARGEST_FILE = 1 << 20
 # What rcl takes for a number and YAML 1.1 for a text.
 _FLOAT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
 
@@ -42,24 +43,13 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     holds values that make no sense.
     """
     try:
-        if path.stat().st_size > _LARGEST_FILE:
-            raise ModelError(f'{path}: {path.stat().st_size} bytes is no parameter file')
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        reason = ' '.join(str(error).split())[:300]
-        raise ModelError(f'{path}: cannot be read as YAML: {reason}') from error
-    values: dict[str, Any] = {}
-    sections = list(_sections(content, '')) if isinstance(content, Mapping) else []
-    for name, section in sections:
-        if _matches(name):
-            values.update(_flattened(section, ''))
-    if not any(_matches(name) for name, _ in sections):
-        raise ModelError(f'{path}: no ros__parameters of {_NODE}: start the file with '
-                         f'"{_NODE}:" or "/**:" and "ros__parameters:"')
+        values = read_parameters(path, _NODE)
+    except ParameterError as error:
+        raise ModelError(str(error)) from error
     try:
         return _declaration(values, sample_rate)
-    except (ModelError, ValueError, TypeError) as error:
-        raise ModelError(f'{path}: {error}') from error
+    except SaJitterError as error:
+        raise ModelError(f'{path}: {one_line(error)}') from error
 
 
 def _declaration(values: Mapping[str, Any], sample_rate: float) -> Declaration:
@@ -82,30 +72,6 @@ def _declaration(values: Mapping[str, Any], sample_rate: float) -> Declaration:
     return Declaration(DeclaredModel(**arguments), enabled_effects(given), unknown)
 
 
-def _sections(content: Mapping[Any, Any], name: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    """Iterate over all sections of parameters with the node names above them."""
-    for key, value in content.items():
-        if not isinstance(value, Mapping):
-            continue
-        if key == 'ros__parameters':
-            yield name, value
-        else:
-            yield from _sections(value, f'{name}/{str(key).strip("/")}')
-
-
-def _matches(name: str) -> bool:
-    return name.rsplit('/', 1)[-1] in (_NODE, '*', '**')
-
-
-def _flattened(section: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    for key, value in section.items():
-        name = f'{prefix}{key}'
-        if isinstance(value, Mapping):
-            yield from _flattened(value, f'{name}.')
-        else:
-            yield name, value
-
-
 def _convert(name: str, value: Any) -> Any:
     if name in _TEXTS:
         if not isinstance(value, str):
@@ -118,6 +84,8 @@ def _convert(name: str, value: Any) -> Any:
     if name in _INTEGERS:
         if isinstance(value, bool) or not isinstance(value, int):
             raise ModelError(f'{name} is {value!r}: give a whole number')
+        if value > _INTEGERS[name]:
+            raise ModelError(f'{name} is {value}: give at most {_INTEGERS[name]}')
         return value
     return _number(name, value)
 
@@ -127,4 +95,7 @@ def _number(name: str, value: Any) -> float:
         return float(value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ModelError(f'{name} is {value!r}: give a number')
-    return float(value)
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise ModelError(f'{name} is too large: give at most {sys.float_info.max:.2g}') from error

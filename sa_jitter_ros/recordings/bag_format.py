@@ -8,6 +8,7 @@ of their name (`/rig/vibration` is a `vibration`); a channel map can name others
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from math import isfinite, prod
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
 INDEX_BASE = 1 << 24
 TIME_TOLERANCE = 0.01  # s; a clock that jumps by more starts a new run
 MAX_GAP = 3600.0  # s
+MAX_LOST = 1 << 29  # samples of all channels that a gap may hold
 _IMU_AXES = ('x', 'y', 'z')
 _FILL = 65_536
 
@@ -140,9 +142,10 @@ class _Run:
             first = self.first = self.first or block
             self._check(first, block)
             missing = block.index - first.index - self.received
-            if missing > MAX_GAP * block.rate:
-                raise RecordingError(f'{self.topic}: {missing} samples are missing before index '
-                                     f'{block.index}: more than {MAX_GAP:g} s; split the bag')
+            if missing > min(MAX_GAP * block.rate, MAX_LOST / max(len(block.samples), 1)):
+                raise RecordingError(
+                    f'{self.topic}: {missing} samples are missing before index {block.index}: '
+                    f'more than {MAX_GAP:g} s or {MAX_LOST} values; split the bag')
             for start in range(0, missing, _FILL):
                 yield np.full((len(block.samples), min(_FILL, missing - start)), np.nan)
             fresh = block.samples[:, max(-missing, 0):]
@@ -171,13 +174,13 @@ class _Run:
 
 @contextmanager
 def _reader(path: Path) -> Iterator[Any]:
+    """Open a bag; `rosbags` must not make code of the message definitions that it holds."""
     try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import get_typestore, Stores
+        from rosbags.rosbag2 import Reader
     except ImportError as error:
         raise RecordingError(
             "reading bags needs the Python package rosbags: 'pip install rosbags'") from error
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+    with Reader(path) as reader:
         yield reader
 
 
@@ -206,10 +209,20 @@ def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
                    run.remarks())
 
 
+@cache
+def _types() -> Any:
+    from rosbags.typesys import get_typestore, Stores
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
 def _messages(reader: Any, topic: str) -> Iterator[Any]:
     connections = [item for item in reader.connections if item.topic == topic]
+    for item in connections:
+        if item.digest not in ('', _types().hash_rihs01(item.msgtype)):
+            raise RecordingError(f'{topic}: its {item.msgtype} is not that of ROS 2; record the '
+                                 'standard message')
     for connection, _, data in reader.messages(connections=connections):
-        yield reader.deserialize(data, connection.msgtype)
+        yield _types().deserialize_cdr(data, connection.msgtype)
 
 
 def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[_Block]:

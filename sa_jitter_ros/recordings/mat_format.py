@@ -17,7 +17,8 @@ import zlib
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import FIELDS, RawArray, recording_from_fields, size_limit
+from sa_jitter_ros.recordings.fields import (
+    FIELDS, MAX_FIELD_BYTES, RawArray, recording_from_fields, size_limit)
 from sa_jitter_ros.recordings.npz_format import IN_MEMORY_BYTES, MAX_INFLATION
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
@@ -137,7 +138,11 @@ class _Reader:
             raise RecordingError(f'{matrix.name} of shape {matrix.shape}: exceeds its limit of '
                                  f'{limit} bytes')
         if matrix.kind == _CELL:
-            return np.array(list(self._cells(data, matrix)))
+            cells = list(self._cells(data, matrix))
+            size = 4 * len(cells) * max(map(len, cells), default=0)
+            if size > limit:
+                raise RecordingError(f'{matrix.name}: {size} bytes exceed its limit of {limit}')
+            return np.array(cells)
         if matrix.kind == _CHAR:
             return self._text(data, matrix)
         if matrix.kind not in _NUMERIC:
@@ -166,6 +171,9 @@ class _Reader:
     def _text(self, data: Buffer, matrix: _Matrix) -> RawArray:
         """Return the rows of a character matrix."""
         part = self._element(data, matrix.content, matrix.stop)
+        if part.stop - part.start > MAX_FIELD_BYTES:
+            raise RecordingError(f'a text of {part.stop - part.start} bytes exceeds its limit of '
+                                 f'{MAX_FIELD_BYTES}')
         coding = _TEXTS[part.kind] + (
             {'<': '-le', '>': '-be'}[self._order] if part.kind in (4, 17, 18) else '')
         text = data[part.start:part.stop].decode(coding, 'replace')

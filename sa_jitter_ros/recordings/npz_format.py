@@ -5,6 +5,7 @@ Large members are not loaded: a stored one is mapped where it lies, a deflated o
 into an unnamed temporary file (in `$TMPDIR`) and mapped there.
 """
 
+from io import BytesIO
 from math import prod
 import os
 from pathlib import Path
@@ -23,6 +24,7 @@ from sa_jitter_ros.recordings.recording import Recording, recording_errors
 IN_MEMORY_BYTES = 64 << 20
 MAX_INFLATION = 200  # measured signals shrink a few fold; only a bomb shrinks more than this
 _COPY_BYTES = 1 << 20
+_HEADER_BYTES = 10_000
 
 
 def open_npz(path: Path, *, acquisition: int = 0) -> Recording:
@@ -74,6 +76,9 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
 def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
     """Return the array of a member: in memory if small, else mapped from a file."""
     info = archive.getinfo(f'{name}.npy')
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise RecordingError(f'{name}: zip method {info.compress_type} is not read: store or '
+                             'deflate it')
     with archive.open(info) as stream:
         shape, fortran, dtype, start = _read_header(stream, name)
         size = prod(shape) * dtype.itemsize
@@ -105,17 +110,19 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
 def _read_header(stream: IO[bytes],
                  name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether in Fortran order, dtype and length of a `.npy` header."""
-    version = npy.read_magic(stream)
+    head = BytesIO(stream.read(_HEADER_BYTES))  # a longer one is no header of plain numbers
+    version = npy.read_magic(head)
     if version not in ((1, 0), (2, 0)):
         raise RecordingError(f'{name}: npy version {version} is not supported; save it again')
     read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, fortran, dtype = read(stream)
+    shape, fortran, dtype = read(head)
+    stream.seek(head.tell())
     if dtype.hasobject:
         raise RecordingError(
             f'{name}: holds pickled objects, which are never loaded; save plain numbers or text')
     if dtype.itemsize == 0 or any(length < 0 for length in shape):
         raise RecordingError(f'{name}: {shape} of {dtype} is no array that could be stored')
-    return shape, fortran, dtype, stream.tell()
+    return shape, fortran, dtype, head.tell()
 
 
 def _data_offset(path: Path, info: zipfile.ZipInfo) -> int:

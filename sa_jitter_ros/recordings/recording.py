@@ -233,11 +233,17 @@ def recording_errors(path: Path) -> Iterator[None]:
     except RecordingError as error:
         if str(error).startswith(f'{path}: '):
             raise
-        raise RecordingError(f'{path}: {error}') from error
+        raise RecordingError(f'{path}: {_line(error)}') from error
     except Exception as error:
-        reason = ' '.join(str(error).split())[:300] or 'no reason given'
+        reason = _line(error) or 'no reason given'
         raise RecordingError(
             f'{path}: cannot be read ({type(error).__name__}: {reason})') from error
+
+
+def _line(error: Exception) -> str:
+    """Return what an error says, which may quote the file, in one line that can be read."""
+    text = ' '.join(str(error).split())
+    return text if len(text) <= 500 else f'{text[:500]} ...'
 
 
 def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[FloatArray]:

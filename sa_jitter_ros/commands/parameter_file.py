@@ -1,0 +1,79 @@
+"""The parameters of one node in a ROS parameter file, read without ROS."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from sa_jitter_ros.errors import ParameterError
+import yaml
+
+_LARGEST_FILE = 1 << 20
+_DEEPEST = 20
+_LOADER: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
+
+
+def read_parameters(path: Path, node: str) -> dict[str, Any]:
+    """
+    Read the parameters of a node, nested names joined by dots; the last section wins.
+
+    Sections may be headed by the node's name, with or without slash and namespace, `*` or `**`.
+    No tag makes an object; aliases are refused, as rcl does. Raises ParameterError, in one line,
+    for a file that is missing, too large, nested too deep, or has no parameters of the node.
+    """
+    try:
+        size = path.stat().st_size
+        if size > _LARGEST_FILE:
+            raise ParameterError(f'{size} bytes is no parameter file: give at most '
+                                 f'{_LARGEST_FILE}')
+        text = path.read_text(encoding='utf-8')
+        _check_structure(text)
+        content = yaml.load(text, _LOADER)  # noqa: S506 the safe one
+    except ParameterError as error:
+        raise ParameterError(f'{path}: {error}') from error
+    except Exception as error:  # tags whose text does not fit raise whatever comes
+        raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
+    sections = [section for name, section in _sections(content, '')
+                if name.rsplit('/', 1)[-1] in (node, '*', '**')]
+    if not sections:
+        raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
+                             f'"{node}:" or "/**:" and "ros__parameters:"')
+    return {name: value for section in sections for name, value in _flattened(section, '')}
+
+
+def one_line(error: Exception) -> str:
+    """Return what an error says, which may quote the file, in one line that can be read."""
+    text = ' '.join(str(error).split())
+    return text if len(text) <= 300 else f'{text[:300]} ...'
+
+
+def _check_structure(text: str) -> None:
+    """Raise ParameterError for what would take unbounded time or memory to load."""
+    depth = 0
+    for event in yaml.parse(text, _LOADER):
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise ParameterError(f'line {line}: aliases are not read: write the value out')
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        if depth > _DEEPEST:
+            raise ParameterError(f'line {line}: nested deeper than {_DEEPEST} levels')
+
+
+def _sections(content: Any, name: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
+    """Iterate over all sections of parameters with the node names above them."""
+    for key, value in content.items() if isinstance(content, Mapping) else ():
+        if key == 'ros__parameters' and isinstance(value, Mapping):
+            yield name, value
+        else:
+            yield from _sections(value, f'{name}/{str(key).strip("/")}')
+
+
+def _flattened(section: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in section.items():
+        name = f'{prefix}{" ".join(str(key).split())}'
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f'{name}.')
+        else:
+            yield name, value
