@@ -404,6 +404,8 @@ def test_parameter_can_be_set_while_it_runs(bench, name, value, stored):
     ('trigger_cycles', 'many', "trigger_cycles is 'many' (str): give int"),
     ('shaft.ratio', 0.0, 'shaft.ratio is 0.0: give more than 0.0'),
     ('shaft.ratio', math.nan, 'give a finite number'),
+    ('shaft.ratio', 1e-300, 'give one from 0.001 to 1000'),
+    ('shaft.ratio_teeth', [1, 10**9], 'a ratio of 1e-09: give one from'),
     ('shaft.ratio', True, 'shaft.ratio is True (bool): give float'),
     ('shaft.orders', [1.0, -1.0], 'shaft.orders is -1.0: give more than 0.0'),
     ('shaft.orders', 3.0, 'give a list of float'),

@@ -49,7 +49,8 @@ class ViewBench(NodeBench):
     def __init__(self, context, executor_for, **parameters):
         latched = {'prediction': Float64MultiArray, 'missing_effect': String}
         inputs = {f'shaft/{kind}': Float64MultiArray for kind in (
-            'synchronous_average', 'corrected_average', 'order_amplitude', 'pulse_error')}
+            'synchronous_average', 'standard_error', 'corrected_average', 'order_amplitude',
+            'pulse_error', 'condition_indicator')}
         super().__init__(
             context, executor_for, LiveView, qos=RESULT_QOS, outputs={},
             inputs={**inputs, 'residual': Float64MultiArray, 'shaft_speed': Float64},
@@ -139,6 +140,9 @@ def publish_all(b):
     angle = 2.0 * np.pi * np.arange(512) / 512
     raw = np.stack([np.sin(19.0 * angle), 0.5 * np.sin(38.0 * angle)])
     b.send('shaft/synchronous_average', average('synchronous_average', raw))
+    b.send('shaft/standard_error', average('standard_error', np.full(raw.shape, 0.05)))
+    b.send('shaft/condition_indicator', average(
+        'condition_indicator', np.array([[0.7071, NAN], [0.3536, 1.523]]), ('rms', 'fm0')))
     b.send('shaft/corrected_average', average('corrected_average', 1.1 * raw))
     b.send('shaft/order_amplitude', average(
         'order_amplitude', amplitudes(), messages.AMPLITUDE_FIELDS))
@@ -168,15 +172,20 @@ def test_snapshot_holds_what_was_published(bench):
     news = b.snapshot()
     parts = {name: item['content'] for name, item in news['parts'].items()}
     assert set(parts) == {
-        'settings', 'shaft/synchronous_average', 'shaft/corrected_average',
-        'shaft/order_amplitude', 'shaft/pulse_error', 'prediction', 'residual', 'missing_effect',
-        'shaft_speed', '/diagnostics'}
+        'settings', 'shaft/synchronous_average', 'shaft/standard_error',
+        'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
+        'shaft/condition_indicator', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
+        '/diagnostics'}
     assert parts['settings'] == {'shafts': ['shaft'], 'vibration_unit': 'g',
                                  'channel_names': ['casing', 'shaft end']}
     assert parts['shaft/synchronous_average']['header'] == vars(header())
     for kind, factor in (('synchronous_average', 1.0), ('corrected_average', 1.1)):
         np.testing.assert_allclose(parts[f'shaft/{kind}']['channels'], factor * raw, atol=2e-5)
         assert parts[f'shaft/{kind}']['points'] == 512
+    assert parts['shaft/standard_error']['channels'] == [[0.05] * 512] * 2
+    assert parts['shaft/condition_indicator'] == {
+        'header': vars(header()), 'names': ['rms', 'fm0'],
+        'values': [[0.7071, None], [0.3536, 1.523]]}
     for name, values in zip(messages.AMPLITUDE_FIELDS, np.moveaxis(amplitudes(), -1, 0)):
         assert parts['shaft/order_amplitude'][name] == values.tolist()
     for name, values in zip(messages.PULSE_ERROR_FIELDS, pulse_errors().T):
@@ -496,6 +505,10 @@ def test_the_browser_shows_the_numbers(bench):
            'yes')
     assert ' '.join(row) in ' '.join(rows)
     assert 'raw [g]' in text_of(page, 'orders')
+    assert text_of(page, 'indicators').split() == [
+        'channel', 'rms', 'fm0', 'casing', '0.7071', '–', '&lt;b&gt;end&lt;/b&gt;', '0.3536',
+        '1.523']
+    assert page.count('class="spread" d="M') == 2
     assert 'excess_jitter (std = 19.3 ± 0.4 µs)' in text_of(page, 'effects')
     assert 'cannot be told from phase_wander' in text_of(page, 'effects')
     assert re.search(r'rig/averager\s+WARN\s+pulses_dropped grew\s+pulses_dropped 321',

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import close_loop
-from sa_jitter_ros.commands.declaration import _INTEGERS, read_declaration
+from sa_jitter_ros.commands.declaration import _INTEGERS, _RATIOS, read_declaration
 from sa_jitter_ros.commands.parameter_file import read_parameters
 from sa_jitter_ros.effects import EFFECTS, parameter_ranges
 from sa_jitter_ros.errors import ModelError, ParameterError
@@ -77,7 +77,8 @@ def test_any_text(folder, text):
 
 
 LAUGHS = 'a: &a [lol, lol]\n' + ''.join(
-    f'{new}: &{new} [{", ".join([f"*{old}"] * 9)}]\n' for old, new in zip('abcdefghi', 'bcdefghij'))
+    f'{new}: &{new} [{", ".join([f"*{old}"] * 9)}]\n'
+    for old, new in zip('abcdefghi', 'bcdefghij'))
 HOSTILE = {
     'billion laughs': (LAUGHS + HEAD + 'orders: *j', 'line 2: aliases are not read'),
     'merge keys': ('a: &a {x: 1}\nb: {<<: [*a, *a]}\n', 'aliases are not read'),
@@ -87,15 +88,16 @@ HOSTILE = {
     'object': (HEAD + 'orders: !!python/object/apply:os.system [touch ran]', 'constructor'),
     'module': (HEAD + 'orders: !!python/module:os', 'constructor'),
     'digits': (HEAD + 'keyphasor_rate: ' + '9' * 5000, 'integer string conversion'),
-    'large': (HEAD + 'keyphasor_rate: ' + '9' * 400, 'keyphasor_rate is too large'),
+    'large': (HEAD + 'keyphasor_rate: ' + '9' * 400, 'keyphasor_rate: give -1e.15 to 1e.15'),
     'large count': (HEAD + 'trigger_cycles: ' + '9' * 400, 'trigger_cycles is 999'),
     'many cycles': (HEAD + 'trigger_cycles: 1000001', 'give at most 1000000'),
+    'tiny ratio': (HEAD + 'ratio: 1e-300', 'ratio: give 0.001 to 1000, not 1e-300'),
     'date': (HEAD + 'keyphasor_rate: 2001-99-99', 'month must be in'),
     'empty integer': (HEAD + 'keyphasor_rate: !!int ""', 'cannot be read as YAML'),
     'no time': (HEAD + 'keyphasor_rate: !!timestamp now', 'cannot be read as YAML'),
     'no boolean': (HEAD + 'keyphasor_rate: !!bool maybe', 'cannot be read as YAML'),
     'nan': (HEAD + 'keyphasor_rate: .nan', 'keyphasor_rate is nan'),
-    'infinity': (HEAD + 'trigger_speed: .inf', 'trigger_speed is inf'),
+    'infinity': (HEAD + 'trigger_speed: .inf', 'trigger_speed: give .* not inf'),
     'another node': ('tach_detector:\n  ros__parameters: {x: 1}', 'no ros__parameters of jitter'),
     'no map': ('jitter_predictor:\n  ros__parameters: 3', 'no ros__parameters of jitter'),
     'two documents': ('a: 1\n---\nb: 2', 'another document'),
@@ -131,10 +133,12 @@ def test_what_is_no_file(tmp_path, make):
         read_parameters(path, 'node')
 
 
-def test_counts_end_where_those_of_the_node_do():
+def test_ranges_are_those_of_the_nodes():
     predictor = pytest.importorskip('sa_jitter_ros.nodes.jitter_predictor')
     limits = {item.name: item.maximum for item in predictor.PARAMETERS}
     assert {name: limits[name] for name in _INTEGERS} == _INTEGERS
+    averager = pytest.importorskip('sa_jitter_ros.nodes.averager_parameters')
+    assert averager.RATIOS == _RATIOS
 
 
 @pytest.mark.parametrize('name', ['billion laughs', 'object', 'large', 'deep lists'])

@@ -267,3 +267,13 @@ def test_neighbours_of_strong_orders_take_no_room_from_weaker_ones(rng):
         cycles, pulses = simulate(rng, errors, lines, samples=240, ratio=1.0, noise=0.05)
         found = recover(cycles, pulses, ratio=1.0, declared=width / np.sqrt(12.0))
         np.testing.assert_array_equal(found.orders, list(lines))
+
+
+@pytest.mark.parametrize(('samples', 'ratio'), [(80, 25.0), (10, 1.0), (16, 0.3)])
+def test_few_samples_a_cycle_are_searched_to_their_end(rng, samples, ratio):
+    speed = ratio / PERIOD
+    errors = rng.uniform(-0.5, 0.5, 101) * 0.1 / speed
+    cycles, pulses = simulate(rng, errors, {1.0: [1.0]}, samples=samples, ratio=ratio, noise=0.02)
+    found = recover(cycles, pulses, declared=0.1 / speed / np.sqrt(12.0), ratio=ratio)
+    assert found.errors.shape == errors.shape
+    assert not found.accepted or np.abs(z_scores(found, errors)).mean() < 2.0

@@ -4,7 +4,6 @@ from dataclasses import replace
 import json
 
 from bench import NodeBench
-from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
@@ -15,7 +14,7 @@ from sa_jitter_ros.closure.online import (Average, Batch, compare, declared_by, 
 from sa_jitter_ros.closure.online_trace import trace_averages
 from sa_jitter_ros.closure.report import report
 from sa_jitter_ros.effects import EFFECTS, make_effect, predict_with
-from sa_jitter_ros.errors import ModelError, SignalError
+from sa_jitter_ros.errors import ModelError, ParameterError, SignalError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import INPUT_QOS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor, prediction_message
@@ -312,14 +311,20 @@ def test_mismatch_is_said_and_cured(bench, change, reason):
     assert b.spin(b.residuals)
 
 
+@pytest.mark.parametrize(('name', 'value', 'reason'), [
+    ('shaft', 'Gear', 'small letters'), ('predictor', '0', 'give the name of a node'),
+    ('predictor', 'a b', 'give the name of a node')])
+def test_names_that_no_topic_or_node_can_have_are_refused(ros_context, name, value, reason):
+    with pytest.raises(ParameterError, match=reason):
+        ResidualAnalyser(context=ros_context, parameter_overrides=[Parameter(name, value=value)])
+
+
 def test_averages_without_correction_are_refused(bench):
     b = bench()
     b.predict()
     b.average(synthetic(8), corrected=False)
-    level, text, values = b.diagnostics()
-    assert level == DiagnosticStatus.WARN
-    assert 'set correct_jitter: true' in text
-    assert 'better keyphasor' in text
+    assert b.spin(lambda: b.told('set correct_jitter: true') and b.told('better keyphasor'))
+    values = b.diagnostics()[2]
     assert values['uncorrected'] == '8'
     assert values['averages'] == '0'
 

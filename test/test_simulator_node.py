@@ -1,5 +1,6 @@
 """The machine simulator through real subscribers."""
 
+import dataclasses
 from itertools import pairwise
 import os
 import signal
@@ -10,11 +11,12 @@ import numpy as np
 import pytest
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from sa_jitter_ros.effects import EFFECTS, parameter_ranges
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import INPUT_QOS
-from sa_jitter_ros.nodes.machine_simulator import EFFECT_PARAMETERS, MachineSimulator
-from sa_jitter_ros.simulation import EFFECTS
+from sa_jitter_ros.nodes.machine_simulator import EFFECT_DEFAULTS, MachineSimulator
+from sa_jitter_ros.simulation import effects as simulation_effects
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float64MultiArray
 
@@ -84,10 +86,18 @@ def test_several_shafts_with_a_chipped_tooth(bench):
     assert abs(machine.amplitude(25, 'gear')) > 1e-3
 
 
+def test_the_simulator_knows_the_effects_and_parameters_of_the_registry():
+    registered = {name: set(parameter_ranges(kind)) for name, kind in EFFECTS.items()}
+    assert registered.keys() == simulation_effects.EFFECTS.keys()
+    for name, kind in simulation_effects.EFFECTS.items():
+        assert registered[name] <= {item.name for item in dataclasses.fields(kind)}
+    assert EFFECT_DEFAULTS.keys() <= {
+        f'{name}.{key}' for name, keys in registered.items() for key in keys}
+
+
 def test_every_effect_can_be_switched_on_while_it_runs(bench):
     simulator = bench(duration=0.0, rate=1.0, noise_std=0.0, jitter_distribution='none',
                       pulses_per_revolution=2)
-    assert EFFECT_PARAMETERS.keys() == EFFECTS.keys()
     plain = simulator.node.machine
     for name in EFFECTS:
         results = simulator.node.set_parameters([Parameter(f'effects.{name}.enabled', value=True)])

@@ -58,7 +58,7 @@ class LineSearch:
         # A taper over the cycles keeps strong orders from showing at their neighbours.
         taper = np.sin(pi * (np.arange(part.shape[1]) + 0.5) / part.shape[1]) ** 2
         spectra = rfft(part * np.multiply.outer(window, taper)[:, :, None], axis=0)
-        return cls(spectra, np.arange(1.0, 0.4 * points / ratio + 1.0), ratio, first)
+        return cls(spectra, np.arange(1.0, int(0.4 * points / ratio) + 1.0), ratio, first)
 
     def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
         """
@@ -82,8 +82,8 @@ class LineSearch:
             x = position - bins[:, None]
             lobe = 0.5 * np.sinc(x) + 0.25 * (np.sinc(x - 1.0) + np.sinc(x + 1.0))
             weight = phase * lobe * np.exp(-1j * pi * x)
-            weight[bins < 0] = 0.0
-            line += np.einsum('gk,gkc->gc', weight, self.spectra[np.abs(bins)])
+            weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
+            line += np.einsum('gk,gkc->gc', weight, self.spectra.take(bins, axis=0, mode='clip'))
         power = np.abs(line) ** 2
         background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
         contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)

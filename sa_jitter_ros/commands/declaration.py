@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 import re
-import sys
 from typing import Any
 
 from sa_jitter_ros.commands.parameter_file import one_line, read_parameters
@@ -22,6 +21,8 @@ _OTHERS = ('follow_shaft_speed', 'speed_tolerance', 'use_sim_time')
 _DEFAULTS: Mapping[str, Any] = {
     'keyphasor_rate': 10000.0, 'trigger_speed': 25.0, 'trigger_cycles': 40,
     'orders': (1.0, 2.0, 3.0)}
+_RATIOS = (1e-3, 1e3)  # as the averager has them
+_LARGEST = 1e15  # of any other number: squares and products stay finite
 # What rcl takes for a number and YAML 1.1 for a text.
 _FLOAT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
 
@@ -92,10 +93,10 @@ def _convert(name: str, value: Any) -> Any:
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, str) and _FLOAT.fullmatch(value):
-        return float(value)
+        value = float(value)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ModelError(f'{name} is {value!r}: give a number')
-    try:
-        return float(value)
-    except OverflowError as error:
-        raise ModelError(f'{name} is too large: give at most {sys.float_info.max:.2g}') from error
+    low, high = _RATIOS if name == 'ratio' else (-_LARGEST, _LARGEST)
+    if value < low or value > high:
+        raise ModelError(f'{name}: give {low:g} to {high:g}, not {value}')
+    return float(value)

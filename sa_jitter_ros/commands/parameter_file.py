@@ -27,7 +27,7 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
                                  f'{_LARGEST_FILE}')
         text = path.read_text(encoding='utf-8')
         _check_structure(text)
-        content = yaml.load(text, _LOADER)  # noqa: S506 the safe one
+        content = yaml.load(text, _LOADER)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
     except Exception as error:  # tags whose text does not fit raise whatever comes

@@ -10,6 +10,7 @@ from sa_jitter_ros.averaging.shaft import AverageSettings, AVERAGING
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.parameters import Parameter, Values
 
+RATIOS = (1e-3, 1e3)  # beyond them one shaft hardly turns while the other is averaged
 PARAMETERS = (
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration',
               read_only=True),
@@ -83,6 +84,9 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
             raise ParameterError(f'{name}.ratio_teeth has {len(teeth)} tooth counts: give pairs '
                                  'of driver and driven')
         ratio = prod(teeth[::2]) / prod(teeth[1::2])
+    if not RATIOS[0] <= ratio <= RATIOS[1]:
+        raise ParameterError(f'{name}: a ratio of {ratio:.3g}: give one from {RATIOS[0]:g} to '
+                             f'{RATIOS[1]:g}')
     return AverageSettings(
         cycles=ratio * trigger_share(values), trigger_cycles=values['trigger_cycles'],
         orders=tuple(values[f'{name}.orders']),

@@ -1,15 +1,15 @@
 """Node `jitter_predictor`: what the declared keyphasor does to each order of the average."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.effects import (EFFECTS, enabled_effects, parameter_defaults, parameter_ranges,
-                                   predict_with)
+from sa_jitter_ros.effects import enabled_effects, predict_with
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.effect_parameters import effect_parameters
 from sa_jitter_ros.nodes.messages import (encode_prediction, PREDICTION_FIELDS,
                                           PredictionMessage)
 from sa_jitter_ros.nodes.parameters import Parameter, Values
@@ -46,21 +46,6 @@ PARAMETERS = (
 _MODEL = ('keyphasor_rate', 'trigger_speed', 'trigger_cycles', 'orders', 'ratio',
           'pulses_per_revolution', 'pulses_per_trigger', 'jitter_distribution', 'jitter_std',
           'jitter_table', 'noise_std', 'sample_rate')
-
-
-def effect_parameters() -> Iterator[Parameter]:
-    """Iterate over the parameters of every effect, `effects.<name>.<parameter>`."""
-    for name, kind in EFFECTS.items():
-        yield Parameter(f'effects.{name}.enabled', False, f'add the effect: {kind.summary}')
-        defaults = parameter_defaults(kind)
-        for key, limits in parameter_ranges(kind).items():
-            default = defaults[key]
-            yield Parameter(
-                f'effects.{name}.{key}', list(default) if isinstance(default, tuple) else default,
-                limits.description, unit=limits.unit, choices=limits.choices,
-                minimum=limits.minimum if math.isfinite(limits.minimum) else None,
-                maximum=limits.maximum if math.isfinite(limits.maximum) else None,
-                above=limits.above if math.isfinite(limits.above) else None)
 
 
 def declared_model(values: Values) -> DeclaredModel:

@@ -4,24 +4,20 @@ from collections.abc import Callable, Sequence
 from functools import partial
 import json
 import math
-import re
 import time
-from typing import Any, TypeVar
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
-from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
+from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
-    Attenuations, Board, CHANNELS, number, ORDERS, orders_content, PulseErrors, pulses_content,
-    SPEEDS, table_content, waveform_content)
+    Attenuations, Board, CHANNELS, indicators_content, number, ORDERS, orders_content, PulseErrors,
+    pulses_content, SPEEDS, table_content, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
-from sa_jitter_ros.nodes.messages import (
-    AMPLITUDE_FIELDS, AverageMessage, decode_average, decode_prediction, decode_residual,
-    PREDICTION_FIELDS, PULSE_ERROR_FIELDS, RESIDUAL_FIELDS)
-from sa_jitter_ros.nodes.parameters import Parameter, Values
+from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
+                                          PREDICTION_FIELDS, RESIDUAL_FIELDS)
+from sa_jitter_ros.nodes.parameters import Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
-
-Decoded = TypeVar('Decoded')
 
 LARGEST_REPORT = 1_000_000  # characters of missing_effect
 NODES, NODE_VALUES = 64, 100  # whose diagnostics are kept; values of each
@@ -48,10 +44,7 @@ class LiveView(MonitoringNode):
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('live_view', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
-        wrong = [name for name in values['shafts'] if not re.fullmatch('[a-z][a-z0-9_]*', name)]
-        if wrong:
-            raise ParameterError(f'shafts holds {wrong}: give names of small letters, digits and '
-                                 'underscores')
+        require_shaft_names('shafts', values['shafts'])
         if not (is_loopback(values['host']) or values['open_to_network']):
             raise ParameterError(f'host {values["host"]!r} is open to other machines: leave it '
                                  '127.0.0.1, or set open_to_network too')
@@ -90,37 +83,40 @@ class LiveView(MonitoringNode):
         errors, attenuations = PulseErrors(), Attenuations()
 
         def on_waveform(kind: str, message: Float64MultiArray) -> None:
-            average = checked(partial(decode_average, kind), message)
+            average = decode_average(kind, message)
             self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
 
+        def on_indicators(message: Float64MultiArray) -> None:
+            average = decode_average('condition_indicator', message)
+            self._board.put(f'{shaft}/condition_indicator', partial(indicators_content, average))
+
         def on_orders(message: Float64MultiArray) -> None:
-            average = with_fields(message, 'order_amplitude', AMPLITUDE_FIELDS)
+            average = decode_average('order_amplitude', message)
             self._averages += 1
             shown = average.values[:CHANNELS, :ORDERS]
             history = attenuations.add(shown[..., 0], shown[..., 5])
             self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))
 
         def on_pulses(message: Float64MultiArray) -> None:
-            average = with_fields(message, 'pulse_error', PULSE_ERROR_FIELDS)
+            average = decode_average('pulse_error', message)
             self._board.put(f'{shaft}/pulse_error', partial(
                 pulses_content, average, errors.add(average.values)))
 
         callbacks: dict[str, Callable[[Any], None]] = {
             **{kind: partial(on_waveform, kind)
-               for kind in ('synchronous_average', 'corrected_average')},
-            'order_amplitude': on_orders, 'pulse_error': on_pulses}
+               for kind in ('synchronous_average', 'standard_error', 'corrected_average')},
+            'order_amplitude': on_orders, 'pulse_error': on_pulses,
+            'condition_indicator': on_indicators}
         for kind, callback in callbacks.items():
             self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
 
     def _on_prediction(self, message: Float64MultiArray) -> None:
-        prediction = checked(decode_prediction, message)
-        check_width(prediction.values, PREDICTION_FIELDS)
+        prediction = decode_prediction(message)
         self._board.put('prediction', partial(table_content, prediction, PREDICTION_FIELDS),
                         data=False)
 
     def _on_residual(self, message: Float64MultiArray) -> None:
-        residual = checked(decode_residual, message)
-        check_width(residual.values, RESIDUAL_FIELDS)
+        residual = decode_residual(message)
         self._board.put('residual', partial(table_content, residual, RESIDUAL_FIELDS))
 
     def _on_missing_effect(self, message: String) -> None:
@@ -165,29 +161,6 @@ class LiveView(MonitoringNode):
             'address': self._server.address, 'averages': str(self._averages),
             'requests': str(self._server.requests),
             'requests_refused': str(self._server.refused)}
-
-
-def checked(decode: Callable[[Any], Decoded], message: Any) -> Decoded:
-    """Decode; a count in the header that is no number raises `MessageError`, too."""
-    try:
-        return decode(message)
-    except SaJitterError:
-        raise
-    except (OverflowError, ValueError) as error:
-        raise MessageError(f'header: {error}: send whole numbers as counts') from None
-
-
-def check_width(values: Any, fields: tuple[str, ...]) -> None:
-    """Raise `MessageError` unless the last dimension is that of the fields."""
-    if values.shape[-1] != len(fields):
-        raise MessageError(f'{values.shape[-1]} fields: send {len(fields)}, {",".join(fields)}')
-
-
-def with_fields(message: Float64MultiArray, kind: str, fields: tuple[str, ...]) -> AverageMessage:
-    """Decode an average's table, whose last dimension is that of the fields."""
-    average = checked(partial(decode_average, kind), message)
-    check_width(average.values, fields)
-    return AverageMessage(average.header, average.values, fields)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -21,7 +21,7 @@ from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage, Resi
 FloatArray = NDArray[np.float64]
 Json = Any
 
-CHANNELS, ORDERS = 64, 256  # that are shown
+CHANNELS, ORDERS, INDICATORS = 64, 256, 64  # that are shown
 CURVE_POINTS, ALL_POINTS = 1200, 16000  # of one waveform, of all channels
 HISTORY, HISTORY_NUMBERS = 30, 20000  # averages whose attenuation is kept; numbers in them
 PULSES = 1000  # whose errors are kept
@@ -147,6 +147,14 @@ def waveform_content(average: AverageMessage) -> Json:
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
     return {'header': header_content(average.header), 'points': average.values.shape[1],
             'channels': listed(rounded(envelope(shown, points)))}
+
+
+def indicators_content(average: AverageMessage) -> Json:
+    """Content of condition indicators: their names, values (channel, indicator)."""
+    values = average.values[:CHANNELS, :INDICATORS]
+    names = average.names or [f'indicator {i}' for i in range(average.values.shape[1])]
+    return {'header': header_content(average.header), 'names': names[:values.shape[1]],
+            'values': listed(values)}
 
 
 def orders_content(average: AverageMessage, history: list[FloatArray]) -> Json:

@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.effects import EFFECTS, parameter_ranges
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
-from sa_jitter_ros.nodes.parameters import Parameter, Values
+from sa_jitter_ros.nodes.effect_parameters import effect_parameters
+from sa_jitter_ros.nodes.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, DeclaredJitter, Effect, Gearbox, Keyphasor,
@@ -58,42 +60,14 @@ PARAMETERS = (
     Parameter('waveform_noise_std', 0.0, 'white noise on the waveform of 0 to 5 V', unit='V',
               minimum=0.0, **FIXED),
 )
-# Effects that the declared model lacks; parameters as the predictor has them.
-EFFECT_PARAMETERS = {
-    'excess_jitter': (
-        Parameter('std', 2e-5, 'of an independent normal pulse error', unit='s', minimum=0.0),),
-    'correlated_jitter': (
-        Parameter('std', 2e-5, 'of a normal pulse error', unit='s', minimum=0.0),
-        Parameter('correlation', 0.8, 'of neighbouring pulses', minimum=-0.999, maximum=0.999)),
-    'target_geometry': (
-        Parameter('pulse_angles', [0.0, 0.005], 'how far each mark is off its even place',
-                  unit='rad'),),
-    'clock_skew': (
-        Parameter('skew', 1e-5, 'relative excess of the clock of the keyphasor', minimum=-0.1,
-                  maximum=0.1),),
-    'keyphasor_quantisation': (
-        Parameter('clock_rate', 5000.0, 'clock to which pulse times are rounded up; replaces the '
-                  'declared jitter', unit='Hz', above=0.0),
-        Parameter('period_std', 0.0, 'of the trigger period, by a slow speed fluctuation',
-                  unit='s', minimum=0.0)),
-    'missing_pulses': (
-        Parameter('probability', 0.02, 'of a pulse to be lost', minimum=0.0, maximum=0.99),),
-    'speed_fluctuation': (
-        Parameter('acceleration_std', 10.0, 'random acceleration of the tach shaft',
-                  unit='rad/s^2', minimum=0.0),),
-    'phase_wander': (
-        Parameter('std', 0.01, 'slow angle between a shaft and its vibration', unit='rad',
-                  minimum=0.0),),
-    'amplitude_modulation': (
-        Parameter('std', 0.2, 'slow relative change of the amplitude', minimum=0.0),),
-    'interpolation_loss': (
-        Parameter('method', 'linear', 'interpolator that the vibration has been through',
-                  choices=('linear', 'cubic', 'spline')),),
-    'additive_noise': (
-        Parameter('std', 0.5, 'white noise per sample, in units of the vibration', minimum=0.0),),
-    'interfering_tone': (
-        Parameter('frequency', 100.0, 'of a tone that no shaft makes', unit='Hz', above=0.0),
-        Parameter('amplitude', 0.5, 'of the tone', minimum=0.0)),
+# Sizes at which an effect shows as soon as it is switched on.
+EFFECT_DEFAULTS = {
+    'excess_jitter.std': 2e-5, 'correlated_jitter.std': 2e-5, 'correlated_jitter.correlation': 0.8,
+    'target_geometry.pulse_angles': (0.0, 0.005), 'clock_skew.skew': 1e-5,
+    'keyphasor_quantisation.clock_rate': 5000.0, 'missing_pulses.probability': 0.02,
+    'speed_fluctuation.acceleration_std': 10.0, 'phase_wander.std': 0.01,
+    'amplitude_modulation.std': 0.2, 'additive_noise.std': 0.5,
+    'interfering_tone.frequency': 100.0, 'interfering_tone.amplitude': 0.5,
 }
 
 
@@ -111,20 +85,12 @@ def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     )
 
 
-def effect_parameters() -> Iterator[Parameter]:
-    """Iterate over the parameters of all effects."""
-    for name, items in EFFECT_PARAMETERS.items():
-        yield Parameter(f'effects.{name}.enabled', False, f'add the effect {name}')
-        for item in items:
-            yield Parameter(**{**vars(item), 'name': f'effects.{name}.{item.name}'})
-
-
 def effects_of(values: Values) -> tuple[Effect, ...]:
     """Return declared jitter and noise and the enabled effects; raises `ParameterError`."""
     options = {}
-    for name, items in EFFECT_PARAMETERS.items():
+    for name, kind in EFFECTS.items():
         if values[f'effects.{name}.enabled']:
-            found = {item.name: values[f'effects.{name}.{item.name}'] for item in items}
+            found = {key: values[f'effects.{name}.{key}'] for key in parameter_ranges(kind)}
             options[name] = {key: tuple(value) if isinstance(value, list) else value
                              for key, value in found.items()}
     declared: list[Effect] = [AdditiveNoise(values['noise_std'], 'declared_noise')]
@@ -178,8 +144,10 @@ class MachineSimulator(PlaybackNode):
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('machine_simulator', PARAMETERS, **node_kwargs)
-        self.parameters.declare(tuple(effect_parameters()))
-        for shaft in self.parameters.values()['shafts']:
+        self.parameters.declare(tuple(effect_parameters(EFFECT_DEFAULTS)))
+        shafts = self.parameters.values()['shafts']
+        require_shaft_names('shafts', shafts)
+        for shaft in shafts:
             self.parameters.declare(shaft_parameters(shaft))
         self._values = values = self.parameters.values()
         self.machine = machine_of(values)

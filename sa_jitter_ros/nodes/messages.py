@@ -335,7 +335,7 @@ def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
     """Decode an average's array; `kind` is the topic's name."""
     header, values, names = decode_array(message, _AVERAGE_LABELS[kind], 6)
     if kind in _AVERAGE_FIELDS:
-        values = _with_fields(values, _AVERAGE_FIELDS[kind])
+        values, names = _with_fields(values, _AVERAGE_FIELDS[kind]), _AVERAGE_FIELDS[kind]
     start, end, sequence, cycles, fundamental, speed = (float(item) for item in header)
     return AverageMessage(
         AverageHeader(start, end, _whole('sequence', sequence), _whole('trigger cycles', cycles),

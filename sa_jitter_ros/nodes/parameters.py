@@ -10,6 +10,7 @@ that match nothing, and on a change hands the whole new configuration first to `
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 import math
+import re
 from typing import Any
 
 from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescriptor,
@@ -122,6 +123,20 @@ def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.para
                  str: rclpy.Parameter.Type.STRING_ARRAY}
         return rclpy.parameter.Parameter(name, kinds[element], value)
     return rclpy.parameter.Parameter(name, value=value)
+
+
+def require_shaft_names(parameter: str, names: Sequence[str]) -> None:
+    """Raise `ParameterError` unless there are names, different ones that topics can have."""
+    wrong = [name for name in names if not re.fullmatch('[a-z][a-z0-9_]*', name)]
+    if wrong or not names or len(set(names)) < len(names):
+        raise ParameterError(f'{parameter} is {", ".join(map(repr, names))}: give different names '
+                             'of small letters, digits and underscores')
+
+
+def require_node_name(parameter: str, name: str) -> None:
+    """Raise `ParameterError` unless a node can have the name, with or without namespace."""
+    if not re.fullmatch(r'/?([A-Za-z_]\w*/)*[A-Za-z_]\w*', name, re.ASCII) or '__' in name:
+        raise ParameterError(f'{parameter} is {name!r}: give the name of a node')
 
 
 class ParameterSet:

@@ -22,9 +22,11 @@ from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.nodes import jitter_predictor
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.effect_parameters import effect_parameters
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)
-from sa_jitter_ros.nodes.parameters import as_ros_parameter, Parameter, Values
+from sa_jitter_ros.nodes.parameters import (as_ros_parameter, Parameter, require_node_name,
+                                            require_shaft_names, Values)
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from std_msgs.msg import Float64MultiArray, String
 
@@ -36,7 +38,7 @@ PARAMETERS = (
               minimum=2, maximum=10000),
     Parameter('close_loop', False, "set the predictor's effect parameters to what was found"),
 )
-_PREDICTOR = (*jitter_predictor.PARAMETERS, *jitter_predictor.effect_parameters())
+_PREDICTOR = (*jitter_predictor.PARAMETERS, *effect_parameters())
 _TICK = 0.1  # s between looks at what has come
 _PATIENCE = 3.0  # s to look for the predictor
 _ANSWER = 15.0  # s to wait for its answer: it predicts anew first
@@ -53,6 +55,8 @@ class ResidualAnalyser(MonitoringNode):
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('residual_analyser', PARAMETERS, **node_kwargs)
         self._values = self.parameters.values()
+        require_shaft_names('shaft', [self._values['shaft']])
+        require_node_name('predictor', self._values['predictor'])
         self._batch = Batch(self._values['acquisitions'])
         self._pulses: dict[float, NDArray[np.float64]] = {}
         self._prediction: Published | None = None

@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-import re
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.shaft import SynchronousAverage
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
-from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.averager_parameters import (gear_settings, PARAMETERS, pulse_validator,
                                                      shaft_parameters, shaft_settings,
@@ -17,7 +16,7 @@ from sa_jitter_ros.nodes.averager_parameters import (gear_settings, PARAMETERS, 
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
                                           PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
-from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.nodes.parameters import require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray
 
 
@@ -27,10 +26,7 @@ class SynchronousAverager(MonitoringNode):
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('synchronous_averager', PARAMETERS, **node_kwargs)
         names = self.parameters.values()['shafts']
-        wrong = [name for name in names if not re.fullmatch('[a-z][a-z0-9_]*', name)]
-        if wrong or not names or len(set(names)) < len(names):
-            raise ParameterError(f'shafts is {names}: give different names of small letters, '
-                                 'digits and underscores')
+        require_shaft_names('shafts', names)
         for name in names:
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()

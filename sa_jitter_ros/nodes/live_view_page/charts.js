@@ -131,6 +131,15 @@ export class Chart {
     this.add('path', {class: `curve ${style}`, d: path});
   }
 
+  // Area between two curves over the same places; nothing where one is unknown.
+  between(style, xs, lows, highs) {
+    const points = lows.flatMap((low, i) => known(low) && known(highs[i]) ? [i] : []);
+    const place = (values, i) => `${this.x(xs(i)).toFixed(1)} ${this.y(values[i]).toFixed(1)}`;
+    if (!points.length) return;
+    this.add('path', {class: style, d: `M${points.map(i => place(lows, i)).join('L')}L`
+      + `${points.reverse().map(i => place(highs, i)).join('L')}Z`});
+  }
+
   level(style, value) {
     const place = this.y(value);
     this.add('line', {class: style, x1: MARGIN.left, x2: MARGIN.left + this.inner, y1: place,

@@ -27,24 +27,37 @@ function drawWaveform(chart, place) {
   const shown = raw.channels.length > CURVES ? first + place : place;
   // The two arrive one after the other: that of the average before is as good.
   const fresh = corrected && Math.abs(raw.header.sequence - corrected.header.sequence) < 2;
+  const spread = standardError(raw)?.channels[shown];
+  const limits = [-2, 2].map(factor => raw.channels[shown].map((value, i) =>
+    known(value) && known(spread?.[i]) ? value + factor * spread[i] : null));
   const curves = [['raw', raw.channels[shown]],
                   ['corrected', fresh ? corrected.channels[shown] : null]]
     .filter(([, values]) => values);
   const x = linear([0, 360]);
   x.ticks = [0, 45, 90, 135, 180, 225, 270, 315, 360].map(value => [value, `${value}`]);
   chart.axes({
-    x, y: linear(range(curves.flatMap(([, values]) => values)), 4), title: channelName(shown),
-    xLabel: `angle of ${find('shaft').value} [degrees]`, yLabel: `[${unit()}]`});
+    x, y: linear(range([...limits.flat(), ...curves.flatMap(([, values]) => values)]), 4),
+    title: channelName(shown), xLabel: `angle of ${find('shaft').value} [degrees]`,
+    yLabel: `[${unit()}]`});
+  chart.between('spread', i => 360 * i / limits[0].length, ...limits);
   for (const [style, values] of curves) {
     chart.curve(style, i => 360 * i / values.length, values);
   }
   const usual = waveformNote(raw, fresh);
   chart.follow(position => {
     find('waveform-note').textContent = position === null ? usual
-      : `${channelName(shown)} at ${(360 * position).toFixed(1)}°: ` + curves.map(
+      : `${channelName(shown)} at ${(360 * position).toFixed(1)}°: ` + [
+        ...curves, ...(spread ? [['standard error', spread]] : [])].map(
         ([style, values]) => `${style} ` + format(
           values[Math.min(Math.round(position * values.length), values.length - 1)])).join(', ');
   });
+}
+
+// The standard error of this very average, null where it is not published.
+function standardError(raw) {
+  const error = ofShaft('standard_error');
+  return error?.header.sequence === raw.header.sequence && error.points === raw.points
+    ? error : null;
 }
 
 function waveformNote(raw, fresh) {

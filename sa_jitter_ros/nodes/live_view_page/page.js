@@ -4,7 +4,7 @@ import {Chart} from './charts.js';
 import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms}
   from './drawings.js';
 import {channelName, find, ofShaft, settings, state} from './model.js';
-import {drawEffects, drawNodes, drawOrders, drawTiles} from './words.js';
+import {drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles} from './words.js';
 
 const PERIOD = 500;  // ms between questions
 
@@ -39,10 +39,11 @@ const charts = {
 // What to draw, and when: on a change of a part whose name ends so.
 const DRAWN = [
   [drawTiles, /speed|order_amplitude|pulse_error|prediction|residual|missing_effect/],
-  [drawWaveforms, /average$/],
+  [drawWaveforms, /average$|standard_error/],
   [charts.amplitudes.render, /order_amplitude/],
   [charts.attenuation.render, /order_amplitude|prediction/],
   [drawOrders, /order_amplitude|prediction/],
+  [drawIndicators, /condition_indicator/],
   [charts.errors.render, /pulse_error|prediction/],
   [charts.residual.render, /residual|missing_effect/],
   [drawEffects, /missing_effect/],

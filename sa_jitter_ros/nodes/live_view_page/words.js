@@ -2,7 +2,7 @@
 
 import {format, known} from './charts.js';
 import {drawSpeedLine} from './drawings.js';
-import {find, finite, inBand, ofShaft, orderRows, part, predicted, state, timeUnit, unit,
+import {channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, state, timeUnit, unit,
         withTimeUnit} from './model.js';
 
 const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
@@ -69,6 +69,18 @@ export function drawOrders() {
             [inside === null ? '–' : inside ? 'yes' : 'no',
              `number ${inside === false ? 'warn' : ''}`]];
   }));
+}
+
+export function drawIndicators() {
+  const indicators = ofShaft('condition_indicator');
+  if (!indicators) {
+    fill(find('indicators'), [['none received yet']], []);
+    return;
+  }
+  fill(find('indicators'), [['channel'], ...indicators.names.map(
+    name => [name.replaceAll('_', ' '), 'number'])],
+       indicators.values.map((row, i) => [[channelName(i)], ...row.map(
+         value => [format(value), 'number'])]));
 }
 
 export function drawEffects() {
