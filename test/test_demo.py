@@ -1,13 +1,15 @@
 """The demo as a user meets it: separate processes over DDS, a table and figures."""
 
+import os
 import re
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from sa_jitter_ros.commands import demo
 from sa_jitter_ros.commands.demo_plan import plan_recording
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.errors import RecordingError, SaJitterError
 from sa_jitter_ros.recordings import Recording
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource
@@ -95,3 +97,20 @@ def test_measured_recordings_give_averages_whose_loss_is_known(
     attenuation = np.array([float(row[-5]) for row in rows])
     assert len(rows) >= 5
     np.testing.assert_allclose(attenuation, 1.0, atol=0.01)
+
+
+@pytest.mark.parametrize('chosen', [None, 'OFF'])
+def test_discovery_stays_on_this_host_unless_the_user_chooses(monkeypatch, tmp_path, capsys,
+                                                               chosen):
+    name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    monkeypatch.setenv(name, chosen or '')
+    if chosen is None:
+        monkeypatch.delenv(name)
+
+    def watcher(**node_kwargs):
+        raise SaJitterError(f'range {os.environ[name]}')
+
+    monkeypatch.setattr(demo, 'Watcher', watcher)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    assert demo.main(['--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f'demo: range {chosen or "LOCALHOST"}\n'

@@ -7,6 +7,7 @@ predictor, and compares what comes out with what was predicted.
 
 import argparse
 from collections.abc import Sequence
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -151,6 +152,7 @@ def main(args: Sequence[str] | None = None) -> int:
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')
         if not options.live:
             print('to watch it live in a web browser: ./run demo --live')
+        os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         rclpy.init(context=context)
         watcher = Watcher(context=context)
         executor = SingleThreadedExecutor(context=context)
