@@ -1,4 +1,4 @@
-"""The quality gates: style as ROS packages have it, ruff, and strict types in the core."""
+"""The quality gates: style as ROS packages have it, ruff, and strict types."""
 
 from importlib.util import find_spec
 from pathlib import Path

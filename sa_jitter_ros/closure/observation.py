@@ -9,6 +9,7 @@ modulation and interpolation do to both cancels in it.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,7 +95,7 @@ class Observation:
     against_reference: bool
     name: str = ''
 
-    def stacked(self, field: str) -> NDArray[np.generic]:
+    def stacked(self, field: str) -> NDArray[Any]:
         """Return one field of all acquisitions as an array."""
         return np.array([getattr(item, field) for item in self.acquisitions])
 

@@ -16,7 +16,7 @@ import tempfile
 from typing import NoReturn
 
 from sa_jitter_ros.closure.html_report import report_files
-from sa_jitter_ros.closure.observation import observe
+from sa_jitter_ros.closure.observation import Observation, observe
 from sa_jitter_ros.closure.report import summary
 from sa_jitter_ros.closure.trace import Trace, trace
 from sa_jitter_ros.commands.declaration import read_declaration
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> Trace:
     for name in declaration.unknown:
         print(f'close_loop: {options.declared}: {name} is no parameter of jitter_predictor, '
               'ignored', file=sys.stderr)
-    observations = []
+    observations: list[Observation] = []
     for path, recording in zip(options.recordings, recordings):
         say(f'observing {path}')
         observations.append(observe(

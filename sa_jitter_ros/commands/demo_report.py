@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,7 +17,7 @@ FloatArray = NDArray[np.float64]
 RAW, CORRECTED, MEASURED = 'tab:red', 'tab:blue', 'black'
 
 
-def amplitude_rows(amplitudes: Sequence[AverageMessage]) -> tuple[FloatArray, FloatArray]:
+def amplitude_rows(amplitudes: Sequence[AverageMessage]) -> tuple[FloatArray, NDArray[Any]]:
     """Tables (average, order, field) of every order on its strongest channel, and the channels."""
     table = np.stack([item.values for item in amplitudes])  # average, channel, order, field
     channels = np.argmax(np.nanmean(table[..., 1], axis=0), axis=0)
@@ -106,7 +107,7 @@ def draw_orders(plan: Plan, amplitudes: Sequence[AverageMessage],
     _save(figure, path)
 
 
-def _stems(axes: Axes, position: FloatArray, values: FloatArray, color: str, label: str) -> None:
+def _stems(axes: Axes, position: NDArray[Any], values: FloatArray, color: str, label: str) -> None:
     """Mean of each order as a stem's head, the scatter over averages as its bar."""
     mean, spread = np.nanmean(values, axis=0), np.nanstd(values, axis=0)
     axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,

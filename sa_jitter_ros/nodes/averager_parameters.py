@@ -102,7 +102,7 @@ def trigger_share(values: Values) -> float:
     if trigger > revolution:
         raise ParameterError(f'pulses_per_trigger is {trigger} of {revolution} '
                              'pulses_per_revolution: give at most that many')
-    return (trigger or revolution) / revolution
+    return float((trigger or revolution) / revolution)
 
 
 def pulse_validator(values: Values) -> PulseValidator:

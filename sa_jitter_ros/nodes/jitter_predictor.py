@@ -50,8 +50,10 @@ _MODEL = ('keyphasor_rate', 'trigger_speed', 'trigger_cycles', 'orders', 'ratio'
 
 def declared_model(values: Values) -> DeclaredModel:
     """Model that the parameters declare; raises `ModelError`."""
-    return DeclaredModel(**{name: tuple(values[name]) if isinstance(values[name], list)
-                            else values[name] for name in _MODEL})
+    arguments: dict[str, Any] = {
+        name: tuple(values[name]) if isinstance(values[name], list) else values[name]
+        for name in _MODEL}
+    return DeclaredModel(**arguments)
 
 
 def check(values: Values) -> None:

@@ -153,6 +153,7 @@ class LiveView(MonitoringNode):
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Say where the page is and whether there is something on it."""
+        assert self._server is not None
         silence = self._board.silence()
         state = 'no data received yet' if silence is None else (
             f'{self._averages} averages shown' if silence < 3.0 else

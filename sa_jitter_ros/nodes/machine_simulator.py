@@ -14,12 +14,12 @@ from sa_jitter_ros.nodes.effect_parameters import effect_parameters
 from sa_jitter_ros.nodes.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.simulation import (
-    AdditiveNoise, band_limited, ChippedTooth, DeclaredJitter, Effect, Gearbox, Keyphasor,
+    AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox, Keyphasor,
     make_effects, mesh, Torsion)
 from sa_jitter_ros.simulation.pulse_effects import JITTER_DISTRIBUTIONS
 from sa_jitter_ros.simulation.sinusoids import NOTHING
 
-FIXED = {'read_only': True}
+FIXED: dict[str, Any] = {'read_only': True}
 PARAMETERS = (
     Parameter('seed', 0, 'of all random numbers', minimum=0, **FIXED),
     Parameter('start_time', 0.0, 'time of the first sample', unit='s', **FIXED),
@@ -114,7 +114,8 @@ def machine_of(values: Values) -> Gearbox:
     if len(band) != 2:
         raise ParameterError(f'speed_fluctuation_band is {band}: give two frequencies')
     std = values['speed_fluctuation_std']
-    components, faults = [], []
+    components: list[Component] = []
+    faults = []
     for shaft in values['shafts']:
         teeth, depth = values[f'{shaft}.teeth'], values[f'{shaft}.chipped_tooth']
         components += mesh(shaft, teeth, harmonics=values[f'{shaft}.harmonics'],

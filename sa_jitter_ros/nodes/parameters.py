@@ -66,7 +66,7 @@ class Parameter:
         return self._convert_one(value)
 
     def _convert_one(self, value: Any) -> Any:
-        kind = self.kind
+        kind: Any = self.kind
         if kind is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
         if kind is str and isinstance(value, int) and not isinstance(value, bool):

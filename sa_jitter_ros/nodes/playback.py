@@ -99,7 +99,8 @@ class PlaybackNode(MonitoringNode):
         self._vibration = self.create_output(SAMPLE_TYPES[kind], 'vibration', INPUT_QOS)
         self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._keyphasor = values['keyphasor']
-        self._pulse = self._waveform = None
+        self._pulse: Any = None  # publishers, where there is something to publish
+        self._waveform: Any = None
         self._pacer = Pacer(values['rate'])
         self._playing, self._started = values['playing'], False
         self._born, self._rest = time.monotonic(), 0.0
@@ -127,7 +128,7 @@ class PlaybackNode(MonitoringNode):
 
     def block_samples(self, sample_rate: float, channels: int) -> int:
         """Return the number of samples in a message."""
-        seconds = self.parameters.values()['block_seconds']
+        seconds: float = self.parameters.values()['block_seconds']
         most = (MAX_MESSAGE_BYTES - 4096) // (8 * channels)
         return max(1, min(round(seconds * sample_rate), most))
 
