@@ -100,8 +100,7 @@ def test_measured_recordings_give_averages_whose_loss_is_known(
 
 
 @pytest.mark.parametrize('chosen', [None, 'OFF'])
-def test_discovery_stays_on_this_host_unless_the_user_chooses(monkeypatch, tmp_path, capsys,
-                                                               chosen):
+def test_discovery_stays_on_this_host_unless_opened(monkeypatch, tmp_path, capsys, chosen):
     name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
     monkeypatch.setenv(name, chosen or '')
     if chosen is None:

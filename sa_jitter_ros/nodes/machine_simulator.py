@@ -14,8 +14,8 @@ from sa_jitter_ros.nodes.effect_parameters import effect_parameters
 from sa_jitter_ros.nodes.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.simulation import (
-    AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox, Keyphasor,
-    make_effects, mesh, Torsion)
+    AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,
+    Keyphasor, make_effects, mesh, Torsion)
 from sa_jitter_ros.simulation.pulse_effects import JITTER_DISTRIBUTIONS
 from sa_jitter_ros.simulation.sinusoids import NOTHING
 
