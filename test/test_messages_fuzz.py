@@ -123,7 +123,7 @@ NODES = {
                               'tach_type': 'std_msgs/Float64MultiArray', 'trigger_cycles': 1},
         {'vibration': ARRAY32, 'tach_pulse': ARRAY}),
     'averager of imu': (SynchronousAverager, {'vibration_type': 'sensor_msgs/Imu',
-                                              'sample_rate': 100.0, 'trigger_cycles': 1},
+                                              'sample_rate': 1e9, 'trigger_cycles': 1},
                         {'vibration': IMU, 'tach_pulse': PULSE}),
     'detector': (TachDetector, {'learning_time': 0.01}, {'tach_waveform': ARRAY}),
     'predictor': (JitterPredictor, {'follow_shaft_speed': True}, {'shaft_speed': SPEED}),

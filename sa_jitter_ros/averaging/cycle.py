@@ -72,7 +72,7 @@ def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> 
     needed = 1.05 * period * rate / cycles
     share = Fraction(cycles).limit_denominator(512)
     step = share.denominator if abs(float(share) - cycles) < 1e-12 * cycles else 1
-    multiple = math.ceil(max(needed, 8.0) / step)
+    multiple = math.ceil(min(max(needed, 8.0), MAX_POINTS) / step)
     return min(step * int(next_fast_len(multiple, real=True)), MAX_POINTS)
 
 

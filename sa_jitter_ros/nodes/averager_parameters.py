@@ -17,7 +17,7 @@ PARAMETERS = (
     Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse',
               read_only=True),
     Parameter('sample_rate', 0.0, 'sampling rate where messages carry none, 0 if they do',
-              unit='Hz', minimum=0.0, read_only=True),
+              unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
     Parameter('start_time', 0.0, 'time of sample 0 where messages carry none', unit='s',
               read_only=True),
     Parameter('imu_axis', 'z', 'axes of linear acceleration taken as channels, from x, y, z',

@@ -28,7 +28,7 @@ PARAMETERS = (
     Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
               'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
     Parameter('sample_rate', 0.0, 'sampling rate where messages carry none, 0 if they do',
-              unit='Hz', minimum=0.0, read_only=True),
+              unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
     Parameter('start_time', 0.0, 'time of sample 0 where messages carry none', unit='s',
               read_only=True),
     Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',

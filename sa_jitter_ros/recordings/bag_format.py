@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.bag_limits import check_inflation
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.recording import (
     FloatArray, MAX_CHANNELS, MAX_PULSES, rechunk, Recording, recording_errors)
@@ -180,7 +181,11 @@ def _reader(path: Path) -> Iterator[Any]:
     except ImportError as error:
         raise RecordingError(
             "reading bags needs the Python package rosbags: 'pip install rosbags'") from error
+    check_inflation(path)
     with Reader(path) as reader:
+        if reader.compression_mode == 'message':
+            raise RecordingError('compressed message by message: convert it with ros2 bag convert '
+                                 'to compression of files, or to none')
         yield reader
 
 
