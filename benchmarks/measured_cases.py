@@ -27,8 +27,8 @@ from sa_jitter_ros.recordings.recording import ChannelSelection, Recording
 from scipy import stats
 import yaml
 
-CLOCKS = (3300.0, 4700.0, 5120.0, 6000.0, 9100.0)
-FITTED = CLOCKS[0]
+CLOCKS = (2560.0, 3300.0, 4700.0, 5120.0, 6000.0, 9100.0, 13000.0)
+FITTED = 3300.0
 GEAR0 = {'trigger_speed': 33.33, 'trigger_cycles': 40, 'orders': [23.0, 46.0, 69.0, 92.0, 115.0]}
 _FIRST_HALF, _SECOND_HALF = (0, 1, 2), (3, 4, 5)
 _FEW, _SHOWN = 10, 120
@@ -143,17 +143,18 @@ def transfer_table(period_std: float, data: Path) -> str:
 
 def table(cases: Sequence[Case], first: str) -> str:
     """Return the outcomes in Markdown."""
-    lines = [f'| {first} | held out | verdict | added | RMS before | after | chi2/dof before '
-             '| after | p before | after |', '|---|---|---|---|---|---|---|---|---|---|']
+    lines = [f'| {first} | held out | verdict | added | unsteadiness | RMS before | after '
+             '| chi2/dof before | after | p before | after |', f'|{"---|" * 11}']
     for case in cases:
         if case.error:
-            lines.append(f'| {case.title} | - | not used | | | | | | | |')
+            lines.append(f'| {case.title} | - | not used {"| " * 8}|')
             continue
         numbers = [f'{case.value(when, key):.{digits}}'
                    for key, digits in (('rms', '4f'), ('chi2_per_dof', '3g'), ('p_value', '2g'))
                    for when in ('before', 'after')]
         lines.append(f'| {case.title} | {case.content["acquisitions"]["held_out"]} | '
-                     f'{case.content["verdict"]} | {case.effects} | {" | ".join(numbers)} |')
+                     f'{case.content["verdict"]} | {case.effects} | '
+                     f'{case.content["unsteadiness"]:.1%} | {" | ".join(numbers)} |')
     return '\n'.join(lines)
 
 
@@ -233,8 +234,9 @@ def main() -> None:
     effect, = (item for item in source.content['missing_effects']
                if item['name'] == 'keyphasor_quantisation')
     period_std = effect['parameters']['period_std']['value']
-    for item in gearbox[0].content['missing_effects']:
-        print(f'\n{gearbox[0].title}: {item["name"]}: {item["evidence"]}')
+    shown = gearbox[CLOCKS.index(FITTED)]
+    for item in shown.content['missing_effects']:
+        print(f'\n{shown.title}: {item["name"]}: {item["evidence"]}')
     print(f'\nperiod_std = {period_std:.3g} s, fitted at {FITTED:.0f} Hz on channels 0 to 2, then '
           'declared; channels 3 to 5:\n')
     print(transfer_table(period_std, options.data), flush=True)

@@ -104,3 +104,21 @@ def test_loop_is_judged_on_a_machine_of_another_simulator(benchmark, tmp_path):
 def test_page_without_a_section_is_refused(benchmark):
     with pytest.raises(ValueError, match='no section'):
         benchmark('performance_page').fill('nothing', {'core': ''})
+
+
+def test_measured_cases_are_run_as_a_user_does(benchmark, tmp_path):
+    cases, machines = benchmark('measured_cases'), benchmark('trace_confusion')
+    taken = machines.recording(machines.machine((), seed=1), 8.1)
+    np.savez(tmp_path / 'machine.npz', vibration=taken.read(), sample_rate=taken.sample_rate,
+             pulse_times=taken.pulse_times)
+    model = {'keyphasor_rate': machines.KEYPHASOR_RATE, 'trigger_speed': machines.SPEED,
+             'orders': list(machines.ORDERS), 'noise_std': machines.NOISE}
+    stored = [cases.stored('machine.npz')]
+    used, refused = (cases.run(cases.Case(title, stored, {**model, 'trigger_cycles': count}),
+                               tmp_path) for title, count in (('used', 20), ('refused', 100)))
+    assert used.content['verdict'] == 'none'
+    assert 'fitting and scoring take at least 4' in refused.error
+    lines = cases.table([used, refused], 'machine').splitlines()
+    assert {line.count('|') for line in lines} == {12}
+    assert lines[2].startswith('| used | 5 | none | - | 0.0% |')
+    assert cases.error_figure([used]).axes

@@ -104,7 +104,9 @@ def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
 def _error_table(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     return _table(('', 'before', 'after'), [
-        (text, _number(before[key]), _number(after[key])) for key, text in _ERRORS])
+        *((text, _number(before[key]), _number(after[key])) for key, text in _ERRORS),
+        ('scatter of the amplitudes that nothing explains, part of the scale',
+         *2 * (_number(content['unsteadiness']),))])
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:

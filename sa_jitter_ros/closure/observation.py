@@ -30,6 +30,8 @@ MOST_SAMPLES = 200_000_000
 _OTHER_MACHINE = 5.0
 # Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
+# Strongest orders beside the declared ones that may leak into them.
+_MOST_OTHERS = 16
 # A ripple of this many times its noise in power is taken out of the corrected average.
 _RIPPLE = 3.0
 
@@ -306,6 +308,6 @@ def _other_sources(reader: CycleReader, pulses: TriggerPulses, model: DeclaredMo
         strong = (spectrum > 0.3 * float(np.min(top))) & (order > 0.0) & (
             order < 0.45 * points / model.cycle_length)
         strong &= np.min(np.abs(order[:, None] - np.array(declared)), axis=1) > 1e-6
-        best = np.argsort(np.where(strong, spectrum, 0.0))[::-1][:8]
+        best = np.argsort(np.where(strong, spectrum, 0.0))[::-1][:_MOST_OTHERS]
         return [float(order[k]) for k in best if strong[k]]
     return ()

@@ -67,6 +67,9 @@ def summary(content: Mapping[str, Json]) -> str:
                 f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
     text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
                 f'{after["chi2_per_dof"]:.3g} after')
+    if content['unsteadiness']:
+        text.append(f'the amplitudes scatter by {content["unsteadiness"]:.2%} of themselves that '
+                    'nothing explains: part of the scale of chi2 and p')
     return '\n'.join(text)
 
 

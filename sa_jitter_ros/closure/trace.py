@@ -129,7 +129,7 @@ class Bench:
         Return what the corrected amplitudes scatter by beyond what noise and effects predict.
 
         It is the root mean square over acquisitions and lines, in parts of the level: 0 where it
-        may be chance, and not more than a steady machine has.
+        may be chance, and of no line more than a steady machine has.
         """
         orders = self.observation.orders.size
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
@@ -141,7 +141,7 @@ class Bench:
         chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
         if np.mean(power / known) < 1.0 + chance:
             return 0.0
-        return min(float(np.sqrt(max(np.mean(power - known), 0.0))), STEADY)
+        return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
@@ -277,7 +277,7 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
         gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
             kind.scatters) else ('attenuation', score.score, current.score)
         p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
-        decisive = own > ACCURACY and left < 0.5 * own if kind.scatters else (
+        decisive = own > ACCURACY and left**2 < 0.5 * own**2 if kind.scatters else (
             _decisive(finding, current, score))
         needed = p_value < SIGNIFICANT or kind.seen or decisive
         if not rejected and not needed:
