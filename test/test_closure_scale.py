@@ -8,6 +8,7 @@ import pytest
 
 from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.expectation import expect, Lines
+from sa_jitter_ros.closure.gathering import line_evidence
 from sa_jitter_ros.closure.observation import observe
 from sa_jitter_ros.closure.trace import STEADY, trace
 from sa_jitter_ros.effects import make_effect
@@ -90,6 +91,20 @@ def test_little_white_noise_is_told_although_it_is_within_a_machines_own_scatter
     assert found.unsteadiness == 0.0
     assert found.before.chi2_per_dof > 5.0
     assert 0.7 < found.after.chi2_per_dof < 1.4
+
+
+def test_what_leaks_into_cycles_but_not_into_averages_is_no_noise(observation, rng):
+    lines, *_ = lines_of(observation)
+
+    def changed(item):
+        leak = 0.3 * np.abs(item.corrected) * rng.standard_normal(item.cycles.shape)
+        return replace(item, cycles=item.cycles + leak - leak.mean(axis=0))
+
+    leaking = replace(observation, acquisitions=tuple(map(changed, observation.acquisitions)))
+    for each in observation, leaking:
+        density = np.sqrt(np.median(np.mean(line_evidence(each, lines).noise_density**2, axis=0)))
+        # of as many squares as there are averages and lines, the more uncertain of both
+        assert density == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * ACQUISITIONS * lines.count))
 
 
 def lines_of(observation):

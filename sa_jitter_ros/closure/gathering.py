@@ -25,6 +25,7 @@ _PRECISE = 0.25
 _TWIN = 4.0
 _CERTAIN = 1e-4
 _GROUPS = 3
+_RARE = 0.01
 # A clock this much faster than the declared one is no cause of anything.
 _FINE = 50.0
 
@@ -151,6 +152,12 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
     noises = np.array([radial_noise(row) for row in cycles])
     noise = np.sqrt(np.mean(noises**2, axis=0))
+    # Other shafts' orders leak into single cycles, less into averages, which then scatter too
+    # little for the noise of their cycles.
+    count = len(cycles)
+    apart = np.abs(np.abs(mean[:, 0]) - level) * np.sqrt(count / (count - 1))
+    least = stats.chi2.ppf(_RARE, count - 1) / (count - 1)
+    noises = np.where(np.mean(apart**2, axis=0) < least * noise**2, apart, noises)
     density = noises * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     evidence = LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
