@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
-from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS
+from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, INPUT_QOS
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sensor_msgs.msg import Imu
 
@@ -487,6 +487,15 @@ def test_quality_of_service_can_be_overridden(bench):
     b.play(MACHINE, 0.5)
     assert len(b.amplitudes()) == 1
     assert b.diagnostics()[0] == DiagnosticStatus.OK
+
+
+def test_an_override_is_for_its_topic_only(ros_context):
+    node = SynchronousAverager(context=ros_context, parameter_overrides=[
+        Parameter('qos_overrides./vibration.subscription.reliability', value='best_effort')])
+    found = {item.topic_name: item.qos_profile.reliability for item in node.subscriptions}
+    assert found['/vibration'] == ReliabilityPolicy.BEST_EFFORT
+    assert found['/tach_pulse'] == INPUT_QOS.reliability == ReliabilityPolicy.RELIABLE
+    node.destroy_node()
 
 
 def test_topics_follow_namespace(ros_context, executor_for):

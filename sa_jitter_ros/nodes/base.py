@@ -1,6 +1,7 @@
 """What every node shares: parameters, diagnostics at 1 Hz, throttled warnings, QoS, main."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 import sys
 from typing import Any
 
@@ -31,6 +32,7 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
                       reliability=ReliabilityPolicy.RELIABLE)
 
 
+# Given to rclpy as copies: it writes the user's overrides into the profile that it gets.
 INPUT_QOS = _reliable(200, DurabilityPolicy.VOLATILE)
 RESULT_QOS = _reliable(10, DurabilityPolicy.VOLATILE)
 LATCHED_QOS = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
@@ -83,14 +85,15 @@ class MonitoringNode(Node):
             self.get_logger().error(self.faults[topic], throttle_duration_sec=WARNING_PERIOD)
 
         return self.create_subscription(
-            kind, topic, guarded, qos,
+            kind, topic, guarded, copy(qos),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
         """Return the publisher of a result."""
         return self.create_publisher(
-            kind, topic, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            kind, topic, copy(qos),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
     # --- telling the user ---
 
