@@ -51,7 +51,7 @@ def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noi
         ripple=np.full((count, pulses - 1), np.nan) if ripple is None else ripple,
         ripple_standard_error=ripple_error, against_reference=False, record_times=times.ravel(),
         record_missing=np.zeros(times.size - 1, int), clock=Clock(5_000.0, 1e-9),
-        clock_period_std=np.nan, lines=lines, explained=tuple(explained))
+        lines=lines, explained=tuple(explained))
 
 
 def declared(rng):

@@ -70,9 +70,9 @@ def channel_groups(observation: Observation) -> Array:
 
 
 def gather_pulses(recording: Recording, observation: Observation, group: Array
-                  ) -> tuple[Clock, float, Sequence[Sequence[Pulses]]]:
+                  ) -> tuple[Clock, Sequence[Sequence[Pulses]]]:
     """
-    Return the clock, the period's standard deviation by it, and what is known of the pulses.
+    Return the clock and what is known of the pulses.
 
     On a grid, the errors are those of the smoothest motion that it allows; where other channels
     recover the motion better than a quarter of a tick, those of that motion.
@@ -82,9 +82,6 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     clock = found.rate
     usable = 0.0 < clock < _FINE * model.keyphasor_rate
     smooth = smooth_on_grid(pulses.times, clock) if usable else None
-    period_std = float('nan')
-    if smooth is not None:
-        period_std = float(np.diff(pulses.times - smooth)[pulses.missing == 0].std(ddof=1))
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
     if usable and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
@@ -105,12 +102,12 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
                 errors, std = _on_grid(motion[a], clock), uncertain
             rows.append(Pulses(item.times, item.first, errors, item.missing, std))
         known.append(rows)
-    return (found if usable else Clock(0.0, 0.0)), period_std, known
+    return (found if usable else Clock(0.0, 0.0)), known
 
 
 def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
-           pulses: Sequence[Sequence[Pulses]], clock: Clock, period_std: float,
-           effects: Sequence[Effect], tone: LineEvidence) -> Evidence:
+           pulses: Sequence[Sequence[Pulses]], clock: Clock, effects: Sequence[Effect],
+           tone: LineEvidence) -> Evidence:
     """Return the evidence of the `chosen` acquisitions, less what `effects` explain."""
     model = observation.model
     picked = [observation.acquisitions[a] for a in chosen]
@@ -137,8 +134,7 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
             [item.ripple_standard_error**2 for item in items]))) if items else float('nan'),
         against_reference=observation.against_reference,
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
-        clock=clock, clock_period_std=period_std,
-        lines=replace(tone, radial=tone.radial[list(usable)],
+        clock=clock, lines=replace(tone, radial=tone.radial[list(usable)],
                       noise_density=tone.noise_density[list(usable)]), explained=tuple(effects))
 
 

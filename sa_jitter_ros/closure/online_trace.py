@@ -70,10 +70,10 @@ def trace_averages(averages: Sequence[Average], model: DeclaredModel, *,
         good_lines(stretch, places(observation.orders, stretch[0].orders))))
     count = len(stretch)
     fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
-    clock, period_std, pulses = _pulses(observation)
+    clock, pulses = _pulses(observation)
     level = lines.of(np.abs(observation.stacked('corrected'))[list(fit)].mean(axis=0))
     found = trace_bench(Bench(
-        observation, lines, level, pulses, clock, period_std, np.ones(len(stretch[0].raw), int),
+        observation, lines, level, pulses, clock, np.ones(len(stretch[0].raw), int),
         _scatter(observation, lines, level), fit, held_out,
         (*declared, _measured_noise(observation, lines)), UNTOLD), progress=progress)
     return replace(found, declared=tuple(declared), findings=tuple(
@@ -128,9 +128,9 @@ def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observati
         TriggerPulses(record, np.zeros(record.size - 1, np.int64), None), model.sample_rate, False)
 
 
-def _pulses(observation: Observation) -> tuple[Clock, float, list[list[Pulses]]]:
+def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
     """
-    Return the clock of the pulse times, the period's deviation by it, and the pulses.
+    Return the clock of the pulse times and the pulses.
 
     For each acquisition, what convicts the clock comes first: errors of the smoothest motion that
     its grid allows. What predicts comes second: the recovered errors, where they follow the first
@@ -140,7 +140,7 @@ def _pulses(observation: Observation) -> tuple[Clock, float, list[list[Pulses]]]
     items = observation.acquisitions
     clock = find_clock(times)
     if not 0.0 < clock.rate < _FINE * observation.model.keyphasor_rate:
-        return Clock(0.0, 0.0), float('nan'), [
+        return Clock(0.0, 0.0), [
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     smooth = smooth_on_grid(times, clock.rate)
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
@@ -148,7 +148,7 @@ def _pulses(observation: Observation) -> tuple[Clock, float, list[list[Pulses]]]
     follow = np.corrcoef((grid - grid.mean(axis=1, keepdims=True)).ravel(), seen.ravel())[0, 1]
     span = float(np.median(np.ptp(seen, axis=1))) * clock.rate
     better = seen if follow > _FOLLOWS and span < _ONE_TICK else grid
-    return clock, float(np.diff(times - smooth).std(ddof=1)), [
+    return clock, [
         [Pulses(item.times, item.first, errors, item.missing) for errors in pair]
         for item, pair in zip(items, zip(grid, better))]
 

@@ -22,6 +22,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.pulse_covariance import log_likelihood
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -31,6 +32,8 @@ Progress = Callable[[str], None]
 #: A residual with a smaller p value is no chance.
 SIGNIFICANT = 0.02
 _EVIDENCE = 1e-3
+# Held-out pulse errors that are e^7 times likelier by chance are rarer than e^-7.
+_TOLD, _MOVED = 7.0, 0.01
 _DECISIVE, _MATERIAL = 1e-6, 2.0 * ACCURACY
 #: Scatter from average to average that is the machine's own, in parts of an amplitude: what steady
 #: machines were measured to have that no effect describes (docs/measured_cases.md).
@@ -98,13 +101,17 @@ class Bench:
     level: Array
     pulses: Sequence[Sequence[Pulses]]
     clock: Clock
-    period_std: float
     group: Array
     scatter: LineEvidence
     fit: tuple[int, ...]
     held_out: tuple[int, ...]
     declared: tuple[Effect, ...]
     untold: Mapping[str, str] = field(default_factory=dict)
+
+    def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
+        """Return the evidence of some acquisitions, less what effects explain."""
+        return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
+                      [*self.declared, *effects], self.scatter)
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
                unsteadiness: float = 0.0) -> Expectation:
@@ -198,8 +205,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         significant = after.p_value < SIGNIFICANT
         effects = [finding.effect for finding in chosen if finding.effect is not None]
         try:
-            evidence = gather(observation, bench.lines, bench.fit, bench.pulses, bench.clock,
-                              bench.period_std, [*declared, *effects], bench.scatter)
+            evidence = bench.gather(effects, bench.fit)
         except SignalError as error:
             reason = str(error)
             break
@@ -243,12 +249,11 @@ def _bench(observation: Observation, observations: Sequence[Observation],
     group = channel_groups(observation)
     known = [gather_pulses(recording, item, group)
              for recording, item in zip(recordings, observations)]
-    clock, period_std, _ = known[0]
     orders = observation.orders.size
     corrected = np.abs(observation.stacked('corrected')[..., :orders])
     level = lines.of(corrected[list(fit)].mean(axis=0))
-    return Bench(observation, lines, level, [row for _, _, rows in known for row in rows], clock,
-                 period_std, group, line_evidence(observation, lines), fit, held_out,
+    return Bench(observation, lines, level, [row for _, rows in known for row in rows],
+                 known[0][0], group, line_evidence(observation, lines), fit, held_out,
                  tuple(declared))
 
 
@@ -279,11 +284,12 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
         p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
         decisive = own > ACCURACY and left**2 < 0.5 * own**2 if kind.scatters else (
             _decisive(finding, current, score))
-        needed = p_value < SIGNIFICANT or kind.seen or decisive
+        told = not kind.scatters and _told(bench, effects, finding, current, score)
+        needed = p_value < SIGNIFICANT or kind.seen or decisive or told
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
-        if not rejected and not (new > old or (kind.seen and new > old - _SAME)):
+        if not rejected and not (new > old or told or (kind.seen and new > old - _SAME)):
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
         found.append(Candidate(name, number, finding, new, rejected))
@@ -308,6 +314,21 @@ def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
     """
     return (finding.p_value < _DECISIVE and before.rms > _MATERIAL
             and after.rms < 0.5 * before.rms)
+
+
+def _told(bench: Bench, effects: Sequence[Effect], finding: Finding, before: Residual,
+          after: Residual) -> bool:
+    """
+    Tell whether held-out pulse errors tell an effect that the attenuation is too rough to tell.
+
+    Beside a large effect, the chance of few averages hides another that moves them as well.
+    """
+    moved = float(np.sqrt(np.mean((after.mean - before.mean) ** 2)))
+    if finding.effect is None or moved < _MOVED:
+        return False
+    without, with_it = (log_likelihood(bench.gather(known, bench.held_out))
+                        for known in (effects, [*effects, finding.effect]))
+    return with_it - without > _TOLD
 
 
 def _shifted(finding: Finding) -> list[Effect]:

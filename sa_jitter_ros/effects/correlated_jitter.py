@@ -9,13 +9,13 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, goodness_of_fit, white)
+    fit_covariance, fit_memory, goodness_of_fit, white)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _FORGOTTEN = 1e-3
-_SIGNIFICANT = 1e-4
+_SIGNIFICANT = 1e-3  # where excess jitter is refused for a memory
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,7 @@ class CorrelatedJitter(Effect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit variance and memory of the pulse errors; white ones are another effect's."""
         plain = fit_covariance(evidence, white)
-        fit = fit_covariance(evidence, lambda lags, rho: rho ** np.abs(lags),
-                             bounds=(-0.98, 0.98))
+        fit = fit_memory(evidence)
         std, error = root(fit.variance, fit.variance_error)
         if std == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')

@@ -86,6 +86,8 @@ class Effect:
     scatters: ClassVar[bool] = False
     #: Whether it is seen in the pulses themselves, so that it is reported whatever it does.
     seen: ClassVar[bool] = False
+    #: Whether the vibration moves and the pulses are right, however its motion is recovered.
+    moves_vibration: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check every parameter."""

@@ -62,7 +62,7 @@ class Evidence:
     (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
     `record_times` are all pulses of the record and `record_missing` (interval,) is how many pulses
     lack in each interval of the record; `clock` is the one on whose ticks all pulse times lie, if
-    any, and `clock_period_std` what it says of the trigger period's standard deviation in s.
+    any.
     """
 
     model: DeclaredModel
@@ -75,7 +75,6 @@ class Evidence:
     record_times: Array
     record_missing: Array
     clock: Clock
-    clock_period_std: float
     lines: LineEvidence
     explained: tuple[Effect, ...] = ()
 

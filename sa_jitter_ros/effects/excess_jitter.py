@@ -8,11 +8,15 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, goodness_of_fit, white)
+    fit_covariance, fit_memory, goodness_of_fit, white)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+# A memory of this p value is no chance and no proof; one of this standard error may be any.
+_HINT, _VAGUE = 0.05, 0.3
+_DECIDER = 'more acquisitions, or longer ones'
 
 
 @dataclass(frozen=True)
@@ -42,4 +46,8 @@ class ExcessJitter(Effect):
         text = (f'the pulse errors have {fit.observed_std:.3g} s where '
                 f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
         against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
-        return Finding(cls.name, cls(std), {'std': error}, fit.p_value, text, against)
+        memory = fit_memory(evidence)
+        unsure = memory.p_value_over(fit) < _HINT or memory.shape_error > _VAGUE
+        return Finding(
+            cls.name, cls(std), {'std': error}, fit.p_value, text, against,
+            rivals=('correlated_jitter',) if unsure else (), decider=_DECIDER if unsure else '')

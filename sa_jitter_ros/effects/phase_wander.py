@@ -8,12 +8,15 @@ import numpy as np
 from sa_jitter_ros.effects.band import flat_band_correlation, recovered_correlation, SLOW_BAND
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.effects.pulse_covariance import fit_covariance
+from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _MEMORY = 40
+_SIGNIFICANT = 1e-3
+_MOST_BESIDE = 4.0  # variance of independent errors beside that of the wander
+_FREEDOM = 2.0  # what one more parameter gains by chance, Akaike's criterion
 
 
 @dataclass(frozen=True)
@@ -22,6 +25,7 @@ class PhaseWander(Effect):
 
     name: ClassVar[str] = 'phase_wander'
     summary: ClassVar[str] = 'slow motion of the source against the tach shaft'
+    moves_vibration: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
 
@@ -45,6 +49,12 @@ class PhaseWander(Effect):
         if evidence.against_reference:
             return absent(cls.name, 'against a better keyphasor the source cannot move')
         fit = fit_covariance(evidence, lambda lags, _: recovered_correlation(lags, SLOW_BAND))
+        # Independent errors beside a wander must not swell it.
+        beside = fit_covariance(
+            evidence, lambda lags, share: recovered_correlation(lags, SLOW_BAND) + share * white(
+                lags, 0.0), bounds=(0.0, _MOST_BESIDE))
+        if beside.p_value_over(fit) < _SIGNIFICANT:
+            fit = beside
         if fit.variance == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
         slope = slope_test(evidence)
@@ -57,8 +67,15 @@ class PhaseWander(Effect):
             return absent(cls.name, 'the pulse times move as the recovered errors do: slope '
                           f'{slope.slope:.2f} +- {slope.standard_error:.2f}',
                           p_value=slope.p_value)
-        rivals = () if slope.decided else ('correlated_jitter',)
+        rivals, against = (), ''
+        if not slope.decided:
+            rivals = ('correlated_jitter',)
+            better = max(fit_covariance(evidence, white).gain, fit_memory(evidence).gain - _FREEDOM)
+            if better > fit.gain:
+                against = ('independent or autoregressive pulse errors explain them better: twice '
+                           f'the log-likelihood gains {better:.1f} with them, {fit.gain:.1f} with '
+                           'a wander')
         return Finding(cls.name, cls(rad * seconds),
                        {'std': rad * error},
-                       max(fit.p_value, 1e-300), text, rivals=rivals,
+                       max(fit.p_value, 1e-300), text, against, rivals=rivals,
                        decider='a second keyphasor, or a steadier speed' if rivals else '')

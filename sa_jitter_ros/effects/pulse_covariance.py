@@ -31,6 +31,11 @@ def white(lags: Array, _: float) -> Array:
     return np.where(lags == 0, 1.0, 0.0)
 
 
+def autoregressive(lags: Array, correlation: float) -> Array:
+    """Return the autocorrelation of errors that remember each other."""
+    return np.asarray(correlation ** np.abs(lags))
+
+
 @dataclass(frozen=True)
 class CovarianceFit:
     """
@@ -62,9 +67,7 @@ def fit_covariance(evidence: Evidence, correlation: Correlation, *,
     errors = evidence.errors[:, :_MOST_PULSES]
     count = errors.shape[1]
     lags = np.arange(count)
-    noise = np.mean(evidence.standard_errors[:, :_MOST_PULSES] ** 2, axis=0)
-    noise = np.where(np.isfinite(noise), noise, 0.0)
-    known = toeplitz(evidence.expected_autocovariance(lags)) + np.diag(noise)
+    known = _expected(evidence)
     contrast = np.diff(np.eye(count), axis=0)
     scale = float(np.mean(np.diff(errors, axis=1) ** 2)) or 1e-24
     data = np.diff(errors, axis=1) / np.sqrt(scale)
@@ -113,6 +116,30 @@ def fit_covariance(evidence: Evidence, correlation: Correlation, *,
         variance * scale, variance_error * scale, shape, shape_error, gain,
         0.5 * float(stats.chi2.sf(gain, 1)), float(np.sqrt(np.mean(errors**2))),
         float(np.sqrt((np.trace(known) - known.sum() / count) / count)), innovations)
+
+
+def fit_memory(evidence: Evidence) -> CovarianceFit:
+    """Fit normal errors whose neighbours are correlated."""
+    return fit_covariance(evidence, autoregressive, bounds=(-0.98, 0.98))
+
+
+def log_likelihood(evidence: Evidence) -> float:
+    """Return that of the pulse errors if they are what declared jitter and `explained` make."""
+    errors = np.diff(evidence.errors[:, :_MOST_PULSES], axis=1)
+    scale = float(np.mean(errors**2)) or 1e-24
+    contrast = np.diff(np.eye(errors.shape[1] + 1), axis=0)
+    known = contrast @ _expected(evidence) @ contrast.T / scale
+    factor = cho_factor(known + 1e-9 * np.eye(len(known)), lower=True)
+    whitened = solve_triangular(factor[0], errors.T / np.sqrt(scale), lower=True)
+    return float(-0.5 * np.sum(whitened**2) - len(errors) * (
+        np.sum(np.log(np.diag(factor[0]))) + 0.5 * len(known) * np.log(scale)))
+
+
+def _expected(evidence: Evidence) -> Array:
+    """Return the covariance in s^2 of the expected errors with the noise of their recovery."""
+    noise = np.mean(evidence.standard_errors[:, :_MOST_PULSES] ** 2, axis=0)
+    return np.asarray(toeplitz(evidence.expected_autocovariance(np.arange(noise.size)))
+                      + np.diag(np.nan_to_num(noise)))
 
 
 def _standard_errors(slopes: Sequence[Array], contrast: Array, whitened: Array, cumulant: float,

@@ -10,14 +10,18 @@ import numpy as np
 from sa_jitter_ros.effects.evidence import Evidence
 from scipy import stats
 
+# Of the autocovariance at lags 0, 1 and 2, for the variance of second differences.
+_SECOND_DIFFERENCE = (6.0, -8.0, 2.0)
+
 
 @dataclass(frozen=True)
 class SlopeTest:
     """
     Whose error is it: regression of the pulse times on the recovered errors, second differences.
 
-    Slope 1: the tach is wrong; less: the vibration side moves. `p_value` is that of slope 1;
-    `decided` says whether the steady enough speed lets the slope tell the two apart.
+    Slope 1, less what is known to move the vibration: the tach is wrong; the share that is known
+    of the tach: the vibration side moves. `p_value` is that of the first; `decided` says whether
+    the steady enough speed lets the slope tell the two apart.
     """
 
     slope: float
@@ -41,11 +45,14 @@ def slope_test(evidence: Evidence) -> SlopeTest:
     left = x - slope * y
     error = float(np.sqrt(np.mean(left**2) / power / (y.size / 3.0)))
     lags = np.arange(3)
-    white_part = float(np.dot(evidence.expected_autocovariance(lags), (6.0, -8.0, 2.0)))
-    vibration_slope = min(1.0, max(white_part, 0.0) / power)
-    p_value = float(2.0 * stats.norm.sf(abs(slope - 1.0) / max(error, 1e-12)))
-    decided = (1.0 - vibration_slope) > 4.0 * error
-    tach_side = decided and slope > 0.5 * (1.0 + vibration_slope)
+    moving = sum((effect.pulse_autocovariance(evidence.model, lags)
+                  for effect in evidence.explained if effect.moves_vibration), np.zeros(3))
+    of_tach = np.dot(evidence.expected_autocovariance(lags) - moving, _SECOND_DIFFERENCE) / power
+    vibration_slope = float(np.clip(of_tach, 0.0, 1.0))
+    tach_slope = max(1.0 - float(np.dot(moving, _SECOND_DIFFERENCE)) / power, vibration_slope)
+    p_value = float(2.0 * stats.norm.sf(abs(slope - tach_slope) / max(error, 1e-12)))
+    decided = tach_slope - vibration_slope > 4.0 * error
+    tach_side = decided and slope > 0.5 * (tach_slope + vibration_slope)
     return SlopeTest(slope, error, p_value, decided, tach_side)
 
 
