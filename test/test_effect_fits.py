@@ -13,6 +13,7 @@ from sa_jitter_ros.effects.band import (
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
+from sa_jitter_ros.effects.pulse_covariance import log_likelihood
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy.linalg import toeplitz
@@ -228,3 +229,55 @@ def test_root_of_a_variance_near_zero_is_uncertain_by_the_root_of_its_error():
     assert root(4.0, 0.04) == pytest.approx((2.0, 0.01), rel=3e-3)
     assert root(-1.0, 0.04) == (0.0, pytest.approx(0.2))
     assert root(1.0, 0.0) == (1.0, 0.0)
+
+
+def test_independent_errors_beside_a_wander_do_not_swell_it(rng):
+    """Once the wander is explained, what the pulses do as well is theirs."""
+    found = []
+    for _ in range(20):
+        moving = 2e-4 * recovered(sines(rng, SLOW_BAND))[0]
+        evidence = evidence_of(
+            rng, declared(rng) + moving + rng.normal(0.0, 8e-5, moving.shape), moving=moving)
+        found.append(EFFECTS['phase_wander'].fit(evidence))
+    off = z_scores(found, std=2e-4 * 2.0 * np.pi * 25.0)['std']
+    assert np.mean(off) < 3.5 / np.sqrt(len(off))
+    wander = make_effect('phase_wander', std=2e-4 * 2.0 * np.pi * 25.0)
+    assert not slope_test(evidence).tach_side
+    assert slope_test(evidence).p_value < 1e-6
+    assert slope_test(replace(evidence, explained=(wander,))).p_value > 1e-3
+
+
+def test_few_pulses_find_a_memory_or_leave_it_open(rng):
+    """A memory that three acquisitions do not prove is named beside independent errors."""
+    told = []
+    for _ in range(15):
+        evidence = evidence_of(rng, declared(rng)[:3] + stationary(rng, 1e-8 * 0.7**LAGS, 3))
+        independent = EFFECTS['excess_jitter'].fit(evidence)
+        assert bool(independent.rivals) == bool(independent.decider)
+        told.append(EFFECTS['correlated_jitter'].fit(evidence).effect is not None
+                    or 'correlated_jitter' in independent.rivals)
+    assert sum(told) >= 13
+    independent = [EFFECTS['excess_jitter'].fit(evidence_of(
+        rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))) for _ in range(15)]
+    assert sum(bool(item.rivals) for item in independent) <= 4  # 5 % of them by chance
+
+
+def test_modulation_is_told_by_few_acquisitions(rng):
+    """Without one, lines do not move together: false alarms are as rare as the p value says."""
+    def fit(std):
+        gain = std * stationary(rng, flat_band_correlation(LAGS, SLOW_BAND), 3)[:, :-1, None]
+        return EFFECTS['amplitude_modulation'].fit(evidence_of(
+            rng, declared(rng)[:3], radial=gain + rng.normal(0.0, 0.01, (3, PULSES - 1, 4))))
+
+    assert all(fit(0.05).effect is not None for _ in range(20))
+    p_values = [fit(0.0).p_value for _ in range(200)]
+    assert abs(np.mean(p_values) - 0.5) < 4.0 / np.sqrt(12.0 * 200.0)
+
+
+def test_likelihood_prefers_what_is_there(rng):
+    excess = make_effect('excess_jitter', std=60e-6)
+    quiet = evidence_of(rng, declared(rng))
+    noisy = evidence_of(rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))
+    for evidence, better in ((quiet, -1.0), (noisy, 1.0)):
+        gain = log_likelihood(replace(evidence, explained=(excess,))) - log_likelihood(evidence)
+        assert better * gain > 7.0

@@ -125,6 +125,15 @@ def test_geometry_repeats_with_the_pulse_index(rng):
     assert effect.pattern(MODEL, pulses) == pytest.approx(pattern[(4 + np.arange(21)) % 3])
 
 
+def test_geometry_counts_missing_pulses():
+    effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0))
+    pulses = Pulses(np.arange(4.0), first=1, missing=np.array([0, 1, 0]))
+    assert pulses.index.tolist() == [1, 2, 4, 5]
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': 3})
+    late = effect.pattern(model, pulses) * 2.0 * np.pi * 25.0
+    assert late == pytest.approx([1.0, 2.0, 1.0, 2.0])
+
+
 def test_geometry_counts_pulses_and_not_triggers():
     model = DeclaredModel(**{**vars(MODEL), 'pulses_per_revolution': 6, 'pulses_per_trigger': 2})
     effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))

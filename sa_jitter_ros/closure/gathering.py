@@ -94,13 +94,14 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     known = []
     for a, item in enumerate(observation.acquisitions):
         grid = None if smooth is None else smooth[item.first:item.first + item.times.size]
+        first = item.first + int(pulses.missing[:item.first].sum())
         rows = []
         for motion, uncertain in zip(again, error_std):
             errors, std = grid, 0.0
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
             if motion is not None and precise and np.all(np.isfinite(motion[a])):
                 errors, std = _on_grid(motion[a], clock), uncertain
-            rows.append(Pulses(item.times, item.first, errors, item.missing, std))
+            rows.append(Pulses(item.times, first, errors, item.missing, std))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), known
 
@@ -134,8 +135,9 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
             [item.ripple_standard_error**2 for item in items]))) if items else float('nan'),
         against_reference=observation.against_reference,
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
-        clock=clock, lines=replace(tone, radial=tone.radial[list(usable)],
-                      noise_density=tone.noise_density[list(usable)]), explained=tuple(effects))
+        clock=clock, explained=tuple(effects),
+        lines=replace(tone, radial=tone.radial[list(usable)],
+                      noise_density=tone.noise_density[list(usable)]))
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:

@@ -307,11 +307,7 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
-    """
-    Tell whether an effect predicts what the declared model takes for chance.
-
-    Then it is there although the residual alone is not larger than the declared chance.
-    """
+    """Tell whether an effect predicts what the declared model takes for chance."""
     return (finding.p_value < _DECISIVE and before.rms > _MATERIAL
             and after.rms < 0.5 * before.rms)
 
@@ -321,10 +317,10 @@ def _told(bench: Bench, effects: Sequence[Effect], finding: Finding, before: Res
     """
     Tell whether held-out pulse errors tell an effect that the attenuation is too rough to tell.
 
-    Beside a large effect, the chance of few averages hides another that moves them as well.
+    Beside a large effect, the chance of few averages hides another; but it must explain them.
     """
     moved = float(np.sqrt(np.mean((after.mean - before.mean) ** 2)))
-    if finding.effect is None or moved < _MOVED:
+    if finding.effect is None or moved < _MOVED or after.p_attenuation < SIGNIFICANT:
         return False
     without, with_it = (log_likelihood(bench.gather(known, bench.held_out))
                         for known in (effects, [*effects, finding.effect]))

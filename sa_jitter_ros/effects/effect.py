@@ -60,10 +60,11 @@ class Pulses:
     """
     The measured trigger pulses of one average.
 
-    `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` is the
-    index of the first of them in the recording; `errors` (N_t + 1,) in s holds what the grid of a
-    clock says about each (`keyphasor_quantisation`), None where it says nothing; `missing` (N_t,)
-    is how many pulses lack within each cycle; `error_std` in s is how uncertain `errors` are.
+    `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` counts
+    the pulses before them in the recording, missing ones too; `errors` (N_t + 1,) in s holds what
+    the grid of a clock says about each (`keyphasor_quantisation`), None where it says nothing;
+    `missing` (N_t,) is how many pulses lack within each cycle; `error_std` in s is how uncertain
+    `errors` are.
     """
 
     times: Array
@@ -71,6 +72,12 @@ class Pulses:
     errors: Array | None = None
     missing: Array | None = None
     error_std: float = 0.0
+
+    @property
+    def index(self) -> Array:
+        """Return how many pulses went before each (N_t + 1,), missing ones too."""
+        lost = 0 if self.missing is None else np.concatenate(([0], np.cumsum(self.missing)))
+        return np.asarray(self.first + np.arange(len(self.times)) + lost)
 
 
 class Effect:

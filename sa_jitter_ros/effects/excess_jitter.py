@@ -14,8 +14,7 @@ from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentP
 from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
-# A memory of this p value is no chance and no proof; one of this standard error may be any.
-_HINT, _VAGUE = 0.05, 0.3
+_HINT = 0.05  # the p value of a memory that is hardly chance, and no proof
 _DECIDER = 'more acquisitions, or longer ones'
 
 
@@ -46,8 +45,7 @@ class ExcessJitter(Effect):
         text = (f'the pulse errors have {fit.observed_std:.3g} s where '
                 f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
         against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
-        memory = fit_memory(evidence)
-        unsure = memory.p_value_over(fit) < _HINT or memory.shape_error > _VAGUE
+        unsure = fit_memory(evidence).p_value_over(fit) < _HINT
         return Finding(
             cls.name, cls(std), {'std': error}, fit.p_value, text, against,
             rivals=('correlated_jitter',) if unsure else (), decider=_DECIDER if unsure else '')

@@ -48,6 +48,11 @@ class PhaseWander(Effect):
         """Fit slow errors that the measured pulse times do not have."""
         if evidence.against_reference:
             return absent(cls.name, 'against a better keyphasor the source cannot move')
+        slope = slope_test(evidence)
+        if slope.tach_side:
+            return absent(cls.name, 'the pulse times move as the recovered errors do: slope '
+                          f'{slope.slope:.2f} +- {slope.standard_error:.2f}',
+                          p_value=slope.p_value)
         fit = fit_covariance(evidence, lambda lags, _: recovered_correlation(lags, SLOW_BAND))
         # Independent errors beside a wander must not swell it.
         beside = fit_covariance(
@@ -57,25 +62,20 @@ class PhaseWander(Effect):
             fit = beside
         if fit.variance == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
-        slope = slope_test(evidence)
         seconds, error = root(fit.variance, fit.variance_error)
         rad = 2.0 * np.pi * evidence.model.fundamental_frequency
         text = (f'the vibration moves by {seconds:.3g} s against the pulses and the pulse times '
                 f'follow with slope {slope.slope:.2f} +- {slope.standard_error:.2f} only, '
                 f'p = {slope.p_value:.2g}')
-        if slope.tach_side:
-            return absent(cls.name, 'the pulse times move as the recovered errors do: slope '
-                          f'{slope.slope:.2f} +- {slope.standard_error:.2f}',
-                          p_value=slope.p_value)
-        rivals, against = (), ''
-        if not slope.decided:
-            rivals = ('correlated_jitter',)
-            better = max(fit_covariance(evidence, white).gain, fit_memory(evidence).gain - _FREEDOM)
+        rivals = () if slope.decided else ('correlated_jitter',)
+        against = ''
+        if rivals:
+            better = max(fit_covariance(evidence, white).gain,
+                         fit_memory(evidence).gain - _FREEDOM)
             if better > fit.gain:
                 against = ('independent or autoregressive pulse errors explain them better: twice '
                            f'the log-likelihood gains {better:.1f} with them, {fit.gain:.1f} with '
                            'a wander')
-        return Finding(cls.name, cls(rad * seconds),
-                       {'std': rad * error},
+        return Finding(cls.name, cls(rad * seconds), {'std': rad * error},
                        max(fit.p_value, 1e-300), text, against, rivals=rivals,
                        decider='a second keyphasor, or a steadier speed' if rivals else '')

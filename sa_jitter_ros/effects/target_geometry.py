@@ -25,22 +25,22 @@ class TargetGeometry(Effect):
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')
 
-    def _at(self, model: DeclaredModel, first: int) -> Array:
-        """Return the errors (N_t + 1,) in s of the trigger pulses from the `first` on."""
+    def _at(self, model: DeclaredModel, index: Array) -> Array:
+        """Return the errors in s of the trigger pulses `index`."""
         step = model.pulses_per_trigger or model.pulses_per_revolution
-        index = (first + np.arange(model.trigger_cycles + 1)) * step
-        angles = np.asarray(self.pulse_angles)[index % len(self.pulse_angles)]
+        angles = np.asarray(self.pulse_angles)[index * step % len(self.pulse_angles)]
         return np.asarray(angles / (2.0 * np.pi * model.trigger_speed))
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the errors for every mark that an average may begin with."""
         if not self.pulse_angles:
             return None
-        return np.array([self._at(model, first) for first in range(len(self.pulse_angles))])
+        first = np.arange(len(self.pulse_angles))[:, None]
+        return self._at(model, first + np.arange(model.trigger_cycles + 1))
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
         """Return the errors of the pulses at hand."""
-        return self._at(model, pulses.first) if self.pulse_angles else None
+        return self._at(model, pulses.index) if self.pulse_angles else None
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -81,7 +81,7 @@ def _folded(evidence: Evidence, period: int) -> tuple[Array, float, float, float
     """
     table, phases = [], []
     for row, pulses in zip(evidence.errors, evidence.pulses):
-        phase = (pulses.first + np.arange(row.size))[1:-1] % period
+        phase = pulses.index[1:-1] % period
         folded = np.bincount(phase, row[1:-1], period) / np.bincount(phase, minlength=period)
         table.append(folded - folded.mean())
         phases.append(phase)
