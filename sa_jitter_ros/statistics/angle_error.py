@@ -1,7 +1,7 @@
 """
 Random errors of the angle law, described so that any of them combine.
 
-The linear law reads cycle ``k`` of a component at a wrong angle ``e_k(u)`` (fundamental cycles;
+An angle law reads cycle ``k`` of a component at a wrong angle ``e_k(u)`` (fundamental cycles;
 ``u`` in [0, 1) is the position in the trigger cycle). Whatever an average does to order ``g``
 follows from the joint characteristic functions of that error,
 
@@ -12,7 +12,7 @@ moments of any combination are integrals of a product (`moments`). A random gain
 too: it contributes E prod_i a_{k_i}(u_i).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.distributions import PulseErrorDistribution
+from sa_jitter_ros.statistics.pulse_weights import Covariance, LINEAR, PulseWeights
 
 Array = NDArray[Any]
 
@@ -47,33 +48,35 @@ class AngleErrorProcess(Protocol):
 @dataclass(frozen=True)
 class IndependentPulseJitter:
     """
-    Independent pulse errors seen through the linear law: e_k(u) = (1-u) eps_k + u eps_{k+1}.
+    Independent pulse errors seen through an angle law, by default the linear one.
 
     `frequency` is the fundamental frequency in Hz, which turns s into fundamental cycles (1 where
-    the law is given in cycles). Neighbouring cycles share a pulse. Eq. 16 of Camerini et al. 2019.
+    the law is given in cycles). Neighbouring cycles share pulses. Eq. 16 of Camerini et al. 2019.
     """
 
     distribution: PulseErrorDistribution
     frequency: float = 1.0
+    weights: PulseWeights = LINEAR
 
     @property
     def correlation_length(self) -> int:
-        """Neighbouring cycles share a pulse; others nothing."""
-        return 1
+        """Cycles share pulses as far as the weights of the law reach."""
+        return self.weights.pulses - 1
 
     def characteristic(
         self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
         cycles: Sequence[int],
     ) -> Array:
         """Return the product, over the pulses touched, of the law's characteristic function."""
+        count = self.weights.pulses
+        points = [(self.frequency * np.asarray(c), self.weights.at(np.asarray(u)), k)
+                  for c, u, k in zip(coefficients, positions, cycles)]
         product: Array = np.ones(())
-        for pulse in sorted({k + end for k in cycles for end in (0, 1)}):
+        for pulse in sorted({k + i for k in cycles for i in range(count)}):
             weight: Array = np.zeros(())
-            for c, u, k in zip(coefficients, positions, cycles):
-                if pulse == k:
-                    weight = weight + self.frequency * np.asarray(c) * (1.0 - np.asarray(u))
-                elif pulse == k + 1:
-                    weight = weight + self.frequency * np.asarray(c) * np.asarray(u)
+            for c, at, k in points:
+                if k <= pulse < k + count:
+                    weight = weight + c * at[pulse - k]
             product = product * self.distribution.characteristic_function(weight)
         return product
 
@@ -87,7 +90,7 @@ class GaussianAngleError:
     `correlation_length` cycles.
     """
 
-    covariance: Callable[[Array, Array, int], Array]
+    covariance: Covariance
     correlation_length: int
 
     def characteristic(
@@ -108,9 +111,11 @@ class GaussianAngleError:
         return np.asarray(np.exp(-2.0 * np.pi**2 * variance))
 
 
-def gaussian_pulse_jitter(autocovariance: Sequence[float]) -> GaussianAngleError:
+def gaussian_pulse_jitter(
+    autocovariance: Sequence[float], *, weights: PulseWeights = LINEAR,
+) -> GaussianAngleError:
     """
-    Return correlated normal pulse errors seen through the linear law.
+    Return correlated normal pulse errors seen through an angle law, by default the linear one.
 
     `autocovariance[i]` = Cov[eps_k, eps_{k+i}] in fundamental cycles squared, 0 beyond the list.
     Raises ModelError when no stationary sequence has it.
@@ -126,14 +131,9 @@ def gaussian_pulse_jitter(autocovariance: Sequence[float]) -> GaussianAngleError
         raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no '
                          'random sequence has a negative one; lower the correlations')
 
-    def at(lag: int) -> float:
-        return float(table[abs(lag)]) if abs(lag) < table.size else 0.0
-
-    def covariance(u: Array, v: Array, lag: int) -> Array:
-        return np.asarray(((1.0 - u) * (1.0 - v) + u * v) * at(lag)
-                          + (1.0 - u) * v * at(lag + 1) + u * (1.0 - v) * at(lag - 1))
-
-    return GaussianAngleError(covariance, table.size)
+    covariance = weights.covariance(
+        lambda lags: np.append(table, 0.0)[np.minimum(np.abs(lags), table.size)])
+    return GaussianAngleError(covariance, table.size + weights.pulses - 2)
 
 
 def joint_characteristic(

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 import math
 from typing import Any
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess,
+    IndependentPulseJitter,
     joint_characteristic,
     unit_nodes,
 )
@@ -119,16 +121,29 @@ def average_cumulants(
     Return k(X, X, X) and k(X, X, conj X): integrated where the memory is short, else superposed.
 
     With both kinds of processes the superposition is corrected by its error for the short ones.
+    Independent jitter seen through a law that reads many pulses counts as seen through its `near`
+    law, which moves the distribution function of |X| by less than 0.02.
     """
-    short = [process for process in processes if process.correlation_length <= _REACH]
-    if len(short) == len(processes):
+    near = [_near(process) for process in processes]
+    if all(one is other and one.correlation_length <= _REACH
+           for one, other in zip(near, processes)):
         return third_cumulants(orders, processes, trigger_cycles, cycles)
-    plain, mixed = superposed_cumulants(cycles, trigger_cycles)
+    short = [process for process in near if process.correlation_length <= _REACH]
     if not short:
-        return plain, mixed
+        return superposed_cumulants(cycles, trigger_cycles)
     alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
-    exact = third_cumulants(orders, short, trigger_cycles, alone)
-    close = superposed_cumulants(alone, trigger_cycles)
+    plain, mixed = third_cumulants(orders, short, trigger_cycles, alone)
     gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
-    return (plain + (exact[0] - close[0]) * gain**3,
-            mixed + (exact[1] - close[1]) * gain * np.abs(gain) ** 2)
+    if len(short) == len(near):
+        return plain * gain**3, mixed * gain * np.abs(gain) ** 2
+    every = superposed_cumulants(cycles, trigger_cycles)
+    close = superposed_cumulants(alone, trigger_cycles)
+    return (every[0] + (plain - close[0]) * gain**3,
+            every[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
+
+
+def _near(process: AngleErrorProcess) -> AngleErrorProcess:
+    """Return independent jitter seen through the `near` law, any other process as it is."""
+    if isinstance(process, IndependentPulseJitter) and process.weights.near is not None:
+        return replace(process, weights=process.weights.near)
+    return process

@@ -87,7 +87,8 @@ def required_keyphasor_rate(model: DeclaredModel, attenuation: float) -> float:
 
     def excess(log_rate: float) -> float:
         at_rate = replace(unit, keyphasor_rate=math.exp(log_rate))
-        jitter = IndependentPulseJitter(at_rate.distribution, at_rate.fundamental_frequency)
+        jitter = IndependentPulseJitter(
+            at_rate.distribution, at_rate.fundamental_frequency, at_rate.weights)
         gain = abs(cycle_moments(at_rate.orders, [jitter]).mean[0])
         return float(1.0 - gain - attenuation)
 

@@ -35,6 +35,7 @@ from sa_jitter_ros.statistics.moments import (
     require_cycles,
     require_orders,
 )
+from sa_jitter_ros.statistics.pulse_weights import pulse_weights, PulseWeights
 from sa_jitter_ros.statistics.sampled_law import sampled_law
 
 Array = NDArray[Any]
@@ -72,9 +73,10 @@ class DeclaredModel:
 
     Rates and speeds are in Hz, times in s, orders in multiples of the shaft of interest.
     `pulses_per_trigger` 0 means all pulses of a revolution, `jitter_std` 0 the standard deviation
-    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown. What a distribution does not use
-    (`jitter_std` of a uniform one, `jitter_table` of any but table) may stay set, so that the
-    distribution can be switched. Raises ModelError for values that make no sense.
+    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown; `angle_law` is that of the average. What
+    a distribution does not use (`jitter_std` of a uniform one, `jitter_table` of any but table)
+    may stay set, so that the distribution can be switched. Raises ModelError for values that make
+    no sense.
     """
 
     keyphasor_rate: float
@@ -89,6 +91,7 @@ class DeclaredModel:
     jitter_table: tuple[float, ...] = ()
     noise_std: float = 0.0
     sample_rate: float = 0.0
+    angle_law: str = 'linear'
 
     def __post_init__(self) -> None:
         """Check every value and every combination."""
@@ -107,6 +110,7 @@ class DeclaredModel:
         if self.jitter_distribution not in DISTRIBUTIONS:
             raise ModelError(f'jitter_distribution is {self.jitter_distribution!r}: choose one of '
                              f'{", ".join(DISTRIBUTIONS)}')
+        pulse_weights(self.angle_law)
         if self.noise_std > 0.0 and self.sample_rate == 0.0:
             raise ModelError(f'noise_std is {self.noise_std} without sample_rate: how much noise '
                              'one line of the average holds depends on it; set sample_rate (Hz)')
@@ -132,6 +136,11 @@ class DeclaredModel:
             return Empirical(np.asarray(self.jitter_table))
         std = self.jitter_std or 1.0 / (math.sqrt(12.0) * self.keyphasor_rate)
         return Normal(std) if self.jitter_distribution == 'normal' else Triangular(std)
+
+    @property
+    def weights(self) -> PulseWeights:
+        """Return how the angle law passes on pulse errors."""
+        return pulse_weights(self.angle_law)
 
     @property
     def fundamental_frequency(self) -> float:
@@ -207,10 +216,11 @@ def predict(
     """
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
-    declared = (IndependentPulseJitter(model.distribution, frequency),) if declared_jitter else ()
-    everything = (*declared, *processes)
+    declared = (IndependentPulseJitter(model.distribution, frequency, model.weights),)
+    everything = (*(declared if declared_jitter else ()), *processes)
     jitters = [process.distribution for process in everything
-               if isinstance(process, IndependentPulseJitter) and process.frequency == frequency]
+               if isinstance(process, IndependentPulseJitter)
+               and (process.frequency, process.weights) == (frequency, model.weights)]
     plain = len(jitters) == len(everything) > 0
     spread = float(orders.max()) * frequency * math.sqrt(sum(law.variance for law in jitters))
     nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 160))
@@ -230,7 +240,8 @@ def predict(
     lopsided = np.max(np.abs(curved.skew)) > _LOPSIDED
     if plain and count <= (_FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
         return prediction_of_law(model, moments, sampled_law(
-            orders * frequency, Sum(*jitters), count, moments, gain=gain, line_variance=noise))
+            orders * frequency, Sum(*jitters), count, moments, gain=gain, line_variance=noise,
+            weights=model.weights))
     return prediction_of_law(model, moments, curved)
 
 
