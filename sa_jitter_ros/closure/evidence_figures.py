@@ -14,6 +14,7 @@ from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.prediction import predict_with
+from sa_jitter_ros.statistics.pulse_weights import LINEAR
 
 Array = NDArray[Any]
 
@@ -202,10 +203,16 @@ def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> Non
 
 
 def _angle_errors(evidence: Evidence, u: Array) -> Array:
-    """Return the angle error (acquisition, cycle, u) in s: pulse errors and ripple."""
-    start, end = evidence.errors[:, :-1, None], evidence.errors[:, 1:, None]
+    """
+    Return the angle error (acquisition, cycle, u) in s: pulse errors and ripple.
+
+    The ripple is that between lines from pulse to pulse, part of which other laws follow.
+    """
+    even = evidence.period * np.arange(evidence.errors.shape[1])
+    late = evidence.times - evidence.times[:, :1] - even
+    read = evidence.model.weights.path(late, u) - LINEAR.path(late - evidence.errors, u)
     ripple = np.where(np.isfinite(evidence.ripple), evidence.ripple, 0.0)[:, :, None]
-    return np.asarray(start * (1.0 - u) + end * u + ripple * u * (1.0 - u))
+    return np.asarray(read + ripple * u * (1.0 - u))
 
 
 def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:

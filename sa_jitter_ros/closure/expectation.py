@@ -119,13 +119,13 @@ class _Setting:
         blur = 0.0
         if any(effect.replaces_jitter(model) for effect in self.effects):
             blur = pulses.error_std * model.fundamental_frequency
-        unsure = (*self.processes, IndependentPulseJitter(Normal(blur))) if blur else (
-            self.processes)
+        doubt = IndependentPulseJitter(Normal(blur), weights=model.weights)
+        unsure = (*self.processes, doubt) if blur else self.processes
         found = _known(self.observation, unsure, errors)
         leakage = _leakage(self.observation, unsure, errors)
         if blur:
-            found = replace(found, mean=found.mean * _sharpening(self.observation.orders, blur))
-            leakage = leakage * np.resize(_sharpening(self.observation.sources, blur),
+            found = replace(found, mean=found.mean * _sharpening(self.observation.orders, doubt))
+            leakage = leakage * np.resize(_sharpening(self.observation.sources, doubt),
                                           leakage.shape[1])
         return found, leakage
 
@@ -157,14 +157,15 @@ def _speed(item: Acquisition, model: DeclaredModel) -> float:
     return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))
 
 
-def _sharpening(orders: Array, blur: float) -> Array:
+def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
     """
-    Return the factor on moments that allow for being unsure by `blur` (fundamental cycles).
+    Return the factor on moments that allow for being unsure by the jitter `doubt`.
 
     Errors that are off scatter more than the true ones, so that they attenuate too much already;
     allowing for being unsure attenuates once more. Two-fold at most: beyond, nothing is known.
     """
-    return np.asarray(np.minimum(normal_mean(orders * blur) ** -2.0, _SHARPEST))
+    mean = np.abs(cycle_moments(orders, [doubt], nodes=_NODES, lags=0).mean)
+    return np.asarray(np.minimum(mean**-2.0, _SHARPEST))
 
 
 @lru_cache(maxsize=8)
@@ -209,7 +210,7 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
     e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()
     u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
-    offset = e[:-1, None] + np.diff(e)[:, None] * u
+    offset = model.weights.path(e, u)
     cycle = np.arange(count)[:, None]
     table = np.zeros((observation.orders.size, sources.size), complex)
     for s, source in enumerate(sources):

@@ -268,8 +268,8 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
     for name, kind in EFFECTS.items():
         if name in taken:
             continue
-        finding = absent(name, bench.untold[name]) if name in bench.untold else (
-            kind.fit(evidence))
+        untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
+        finding = absent(name, untold) if untold else kind.fit(evidence)
         if finding.effect is None:
             found.append(Candidate(name, number, finding, None,
                                    finding.against if significant else unneeded))

@@ -18,7 +18,7 @@ from sa_jitter_ros.effects.interpolation_loss import InterpolationLoss
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.effects.missing_pulses import MissingPulses
 from sa_jitter_ros.effects.phase_wander import PhaseWander
-from sa_jitter_ros.effects.prediction import predict_with
+from sa_jitter_ros.effects.prediction import predict_with, require_modelled
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.errors import ParameterError
@@ -31,6 +31,7 @@ __all__ = [
     'parameter_defaults',
     'parameter_ranges',
     'predict_with',
+    'require_modelled',
 ]
 
 EFFECTS: Mapping[str, type[Effect]] = {kind.name: kind for kind in (

@@ -29,18 +29,14 @@ class CorrelatedJitter(Effect):
                                    minimum=-0.999, maximum=0.999)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
-        """Return the first-order autoregressive pulse errors, seen through the linear law."""
+        """Return the first-order autoregressive pulse errors, seen through the angle law."""
         variance = (self.std * model.fundamental_frequency) ** 2
         rho = abs(self.correlation)
         memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))
-
-        def covariance(u: Array, v: Array, lag: int) -> Array:
-            def at(k: int) -> float:
-                return float(variance * self.correlation ** abs(k))
-            return np.asarray(((1.0 - u) * (1.0 - v) + u * v) * at(lag)
-                              + (1.0 - u) * v * at(lag + 1) + u * (1.0 - v) * at(lag - 1))
-
-        return (GaussianAngleError(covariance, min(memory, model.trigger_cycles)),)
+        covariance = model.weights.covariance(
+            lambda lags: variance * self.correlation ** np.abs(lags))
+        reach = memory + model.weights.pulses - 2
+        return (GaussianAngleError(covariance, min(reach, model.trigger_cycles)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return std^2 correlation^|lag|."""

@@ -103,6 +103,11 @@ class Effect:
 
     # --- forward model ---
 
+    @classmethod
+    def unmodelled(cls, model: DeclaredModel) -> str:
+        """Say why there is no forward model with this declared model; '' where there is one."""
+        return ''
+
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return random angle errors, or random gains, that are stationary over the cycles."""
         return ()

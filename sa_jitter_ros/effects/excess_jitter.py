@@ -29,7 +29,8 @@ class ExcessJitter(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the independent pulse errors."""
-        return (IndependentPulseJitter(Normal(self.std), model.fundamental_frequency),)
+        return (IndependentPulseJitter(
+            Normal(self.std), model.fundamental_frequency, model.weights),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return std^2 at lag 0."""

@@ -21,6 +21,14 @@ class MissingPulses(Effect):
     probability: float = parameter(0.0, 'probability that a pulse is lost', '1', minimum=0.0,
                                    maximum=0.9)
 
+    @classmethod
+    def unmodelled(cls, model: DeclaredModel) -> str:
+        """Refuse laws that bend around a gap."""
+        if model.angle_law == 'linear':
+            return ''
+        return (f'angle_law is {model.angle_law!r}: what it makes of a gap has no forward model; '
+                'declare linear, or repair the pulses')
+
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return how far the counted angle is behind, as a delay, for some draws of losses."""
         if self.probability == 0.0:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.statistics.amplitude_law import normal_law
 from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
@@ -30,7 +31,12 @@ _SEED = 11
 
 
 def predict_with(model: DeclaredModel, effects: Sequence[Effect] = ()) -> Prediction:
-    """Return the law of the amplitudes of unit components with the declared model and effects."""
+    """
+    Return the law of the amplitudes of unit components with the declared model and effects.
+
+    Raises ModelError for an effect that has no forward model with it.
+    """
+    require_modelled(model, effects)
     bare = model
     if any(effect.replaces_jitter(model) for effect in effects):
         bare = replace(model, jitter_distribution='table', jitter_table=(0.0,))
@@ -44,14 +50,24 @@ def predict_with(model: DeclaredModel, effects: Sequence[Effect] = ()) -> Predic
         return replace(prediction, model=model)
     if model.noise_std:
         noise = noise + noise_line_variance(model.noise_std, model.sample_rate, model.duration)
-    return _mixture(model, bare, processes, _combined(known), np.asarray(gain), noise)
+    return _mixture(model, jitter_processes(model, effects), _combined(known), np.asarray(gain),
+                    noise)
+
+
+def require_modelled(model: DeclaredModel, effects: Sequence[Effect]) -> None:
+    """Raise ModelError where an effect has no forward model with the declared one."""
+    for effect in effects:
+        reason = effect.unmodelled(model)
+        if reason:
+            raise ModelError(f'{effect.name}: {reason}')
 
 
 def jitter_processes(model: DeclaredModel, effects: Sequence[Effect]
                      ) -> tuple[AngleErrorProcess, ...]:
-    """Return the random angle errors of declared jitter and effects."""
+    """Return the random angle errors of declared jitter and effects; raise as `predict_with`."""
+    require_modelled(model, effects)
     jitter: tuple[AngleErrorProcess, ...] = (
-        IndependentPulseJitter(model.distribution, model.fundamental_frequency),)
+        IndependentPulseJitter(model.distribution, model.fundamental_frequency, model.weights),)
     if any(effect.replaces_jitter(model) for effect in effects):
         jitter = ()
     return (*jitter, *(item for effect in effects for item in effect.processes(model)))
@@ -72,20 +88,22 @@ def scenario_moments(
     Return the moments (scenario, order) of averages with known pulse `errors` (scenario, N_t + 1).
 
     `errors` are in s; `processes` are random and independent of them. Exact but for cycles that
-    hold a missing pulse, where the random errors count as if they did not vary inside the cycle.
+    hold a missing pulse, where the random errors count as if they did not vary inside the cycle,
+    and for what the angle law reads beyond the average: pulses there err as its outermost ones.
     """
     g = np.asarray(model.orders)
     u, w = _RULE
     cycles = np.asarray(errors) * model.fundamental_frequency
+    path = model.weights.path(cycles, u)
     start, step = cycles[:, :-1, None], np.diff(cycles, axis=1)[:, :, None]
     shape = (g.size, len(cycles))
     mean, variance, pseudo = (np.zeros(shape, complex) for _ in range(3))
-    count = start.shape[1]
+    count = path.shape[1]
     first = joint_characteristic(processes, [g[:, None]], [u], [0]) * np.ones((g.size, 1))
     steep = np.abs(step[:, :, 0]) > 0.5
     reach = min(correlation_length(processes) + 1, count) if processes else 0
     for i, order in enumerate(g):
-        phasor = np.exp(2j * np.pi * order * (start + step * u)) * w
+        phasor = np.exp(2j * np.pi * order * path) * w
         if steep.any():
             turns = order * step[steep]
             closed = np.exp(2j * np.pi * order * start[steep] + 1j * np.pi * turns)
@@ -116,13 +134,11 @@ def _combined(known: Sequence[Array]) -> Array:
 
 
 def _mixture(
-    model: DeclaredModel, bare: DeclaredModel, processes: Sequence[AngleErrorProcess],
-    errors: Array, gain: Array, noise: Array,
+    model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array, gain: Array,
+    noise: Array,
 ) -> Prediction:
     """Return the prediction that gives each scenario the same probability."""
-    everything = (IndependentPulseJitter(bare.distribution, bare.fundamental_frequency),
-                  *processes) if bare is model else tuple(processes)
-    each = scenario_moments(model, everything, errors).scaled(gain).with_noise(noise)
+    each = scenario_moments(model, processes, errors).scaled(gain).with_noise(noise)
     mean = each.mean.mean(axis=0)
     spread = each.mean - mean
     moments = AverageMoments(

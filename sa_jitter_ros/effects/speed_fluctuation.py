@@ -1,4 +1,4 @@
-"""Speed fluctuation: an acceleration that the linear angle law cannot follow inside a cycle."""
+"""Speed fluctuation: an acceleration that the angle law cannot follow inside a cycle."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +9,15 @@ from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, flat_band_correlation, ripple_of_acceleration)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.statistics.angle_error import (
+    AngleErrorProcess, GaussianAngleError, unit_nodes)
 from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.statistics.pulse_weights import Covariance, PulseWeights
 from scipy import stats
 
 _SIGNIFICANT = 1e-4
 _MEMORY = 20
+_FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(32)  # enough for `_MEMORY` cycles of the band
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,8 @@ class SpeedFluctuation(Effect):
     Random acceleration of the tach shaft, nearly constant within a trigger cycle.
 
     The linear law then errs by -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing at the
-    pulses, most in the middle.
+    pulses, most in the middle. Other laws err by what the acceleration changes from cycle to
+    cycle.
     """
 
     name: ClassVar[str] = 'speed_fluctuation'
@@ -32,14 +36,11 @@ class SpeedFluctuation(Effect):
         0.0, 'standard deviation of the acceleration of the tach shaft', 'rad/s^2', minimum=0.0)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
-        """Return the error of the linear law."""
-        size = 0.5 * _cycles(model, self.acceleration_std) * model.trigger_period**2
+        """Return the error of the angle law."""
+        size = _cycles(model, self.acceleration_std) * model.trigger_period**2
         variance = (size * model.cycle_length) ** 2
-
-        def covariance(u: Array, v: Array, lag: int) -> Array:
-            keep = float(flat_band_correlation(lag, ACCELERATION_BAND))
-            return np.asarray(variance * keep * u * (1.0 - u) * v * (1.0 - v))
-
+        covariance = (_of_linear_law(variance) if model.angle_law == 'linear'
+                      else _of_law(variance, model.weights))
         return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
 
     @classmethod
@@ -72,6 +73,38 @@ class SpeedFluctuation(Effect):
                        'inside the cycles: something faster moves')
         return Finding(cls.name, cls(unit * size), {'acceleration_std': unit * error},
                        float(p_value), text, against)
+
+
+def _of_linear_law(variance: float) -> Covariance:
+    """Return that of the angle for accelerations of `variance`, constant within a cycle."""
+    def covariance(u: Array, v: Array, lag: int) -> Array:
+        keep = float(flat_band_correlation(lag, ACCELERATION_BAND))
+        return np.asarray(0.25 * variance * keep * u * (1.0 - u) * v * (1.0 - v))
+
+    return covariance
+
+
+def _of_law(variance: float, weights: PulseWeights) -> Covariance:
+    """
+    Return that of the angle for accelerations of `variance`, by the spectrum of what is left.
+
+    Of a motion of f cycles a trigger cycle a law follows what its weights make of it at the
+    pulses; the acceleration is (2 pi f)^2 times the motion.
+    """
+    low, high = ACCELERATION_BAND
+    turn = 2j * np.pi * (low + (high - low) * _FREQUENCIES)
+    at_pulses = np.exp(np.multiply.outer(turn, np.arange(weights.pulses) - weights.before))
+
+    def missed(u: Array) -> Array:
+        followed = np.tensordot(at_pulses, weights.at(u), 1)
+        return np.asarray(np.moveaxis(
+            np.exp(np.multiply.outer(turn, u)) - followed, 0, -1) / turn**2)
+
+    def covariance(u: Array, v: Array, lag: int) -> Array:
+        later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
+        return np.asarray(variance * np.sum(missed(u).conj() * later, axis=-1).real)
+
+    return covariance
 
 
 def _cycles(model: DeclaredModel, acceleration: float) -> float:
