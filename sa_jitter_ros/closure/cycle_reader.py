@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.angle.laws import angle_law, AngleLaw, cycle_times
 from sa_jitter_ros.angle.resampling import interpolate, margin
 from sa_jitter_ros.averaging.cycle import grid_points, project
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
@@ -19,6 +20,7 @@ _WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
 _LEAST = 1e-9
 _WHOLE = 1e-9
 _SEPARATIONS = 6
+_LINEAR = angle_law('linear')
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,15 @@ class CycleReader:
         return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
 
     def cycles(self, pulses: FloatArray, points: int, *, ends: bool = False,
-               ripple: FloatArray | None = None) -> FloatArray:
-        """Return the cycles between pulses, with both `ends` or without the last point."""
+               ripple: FloatArray | None = None, law: AngleLaw = _LINEAR) -> FloatArray:
+        """
+        Return the cycles between pulses, with both `ends` or without the last point.
+
+        `pulses` are those of the cycles and all that the `law` reads beside them.
+        """
         u = np.arange(points + ends) / points
-        times = pulses[:-1, None] + np.diff(pulses)[:, None] * u
+        whole = range(law.before, len(pulses) - 1 - law.after)
+        times = np.array([cycle_times(law, pulses, cycle, u) for cycle in whole])
         if ripple is not None:
             times = times - ripple[:, None] * u * (1.0 - u)
         position = np.clip((times.ravel() - self.start_time) * self.rate, 0.0,
@@ -48,7 +55,7 @@ class CycleReader:
         low = max(int(position.min()) - 40, 0)
         high = int(position.max()) + 42
         values = interpolate(self.samples[low:high], position - low, method=self.method)
-        return values.reshape(len(pulses) - 1, len(u), -1)
+        return values.reshape(*times.shape, -1)
 
 
 def repaired(times: FloatArray, missing: NDArray[np.int64]

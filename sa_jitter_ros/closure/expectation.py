@@ -21,7 +21,7 @@ from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.moments import (
-    AverageMoments, cycle_moments, noise_line_variance, normal_mean)
+    AverageMoments, cycle_moments, noise_line_variance)
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 Array = NDArray[Any]

@@ -1,8 +1,8 @@
 """
 Observation: what each acquisition of a recording shows of the attenuation of its lines.
 
-An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses;
-its corrected ones from the better keyphasor where there is one, else from pulses whose errors were
+An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses
+by the declared angle law; its corrected ones from the better keyphasor where there is one, else from pulses whose errors were
 recovered from the vibration. The attenuation is raw over corrected amplitude: what noise,
 modulation and interpolation do to both cancels in it.
 """
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.angle.laws import angle_law, AngleLaw
 from sa_jitter_ros.averaging.cycle import grid_points
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.cycle_reader import (
@@ -127,7 +128,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         raise RecordingError('vibration holds NaN or infinity: cut the recording at its gaps')
     samples -= samples.mean(axis=0)
     reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
-    starts = _starts(pulses, model.trigger_cycles, reader)
+    starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
     if not starts:
         raise RecordingError(
             f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
@@ -200,16 +201,16 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
     return np.array(errors)
 
 
-def _starts(pulses: TriggerPulses, cycles: int, reader: CycleReader) -> list[int]:
-    """Return the first pulse of every acquisition that lies inside the vibration."""
+def _starts(pulses: TriggerPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
+    """Return the first pulse of every acquisition of which vibration and pulses are there."""
     times, reference = pulses.times, pulses.reference
-    found, first = [], 0
-    while first + cycles < times.size:
+    found, first = [], law.before
+    while first + cycles + law.after < times.size:
         part = slice(first, first + cycles + 1)
         whole = reader.inside(times[part])
         if reference is not None:
-            whole = whole and bool(np.all(np.isfinite(reference[part]))) and reader.inside(
-                reference[part])
+            read = reference[first - law.before:first + cycles + 1 + law.after]
+            whole = whole and bool(np.all(np.isfinite(read))) and reader.inside(reference[part])
         if whole:
             found.append(first)
             first += cycles
@@ -262,18 +263,23 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
         if with_ripple:
             ripple, bend_error = recovery.ripple, ripple_error(recovery, model)
         better = fixed - recovery.errors
-    reference = None
+    law = angle_law(model.angle_law)
+    near = slice(first - law.before, first + count + 1 + law.after)
+    reference, clean_law = None, angle_law('linear')  # whose error in a cycle the recovery knows
     if pulses.reference is not None:
+        clean_law = law
         reference = pulses.reference[first:first + count + 1]
-        better = repaired(reference, missing)[0]
+        whole, index = repaired(pulses.reference[near], pulses.missing[near.start:near.stop - 1])
+        better = whole[index[law.before] - law.before:index[law.before + count] + 1 + law.after]
         errors = times - reference
     errors = errors - errors.mean()
     orders = tuple(sources.tolist())
     bend = None
     if reference is None and with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2:
         bend = ripple
-    raw = amplitudes(reader.cycles(times, points, ends=True), model.cycle_length, orders)
-    clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend),
+    raw = amplitudes(reader.cycles(pulses.times[near], points, ends=True, law=law),
+                     model.cycle_length, orders)
+    clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend, law=clean_law),
                        model.cycle_length, orders)
     clean = separated(clean, model.cycle_length, sources)
     return Acquisition(

@@ -15,7 +15,7 @@ _NODE = 'jitter_predictor'
 _INTEGERS = {'pulses_per_revolution': 100_000, 'pulses_per_trigger': 100_000,
              'trigger_cycles': 1_000_000}  # and the largest that the node takes
 _LISTS = ('orders', 'jitter_table')
-_TEXTS = ('jitter_distribution',)
+_TEXTS = ('jitter_distribution', 'angle_law')
 # Parameters of the node that say nothing about the model.
 _OTHERS = ('follow_shaft_speed', 'speed_tolerance', 'use_sim_time')
 _DEFAULTS: Mapping[str, Any] = {

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.effects import enabled_effects, predict_with
+from sa_jitter_ros.effects import enabled_effects, predict_with, require_modelled
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.effect_parameters import effect_parameters
@@ -14,6 +14,7 @@ from sa_jitter_ros.nodes.messages import (encode_prediction, PREDICTION_FIELDS,
                                           PredictionMessage)
 from sa_jitter_ros.nodes.parameters import Parameter, Values
 from sa_jitter_ros.statistics.prediction import DeclaredModel, DISTRIBUTIONS, Prediction
+from sa_jitter_ros.statistics.pulse_weights import ANGLE_LAWS
 from std_msgs.msg import Float64, Float64MultiArray
 
 PARAMETERS = (
@@ -39,13 +40,15 @@ PARAMETERS = (
               "units of the component's amplitude", minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),
+    Parameter('angle_law', 'linear', 'angle between pulses, as the averager has it',
+              choices=ANGLE_LAWS),
     Parameter('follow_shaft_speed', False, 'take the speed from shaft_speed'),
     Parameter('speed_tolerance', 1e-3, 'relative change of the speed that is worth another '
               'prediction', minimum=0.0, maximum=1.0),
 )
 _MODEL = ('keyphasor_rate', 'trigger_speed', 'trigger_cycles', 'orders', 'ratio',
           'pulses_per_revolution', 'pulses_per_trigger', 'jitter_distribution', 'jitter_std',
-          'jitter_table', 'noise_std', 'sample_rate')
+          'jitter_table', 'noise_std', 'sample_rate', 'angle_law')
 
 
 def declared_model(values: Values) -> DeclaredModel:
@@ -59,6 +62,7 @@ def declared_model(values: Values) -> DeclaredModel:
 def check(values: Values) -> None:
     """Raise `SaJitterError` unless the parameters make a model with effects."""
     model = declared_model(values)
+    require_modelled(model, enabled_effects(values))
     for effect in enabled_effects(values):
         effect.processes(model), effect.gain(model), effect.line_variance(model)
 
