@@ -2,9 +2,9 @@
 Observation: what each acquisition of a recording shows of the attenuation of its lines.
 
 An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses
-by the declared angle law; its corrected ones from the better keyphasor where there is one, else from pulses whose errors were
-recovered from the vibration. The attenuation is raw over corrected amplitude: what noise,
-modulation and interpolation do to both cancels in it.
+by the declared angle law; its corrected ones from the better keyphasor, by the same law, where
+there is one, else from pulses whose errors were recovered from the vibration. The attenuation is
+raw over corrected amplitude: what noise, modulation and interpolation do to both cancels in it.
 """
 
 from collections.abc import Callable, Sequence
