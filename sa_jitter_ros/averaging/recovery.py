@@ -67,8 +67,8 @@ class PulseErrorRecovery:
 
 def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
-                         orders: Sequence[float] = (), most_orders: int = 12,
-                         with_ripple: bool = False) -> PulseErrorRecovery:
+                         orders: Sequence[float] = (), also: Sequence[float] = (),
+                         most_orders: int = 12, with_ripple: bool = False) -> PulseErrorRecovery:
     """
     Recover the pulse errors of one average from its vibration.
 
@@ -77,7 +77,7 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
     pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
     pulse error. `orders` restricts the recovery to these; without it, the at most `most_orders`
-    integer orders are taken that stand out most. `with_ripple` fits a speed ripple u (1 - u) of
+    orders are taken that stand out most: integer ones and those in `also`. `with_ripple` fits a speed ripple u (1 - u) of
     every cycle jointly.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
@@ -86,7 +86,8 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     cycles, periods = _validated(cycles, periods, ratio, declared_standard_deviation)
     declared = declared_standard_deviation * ratio / float(np.mean(periods))
     fit, reason = _staged_fit(cycles, ratio=ratio, first_angle=first_angle, orders=orders,
-                              most_orders=most_orders, declared=declared, with_ripple=with_ripple)
+                              also=also, most_orders=most_orders, declared=declared,
+                              with_ripple=with_ripple)
     if fit is None:
         count, _, channels = cycles.shape
         return PulseErrorRecovery(
@@ -139,12 +140,12 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
 
 
 def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders: Sequence[float],
-                most_orders: int, declared: float, with_ripple: bool
+                also: Sequence[float], most_orders: int, declared: float, with_ripple: bool
                 ) -> tuple[PulseErrorFit | None, str]:
     """Fit low orders first and higher ones as the errors become known; or say why it cannot be."""
     samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
     given = np.unique([g for g in orders if 0.0 < g * ratio <= 0.5 * len(samples)])
-    search = None if len(orders) else LineSearch.of(samples, ratio)
+    search = None if len(orders) else LineSearch.of(samples, ratio, also)
     rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
     known = given if search is None else search.orders
     width = _UNIFORM_WIDTH * declared  # of the interval that an error is still expected in

@@ -11,6 +11,7 @@ than the level of the test says (with a quality factor of 500 at order 19, in 7 
 100 cycles).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi
 
@@ -39,7 +40,8 @@ class LineSearch:
     """
     Hann-windowed spectra (line, cycle, channel) of some consecutive cycles.
 
-    They begin with cycle `first`; `orders` are the integer orders below 0.4 of the sampling rate.
+    They begin with cycle `first`; `orders` are those below 0.4 of the sampling rate: the integer
+    ones and others that are known to be there.
     """
 
     spectra: ComplexArray
@@ -48,8 +50,12 @@ class LineSearch:
     first: int
 
     @classmethod
-    def of(cls, samples: FloatArray, ratio: float) -> 'LineSearch':
-        """Prepare the search in `samples` (sample, cycle, channel) of trigger cycles."""
+    def of(cls, samples: FloatArray, ratio: float, also: Sequence[float] = ()) -> 'LineSearch':
+        """
+        Prepare the search in `samples` (sample, cycle, channel) of trigger cycles.
+
+        `also` are orders to look at beside the integer ones.
+        """
         points, count, _ = samples.shape
         first = max(count - _SEARCHED_CYCLES, 0) // 2
         part = samples[:, first:first + _SEARCHED_CYCLES]
@@ -58,7 +64,9 @@ class LineSearch:
         # A taper over the cycles keeps strong orders from showing at their neighbours.
         taper = np.sin(pi * (np.arange(part.shape[1]) + 0.5) / part.shape[1]) ** 2
         spectra = rfft(part * np.multiply.outer(window, taper)[:, :, None], axis=0)
-        return cls(spectra, np.arange(1.0, int(0.4 * points / ratio) + 1.0), ratio, first)
+        top = 0.4 * points / ratio
+        others = [g for g in also if 0.0 < g <= top]
+        return cls(spectra, np.union1d(np.arange(1.0, int(top) + 1.0), others), ratio, first)
 
     def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
         """

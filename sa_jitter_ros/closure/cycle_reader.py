@@ -74,7 +74,7 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
 
     def attempt(expected: float) -> PulseErrorRecovery:
         return recover_pulse_errors(
-            grid, periods=periods, ratio=model.cycle_length,
+            grid, periods=periods, ratio=model.cycle_length, also=model.orders,
             declared_standard_deviation=expected * declared, with_ripple=with_ripple)
 
     found = attempt(1.0)
@@ -121,14 +121,19 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
     return float(cycles / model.fundamental_frequency)
 
 
+def kept_apart(ratio: float, orders: FloatArray) -> bool:
+    """Tell whether all orders are lines of a trigger cycle of `ratio` fundamental cycles."""
+    return bool(np.all(np.abs(ratio * orders - np.rint(ratio * orders)) < _WHOLE))
+
+
 def separated(cycles: ComplexArray, ratio: float, orders: FloatArray) -> ComplexArray:
     """
     Return complex peaks (cycle, channel, order) without what the other orders leak into each.
 
-    A trigger cycle of `ratio` fundamental cycles, not a whole number, does not keep its orders
-    apart, nor an order from its own mirror image.
+    A trigger cycle does not keep orders apart that are no lines of its own, nor such an order from
+    its own mirror image.
     """
-    if abs(ratio - round(ratio)) < _WHOLE:
+    if kept_apart(ratio, orders):
         return cycles
     middle = np.arange(len(cycles))[:, None, None] + 0.5
     apart = ratio * np.subtract.outer(orders, orders)

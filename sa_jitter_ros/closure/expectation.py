@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.closure.cycle_reader import kept_apart
 from sa_jitter_ros.closure.observation import Acquisition, Observation
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
@@ -29,7 +30,6 @@ Array = NDArray[Any]
 #: What resampling leaves of uncertainty in an amplitude, in parts of it.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
-_WHOLE = 1e-9
 # Speeds closer than this are the same.
 _SPEED_STEP = 1e-3
 _SHARPEST = 2.0
@@ -201,11 +201,11 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
     """
     Return the mean amplitude (order, source) that each unit source shows at each order.
 
-    A ratio that is not whole has the mirror images of the sources after them.
+    Sources that are no lines of the trigger cycle have their mirror images after them.
     """
     model, sources = observation.model, observation.sources
     r, count = model.cycle_length, model.trigger_cycles
-    if abs(r - round(r)) > _WHOLE:
+    if not kept_apart(r, sources):
         sources = np.concatenate((sources, -sources))
     e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()

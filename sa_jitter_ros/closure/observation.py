@@ -33,6 +33,8 @@ _OTHER_MACHINE = 5.0
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
 # Strongest orders beside the declared ones that may leak into them.
 _MOST_OTHERS = 16
+# Lines of a trigger cycle that an order between two of them takes for itself.
+_BESIDE = 1.5
 # A ripple of this many times its noise in power is taken out of the corrected average.
 _RIPPLE = 3.0
 
@@ -313,7 +315,10 @@ def _other_sources(reader: CycleReader, pulses: TriggerPulses, model: DeclaredMo
                               'declare lower ones')
         strong = (spectrum > 0.3 * float(np.min(top))) & (order > 0.0) & (
             order < 0.45 * points / model.cycle_length)
-        strong &= np.min(np.abs(order[:, None] - np.array(declared)), axis=1) > 1e-6
+        # a declared order that is no line of the trigger cycle shows on the lines beside it
+        turns = model.cycle_length * np.array(declared)
+        reach = np.where(np.abs(turns - np.rint(turns)) < 1e-6, 0.5, _BESIDE)
+        strong &= np.all(np.abs(np.arange(spectrum.size)[:, None] - turns) > reach, axis=1)
         best = np.argsort(np.where(strong, spectrum, 0.0))[::-1][:_MOST_OTHERS]
         return [float(order[k]) for k in best if strong[k]]
     return ()
