@@ -65,13 +65,14 @@ class Run:
             self.verdict == ('traced' if self.effects else 'none'))
 
 
-def judge(effects: tuple[str, ...], seed: int, folder: Path, *, pictures: bool = False) -> Run:
+def judge(effects: tuple[str, ...], seed: int, folder: Path, *, plain: bool = False,
+          pictures: bool = False) -> Run:
     """
     Draw a case, run `close_loop` on it in `folder` and read its report.
 
     Without `pictures`, which take most of its time, the command stops short of drawing them.
     """
-    case = draw_case(effects, seed)
+    case = draw_case(effects, seed, plain=plain)
     fields = record(case.machine, case.what, np.random.default_rng([seed, 1]))
     np.savez(folder / 'machine.npz', **fields)
     (folder / 'model.yaml').write_text(declared(case.machine))
@@ -174,6 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--pairs', type=int, default=3, help='machines a pair of effects')
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--only', help='one case, effects joined by +')
+    parser.add_argument('--plain', action='store_true', help='no undeclared orders')
     parser.add_argument('--pictures', action='store_true', help='run the whole command')
     parser.add_argument('--keep', type=Path, help='folder for all files of the runs')
     options = parser.parse_args(arguments)
@@ -190,7 +192,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 if options.keep:
                     folder = options.keep / f'{"+".join(effects) or "none"}_{seed}'
                     folder.mkdir(parents=True, exist_ok=True)
-                run = judge(effects, seed, folder, pictures=options.pictures)
+                run = judge(effects, seed, folder, plain=options.plain,
+                            pictures=options.pictures)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
     print(table(runs))

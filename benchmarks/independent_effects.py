@@ -209,11 +209,18 @@ UNKNOWN = ('following_level', 'late_recovery', 'two_paths', 'resonance')
 _MAKERS = {item.__name__: item for item in MEAN + AS_THEY_ARE + SCATTER}
 
 
-def draw_case(names: tuple[str, ...], seed: int) -> Case:
-    """Draw a machine and what of `names` happens to it; no name: the declared model is right."""
+def draw_case(names: tuple[str, ...], seed: int, *, plain: bool = False) -> Case:
+    """
+    Draw a machine and what of `names` happens to it; no name: the declared model is right.
+
+    A `plain` machine has no vibration but the declared orders: no sidebands, no other shafts.
+    """
     for attempt in range(200):
         rng = np.random.default_rng([seed, attempt, *(ord(c) for c in '+'.join(names))])
         machine = _machine(rng, names)
+        if plain:
+            count = machine.orders.size
+            machine = replace(machine, components=machine.orders, peaks=machine.peaks[:, :count])
         what, truth = Disturbance(), {}
         for name in names:
             one = _sized(rng, name, machine)
