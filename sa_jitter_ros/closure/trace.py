@@ -286,6 +286,10 @@ def _try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], curren
             _decisive(finding, current, score))
         told = not kind.scatters and _told(bench, effects, finding, current, score)
         needed = p_value < SIGNIFICANT or kind.seen or decisive or told
+        moves = kind.scatters or kind.seen or _moved(bench, effects, finding.effect) > ACCURACY
+        if not rejected and not moves:
+            rejected = (f'it is too small to matter: the attenuation of no line changes by more '
+                        f'than {ACCURACY:g}')
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
@@ -304,6 +308,13 @@ def _best(candidates: Sequence[Candidate]) -> Candidate | None:
             return max(left, key=lambda item: item.held_out_score or 0.0)
     left = [item for item in candidates if not item.rejected_because]
     return max(left, key=lambda item: item.held_out_score or 0.0) if left else None
+
+
+def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
+    """Return the largest RMS, over the acquisitions, by which an effect moves a prediction."""
+    without, with_it = (bench.expect(known, bench.held_out).attenuation
+                        for known in (effects, [*effects, more]))
+    return float(np.sqrt(np.mean((with_it - without) ** 2, axis=0).max()))
 
 
 def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
