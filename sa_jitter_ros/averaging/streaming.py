@@ -120,15 +120,12 @@ class StreamingAverager:
         for number, (time, starts, restarted) in enumerate(zip(
                 triggers.times.tolist(), triggers.starts_run.tolist(),
                 triggers.restarted.tolist())):
-            newest = self.timeline.epoch
             # the first pulses of all may be few enough to leave the vibration before out of it
             reach = time if self._triggers else triggers.times[number:number + 3][-1]
-            if restarted:
-                # held until its vibration comes, unless that restarted before
-                self._pulse_epoch = max(self._pulse_epoch + 1, newest)
-            elif self._pulse_epoch < newest and not self.timeline.held_before(reach):
-                # the vibration restarted and the pulses had not run ahead of it
-                self._pulse_epoch, starts = newest, True
+            # time that ran back is that of a vibration which did, too, or of one that will
+            epoch = self.timeline.epoch_near(reach, self._pulse_epoch + restarted)
+            starts = starts or epoch != self._pulse_epoch
+            self._pulse_epoch = epoch
             last = self._triggers[-1] if self._triggers else Trigger(time, True, 0, 0.0)
             self._triggers.append(Trigger(time, starts or not self._triggers, self._pulse_epoch,
                                           last.elapsed + max(time - last.time, 0.0)))
@@ -155,8 +152,6 @@ class StreamingAverager:
     # --- cycles ---
 
     def _process(self) -> list[tuple[str, SynchronousAverage]]:
-        if self._pulse_epoch > self.timeline.epoch:
-            self.timeline.confirm_restart()
         averages: list[tuple[str, SynchronousAverage]] = []
         while len(self._triggers) - self._next >= 2:
             start, end = self._triggers[self._next:self._next + 2]

@@ -64,8 +64,7 @@ class VibrationTimeline:
     A header time more than half a sample off the clock of its run is counted. A block that is off
     by more than `time_tolerance` (s), lies wholly before the last one's start or contradicts the
     last one's samples is held back: if the next block continues it, it begins a new run, otherwise
-    it is dropped. A new run from before the old one's end is a restart; `epoch` counts those,
-    `previous_end` is where (s) the latest happened.
+    it is dropped. A new run from before the old one's end is a restart; `epoch` counts those.
     """
 
     time_tolerance: float = 0.01
@@ -73,13 +72,11 @@ class VibrationTimeline:
     counts: TimelineCounts = field(default_factory=TimelineCounts)
     stretches: list[Stretch] = field(default_factory=list)
     epoch: int = 0
-    previous_end: float = -np.inf
     messages: list[str] = field(default_factory=list)
     _last: SampleBlock | None = None
     _suspect: SampleBlock | None = None
     _odd: tuple[int, float] | None = None
     _clock: Clock | None = None
-    _gap: tuple[int, float] = (0, np.inf)
 
     @property
     def layout(self) -> tuple[int, float] | None:
@@ -115,13 +112,6 @@ class VibrationTimeline:
         else:
             self._continue(block)
 
-    def confirm_restart(self) -> None:
-        """Take a block that is held back for a restart: the pulses have run back as well."""
-        suspect = self._suspect
-        if suspect is not None and suspect.start_time <= self.end_time:
-            self._suspect = None
-            self._new_run(suspect)
-
     def release(self, epoch: int, before: float) -> None:
         """Forget the samples before the time `before` (s) of `epoch`: they were used."""
         for stretch in self.stretches:
@@ -141,10 +131,11 @@ class VibrationTimeline:
         self._tidy()
         return taken
 
-    def held_before(self, time: float) -> bool:
-        """Whether samples from before the latest restart are held that reach a time (s)."""
-        return time <= self.previous_end and any(
-            item.epoch < self.epoch and item.end_time >= time for item in self.stretches)
+    def epoch_near(self, time: float, earliest: int) -> int:
+        """Epoch, of those from `earliest` on, whose held samples are nearest to a time (s)."""
+        away = [(max(item.start_time - time, time - item.end_time, 0.0), item.epoch)
+                for item in self.stretches if item.epoch >= earliest]
+        return min(away)[1] if away else max(earliest, self.epoch)
 
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
@@ -217,10 +208,6 @@ class VibrationTimeline:
     def _new_run(self, block: SampleBlock) -> None:
         self._close()
         if block.start_time <= self.end_time:
-            # Samples in the latest gap tell that it was the jump ahead which was wrong.
-            index, before = self._gap
-            gap = block.index >= index and block.start_time > before
-            self.previous_end = before if gap else self.end_time
             self.epoch += 1
             self.counts.restarts += 1
             self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
@@ -230,7 +217,6 @@ class VibrationTimeline:
             self.messages.append(f'source goes on at {block.start_time:.6g} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = Clock(block.start_time, block.index, block.sample_rate)
-        self._gap = 0, np.inf
         self._store(block.samples, block.index)
         self._last = block
 
@@ -247,7 +233,6 @@ class VibrationTimeline:
         if block.index > expected:
             self.counts.gaps += 1
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
-            self._gap = expected, self.end_time
             self._close()
         # a block that overlaps what was received adds its new part only
         start = max(expected, block.index)
