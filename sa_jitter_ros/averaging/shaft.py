@@ -161,7 +161,7 @@ class ShaftAverager:
         amplitudes[:, self.beyond_nyquist(cycle.period, cycle.rate)] = np.nan
         if not self._counted:
             self._expect_from(angle)
-        self._add_points(first, points)
+        self._add_points(first, points, angle + settings.cycles)
         self._amplitude_mean.update(amplitudes)
         self._amplitudes.append(amplitudes)
         self._pulses.append(float(cycle.pulses[cycle.first + 1]))
@@ -222,6 +222,7 @@ class ShaftAverager:
         self._pulses: deque[float] = deque(maxlen=settings.trigger_cycles + 1)
         self._wave: FloatArray = np.empty((0, 0))
         self._next_point = 0
+        self._full = False  # all points of the waveform are there, but not its end
         self._first_whole = 0
 
     def _new_mean(self, cycles: float) -> RunningMean:
@@ -236,10 +237,13 @@ class ShaftAverager:
         self._first_whole = math.ceil(angle - 1e-9)
         self._next_point = self._first_whole * self._points
 
-    def _add_points(self, first: int, points: FloatArray) -> None:
-        """Put points into their fundamental cycle; a whole one goes into the mean."""
+    def _add_points(self, first: int, points: FloatArray, end: float) -> None:
+        """Put points into their fundamental cycle; the mean takes one that is whole at `end`."""
         if len(self._wave) != self._points:
             self._wave = np.full((self._points, points.shape[1]), np.nan)
+        if self._full:
+            self._take_wave()
+        whole = math.floor(end + 1e-9) * self._points
         points = points[max(self._next_point - first, 0):]
         while len(points):
             at = self._next_point % self._points
@@ -247,10 +251,15 @@ class ShaftAverager:
             self._wave[at:at + count] = points[:count]
             points = points[count:]
             self._next_point += count
-            if at + count == self._points:
-                self._wave_mean.update(self._wave)
-                if self.settings.averaging == 'sliding':  # keeps what it is given
-                    self._wave = np.empty_like(self._wave)
+            self._full = at + count == self._points
+            if self._full and self._next_point <= whole:
+                self._take_wave()
+
+    def _take_wave(self) -> None:
+        self._full = False
+        self._wave_mean.update(self._wave)
+        if self.settings.averaging == 'sliding':  # keeps what it is given
+            self._wave = np.empty_like(self._wave)
 
     def _slide(self) -> None:
         """Forget what has left a sliding window."""
