@@ -630,3 +630,54 @@ def test_late_block_beside_a_restart_leaves_no_pulse_behind():
     assert target.timeline.counts.restarts == 1
     assert len(found) >= 2.5 * machine.speed // 8
     check(machine, found, orders=(1.0,), trigger_cycles=8)
+
+
+@pytest.mark.parametrize('averaging', ['block', 'sliding', 'exponential'])
+def test_a_fundamental_cycle_that_ends_behind_the_last_pulse_is_not_in_the_waveform(averaging):
+    """All its points are, where the grid is coarser than what is missing of the cycle."""
+    ratio, count = 1.9975, 2  # windows end at 3.995, 5.9925, ... of which 3.99 is a point
+    machine = Machine(components={ratio: (1.0, 0.4)})
+    target = averager(shaft={'cycles': ratio, 'orders': (1.0,), 'trigger_cycles': count,
+                             'samples_per_revolution': 100, 'averaging': averaging})
+    found = feed(target, machine, seconds=1.0)
+    for _, average in found:
+        start, end = average.angle, average.angle + count * ratio
+        assert average.fundamental_cycles == np.floor(end + 1e-9) - np.ceil(start - 1e-9)
+        wave = np.cos(2.0 * np.pi * np.arange(100) / 100 + 0.4)
+        np.testing.assert_allclose(average.waveform[0], wave, atol=3e-4)
+    assert len(found) > 10
+
+
+def test_every_sample_is_averaged_or_counted():
+    """400 samples a cycle; what is received beside a lost block is dropped with its cycle."""
+    machine = Machine(speed=32.0)
+    target = averager(shaft={'orders': (1.0,), 'trigger_cycles': 4})
+    lost, bad, received = (21, 22), 40, 0
+    for number in range(100):
+        block = machine.block(160 * number, 160)
+        if number == bad:
+            block.samples[0, 7] = np.nan
+        if number not in lost:
+            target.add_samples(block)
+            received += 160
+        target.add_pulses(machine.pulses(160 / 12800, 160 * number / 12800))
+    counts = target.timeline.counts
+    assert (counts.gaps, counts.samples_lost) == (1, 320)
+    # samples 3360 to 3679 of the cycles 8 and 9 are lost, sample 6407 of cycle 16 is no number
+    assert counts.samples_dropped == (800 - 320) + 400
+    assert target.counts.cycles == 39 - 3
+    assert received == 400 * (36 + 1) + counts.samples_dropped  # the last cycle is not over
+
+
+def test_counts_of_pulses_outlive_their_validator():
+    machine = Machine()
+    target = averager(shaft={'orders': (1.0,)})
+    pulses = machine.pulses(2.0)
+    target.add_pulses(np.sort(np.append(pulses, pulses[10] + 1e-3)))
+    before = target.pulse_counts
+    target.change_pulses(PulseValidator(interval_tolerance=0.2))
+    assert target.pulse_counts == before
+    assert (before.accepted, before.doubles) == (len(pulses), 1)
+    assert target.counts.cycles_dropped == len(pulses) - 1  # they waited for vibration
+    target.add_pulses(machine.pulses(1.0, 2.0))
+    assert target.pulse_counts.accepted == len(machine.pulses(3.0))

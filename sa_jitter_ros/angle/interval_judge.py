@@ -110,6 +110,7 @@ class IntervalJudge:
         """Go back to the last confirmed pulse; return how many pulses that drops."""
         self._clock.stop()
         dropped = max(len(self._pending), 1)
+        self.counts['accepted'] -= not self._pending  # it began a run, and does so no more
         self._pending = []
         self.last = self.confirmed
         self._calm = 0

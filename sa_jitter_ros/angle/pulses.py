@@ -9,7 +9,8 @@ fits them and not the old sequence, makes them a new run. If the last pulse had 
 by a regular one, it is that one which is out of order.
 """
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 from typing import Literal
 
 import numpy as np
@@ -66,6 +67,10 @@ class PulseCounts:
     unlocked: int = 0
     relearnt: int = 0
     cycles_discarded: int = 0
+
+    def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
+        """Return the counts of both."""
+        return PulseCounts(*map(add, astuple(self), astuple(other)))
 
 
 class PulseValidator:

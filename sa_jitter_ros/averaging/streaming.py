@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.angle.laws import angle_law
-from sa_jitter_ros.angle.pulses import PulseValidator, TriggerPulses
+from sa_jitter_ros.angle.pulses import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.shaft import AverageSettings, SynchronousAverage
@@ -64,6 +64,7 @@ class StreamingAverager:
             raise ParameterError('no shaft to average: name at least one')
         self.timeline, self.validator = timeline, validator
         self.counts = StreamCounts()
+        self._pulse_counts = PulseCounts()  # of earlier validators
         self.shafts = {name: CorrectingAverager(settings) for name, settings in shafts.items()}
         self._law = angle_law(next(iter(shafts.values())).law)
         self._triggers: list[Trigger] = []  # of which the next cycle begins at _next
@@ -73,6 +74,11 @@ class StreamingAverager:
         self._lead = np.inf  # s of samples before a cycle that its interpolation reads
         self._speed = 0, 0.0  # cycles and seconds since the last take_speed
         self._messages: list[str] = []
+
+    @property
+    def pulse_counts(self) -> PulseCounts:
+        """What became of the pulses so far, whichever validator judged them."""
+        return self._pulse_counts + self.validator.counts
 
     def take_messages(self) -> list[str]:
         """Lines about what was wrong since the last call."""
@@ -103,7 +109,9 @@ class StreamingAverager:
 
     def change_pulses(self, validator: PulseValidator) -> None:
         """Go on with another validator: pulses so far are forgotten, the angle starts anew."""
+        self._pulse_counts = self.pulse_counts
         self.validator = validator
+        self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
         self._triggers.clear()
         self._next = 0
         self._begin_run()
@@ -225,6 +233,7 @@ class StreamingAverager:
         pulses = np.array([item.time for item in self._triggers[begin:stop]])
         first = self._next - begin
         low, high = (stretch.position(float(pulse)) for pulse in pulses[first:first + 2])
+        self.timeline.counts.samples_dropped += stretch.use(low, high)
         averages, failed = [], ''
         self._lead = 0.0
         for name, shaft in self.shafts.items():

@@ -1,6 +1,7 @@
 """Consecutive samples on one clock: what the time line keeps, and trigger cycles are cut from."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +27,16 @@ class Stretch:
     Consecutive finite samples on one clock; grows at the end, is trimmed at the start.
 
     `epoch` counts how often time ran back before it; `closed` tells that no sample will follow.
+    Every sample is accounted for once: `use` tells that it was averaged, `trim` returns how many
+    were not.
     """
 
     def __init__(self, clock: Clock, epoch: int, index: int, samples: FloatArray) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
         self._data = np.ascontiguousarray(samples.T)
         self._begin, self._end = 0, len(self._data)
-        self._index = index
+        self._index = self._settled = index  # samples before the latter are accounted for
+        self._begins_run = index == clock.index
 
     @property
     def index(self) -> int:
@@ -76,8 +80,22 @@ class Stretch:
         self._data[self._end:self._end + count] = samples.T
         self._end += count
 
+    def use(self, low: float, high: float) -> int:
+        """
+        Take the samples between two positions as averaged; return how many before them were not.
+
+        What comes before the first averaged cycle of a run is not counted: its pulses begin there.
+        """
+        first, end = (self.index + math.ceil(at - 1e-6) for at in (low, high))
+        passed = 0 if self._begins_run else max(first - self._settled, 0)
+        self._begins_run = False
+        self._settled = max(self._settled, end)
+        return passed
+
     def trim(self, index: int) -> int:
-        """Forget the samples before `index`; returns how many those were."""
-        count = min(max(index - self.index, 0), self._end - self._begin)
-        self._begin += count
-        return count
+        """Forget the samples before `index`; return how many of them were not averaged."""
+        end = min(max(index, self.index), self.end_index)
+        unused = max(end - self._settled, 0)
+        self._begin += end - self.index
+        self._settled = max(self._settled, end)
+        return unused

@@ -39,9 +39,15 @@ class SampleBlock:
 
 @dataclass
 class TimelineCounts:
-    """What happened to the samples so far."""
+    """
+    What happened to the samples so far.
+
+    `samples_dropped` were received and entered no average, `samples_lost` are those that the jumps
+    of the index (`gaps`) left out.
+    """
 
     samples_dropped: int = 0
+    samples_lost: int = 0
     gaps: int = 0
     restarts: int = 0
     repeats: int = 0
@@ -113,12 +119,13 @@ class VibrationTimeline:
             self._continue(block)
 
     def release(self, epoch: int, before: float) -> None:
-        """Forget the samples before the time `before` (s) of `epoch`: they were used."""
+        """Forget the samples before the time `before` (s) of `epoch`; count those not averaged."""
         for stretch in self.stretches:
             if stretch.epoch < epoch:
-                stretch.trim(stretch.end_index)
+                self.counts.samples_dropped += stretch.trim(stretch.end_index)
             elif stretch.epoch == epoch and np.isfinite(before):
-                stretch.trim(stretch.index + math.floor(stretch.position(before)))
+                self.counts.samples_dropped += stretch.trim(
+                    stretch.index + math.floor(stretch.position(before)))
         self._tidy()
 
     def take(self) -> list[tuple[int, SampleBlock]]:
@@ -232,6 +239,7 @@ class VibrationTimeline:
             return
         if block.index > expected:
             self.counts.gaps += 1
+            self.counts.samples_lost += block.index - expected
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
             self._close()
         # a block that overlaps what was received adds its new part only

@@ -118,7 +118,7 @@ class SynchronousAverager(MonitoringNode):
     def update_counts(self) -> None:
         """Gather the counts of the core."""
         averager = self._averager
-        samples, pulses = averager.timeline.counts, averager.validator.counts
+        samples, pulses = averager.timeline.counts, averager.pulse_counts
         self.counts.update(
             samples_dropped=samples.samples_dropped,
             pulses_dropped=(averager.counts.pulses_dropped + self._other_keyphasors
@@ -127,7 +127,8 @@ class SynchronousAverager(MonitoringNode):
             cycles_dropped=averager.counts.cycles_dropped + pulses.cycles_discarded,
             gaps=samples.gaps, restarts=max(samples.restarts, pulses.restarts),
             clock_deviation=samples.clock_deviation,
-            averages_dropped=averager.counts.averages_dropped, repeats=samples.repeats)
+            averages_dropped=averager.counts.averages_dropped, repeats=samples.repeats,
+            samples_lost=samples.samples_lost)
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Say how far the averages are and what the pulses look like."""
@@ -137,7 +138,7 @@ class SynchronousAverager(MonitoringNode):
         values = {'trigger_cycles': str(averager.counts.cycles), 'averages': str(published),
                   'keyphasor': self._keyphasor,
                   **{f'pulses_{key}': str(count)
-                     for key, count in asdict(averager.validator.counts).items()}}
+                     for key, count in asdict(averager.pulse_counts).items()}}
         refused = {name: shaft.refused for name, shaft in self._shafts.items() if shaft.refused}
         for name, count in refused.items():
             values[f'{name}.corrections_refused'] = str(count)

@@ -127,7 +127,8 @@ class TachDetector(MonitoringNode):
         self.counts.update(
             samples_dropped=samples.samples_dropped, pulses_dropped=state.too_close,
             gaps=samples.gaps, restarts=samples.restarts,
-            clock_deviation=samples.clock_deviation, repeats=samples.repeats)
+            clock_deviation=samples.clock_deviation, repeats=samples.repeats,
+            samples_lost=samples.samples_lost)
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Say how many pulses were found and at which threshold."""
