@@ -1,0 +1,211 @@
+"""
+Inject thousands of random faults into the running graph and check every average against the truth.
+
+    .venv/bin/python benchmarks/fault_campaign.py
+
+takes a quarter of an hour. A source that misbehaves feeds the nodes, each a process of its own
+over DDS; nodes are killed, stopped and reconfigured; all averages are compared with the known
+vibration of the cycles they claim. Numbers go to `out/faults.json`, figures and tables to
+docs/reliability.md. The exit status is 1 if anything was wrong.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any
+
+from fault_check import ShaftChecker, WrongAverageError
+from fault_disturb import Disturber
+from fault_graph import Graph, ROLES, SHAFTS
+from fault_source import FaultySource, KEYPHASOR, Scene
+import numpy as np
+from performance_page import fill
+from reliability_page import draw_faults, fault_sections
+
+ROOT = Path(__file__).resolve().parents[1]
+PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
+EXTRA = 5  # faultless scenes within which every average must have come back
+HELD = 4  # pulses that may be waiting to be judged
+
+
+class Campaign:
+    """Plays scenes into a graph and keeps account."""
+
+    def __init__(self, seed: int, graph: Graph) -> None:
+        rng = np.random.default_rng(seed)
+        self.graph, self.source = graph, FaultySource(rng)
+        self.disturber = Disturber(rng, graph, self._killed)
+        self.checkers = {
+            key: ShaftChecker(key[1], self.source.runs, self.disturber.settings[key[0]],
+                              delivered=key[0] == 'direct') for key in SHAFTS}
+        self.faults: Counter[str] = Counter()
+        self.checked: Counter[str] = Counter()  # averages of scenes with a fault, by its kind
+        self.wrong = self.disturber.wrong  # to which both add
+        self._scene = Scene(self.source.runs[-1])
+        self.recovery: list[int] = []  # faultless scenes that were needed, scene by scene
+        self._expected: Counter[str] = Counter()  # of `direct` since `_base`
+        self._base: dict[str, str] = {}
+
+    def play(self, *, kills: bool) -> None:
+        """Play a scene and wait until all averages are well again."""
+        self.source.displace = self.disturber.set_law()
+        scene = self.source.scene()
+        self.disturber.faults.clear()
+        before = self.averages
+        self._feed(scene, self.disturber.plan(kills=kills))
+        faults = scene.faults + Counter(self.disturber.faults)
+        waiting = self._wait(scene)
+        extra = 0
+        while waiting and extra < EXTRA:
+            extra += 1
+            scene = self.source.scene(changes=False, faults=False)
+            self._feed(scene, [])
+            waiting = self._wait(scene)
+        self.recovery.append(extra)
+        self.wrong += [f'{key}: no average after {EXTRA} faultless scenes' for key in waiting]
+        self.disturber.settle()
+        self.graph.watch()
+        self.faults += faults
+        for kind in faults:
+            self.checked[kind] += self.averages - before
+
+    @property
+    def averages(self) -> int:
+        """Averages that were checked so far and found true."""
+        return sum(checker.checked for checker in self.checkers.values())
+
+    def _feed(self, scene: Scene, actions: list[Any]) -> None:
+        """Send a scene, and act somewhere in the first half of it."""
+        self._scene = scene
+        places = sorted(self.disturber.rng.integers(0, len(scene.events) // 2, len(actions)))
+        for number, (_, topic, message) in enumerate(scene.events):
+            while places and number >= places[0]:
+                places.pop(0)
+                actions.pop(0)()
+            self.graph.send(topic, message)
+            if number % 20 == 0:
+                self._check(scene)
+        for _, topic, message in scene.events:
+            if topic == 'tach_pulse':
+                self._expected['pulses' if message.source == KEYPHASOR else 'foreign'] += 1
+        self._expected['messages_rejected'] += scene.rejected
+
+    def _killed(self, role: str) -> None:
+        """Begin anew in all accounts of a node, once what it had published is checked."""
+        self._check(self._scene)
+        for (of, _), checker in self.checkers.items():
+            if of == role:
+                checker.start_anew()
+        if role == 'direct':
+            self._base = {}  # counts again from the end of this scene on
+
+    def _check(self, scene: Scene) -> set[Any]:
+        """Check what has come; return the averages that are of the scene's tail."""
+        well = set()
+        for key, checker in self.checkers.items():
+            for amplitude, waveform in self.graph.inboxes[key].take():
+                try:
+                    place = checker.check(amplitude, waveform)
+                except WrongAverageError as error:
+                    self.wrong.append(f'{key[0]}: {error}')
+                    checker.start_anew(amplitude.header.sequence + 1)
+                    continue
+                if place.run is scene.run and place.first >= scene.tail:
+                    well.add(key)
+        return well
+
+    def _wait(self, scene: Scene) -> set[Any]:
+        """Wait for averages of the scene's tail; return which have not come."""
+        waiting = set(self.checkers)
+        waiting -= self._check(scene)
+
+        def come() -> bool:
+            nonlocal waiting
+            waiting -= self._check(scene)
+            return not waiting
+        self.graph.spin(come, 4.0)
+        return waiting
+
+    def account(self) -> None:
+        """Compare what `direct` and the others have counted with what was sent."""
+        status = self.graph.quiet_status('direct')
+        self._check(self._scene)
+        if self._base:
+            grown = {key: int(value) - int(self._base[key]) for key, value in status.items()
+                     if value.isdecimal() and self._base.get(key, '').isdecimal()}
+            judged = sum(grown[f'pulses_{key}'] for key in PULSES)
+            self._compare('pulses judged', judged, self._expected['pulses'], HELD)
+            self._compare('messages_rejected', grown['messages_rejected'],
+                          self._expected['messages_rejected'], 0)
+        self._base, self._expected = status, Counter()
+        for role in ('predictor', 'analyser'):
+            self._compare(f'{role}: messages_rejected', int(
+                self.graph.quiet_status(role)['messages_rejected']),
+                self.disturber.rejected[role], 0)
+
+    def _compare(self, what: str, counted: int, expected: int, slack: int) -> None:
+        if abs(counted - expected) > slack:
+            self.wrong.append(f'{what}: {counted} counted, {expected} sent')
+
+
+def run(seed: int, scenes: int, report: Callable[[str], None]) -> dict[str, Any]:
+    """Run a campaign; nodes are killed in the first half, memory is watched in the second."""
+    graph, told = Graph(), 0
+    try:
+        graph.start(list(ROLES))
+        campaign = Campaign(seed, graph)
+        for number in range(scenes):
+            campaign.play(kills=number < scenes // 2)
+            if number % 5 == 4:
+                campaign.account()
+            if number % 10 == 9 or campaign.wrong[told:]:
+                report('\n'.join([
+                    f'{number + 1} of {scenes} scenes, {sum(campaign.faults.values())} faults, '
+                    f'{campaign.averages} averages, {len(campaign.wrong)} wrong',
+                    *campaign.wrong[told:]]))
+            told = len(campaign.wrong)
+            if told > 20 or graph.died:
+                break
+    finally:
+        statuses = graph.close()
+    lives = [*graph.past, *graph.lives.items()]
+    return {
+        'seed': seed, 'scenes': len(campaign.recovery), 'seconds': time.monotonic() - graph.begin,
+        'faults': dict(sorted(campaign.faults.items())), 'checked': dict(campaign.checked),
+        'averages': {f'{role} {shaft}': checker.checked
+                     for (role, shaft), checker in campaign.checkers.items()},
+        'wrong': campaign.wrong, 'died': graph.died, 'statuses': statuses,
+        'recovery': campaign.recovery, 'heard': graph.heard,
+        'rss': [(role, life.rss) for role, life in lives]}
+
+
+def main() -> int:
+    """Run, keep the numbers, and write the page."""
+    parser = argparse.ArgumentParser(description='Inject faults into the running graph.')
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--scenes', type=int, default=300, help='of some fifteen faults each')
+    parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'faults.json')
+    parser.add_argument('--page', type=Path, default=ROOT / 'docs' / 'reliability.md')
+    parser.add_argument('--figures', type=Path, default=ROOT / 'docs' / 'figures')
+    parser.add_argument('--only-write', action='store_true', help='from the numbers of last time')
+    options = parser.parse_args()
+    if not options.only_write:
+        found = run(options.seed, options.scenes,
+                    lambda text: print(text, file=sys.stderr, flush=True))
+        options.numbers.parent.mkdir(parents=True, exist_ok=True)
+        options.numbers.write_text(json.dumps(found) + '\n')
+    found = json.loads(options.numbers.read_text())
+    print(f'{sum(found["faults"].values())} faults, {sum(found["averages"].values())} averages, '
+          f'{len(found["wrong"])} wrong, {len(found["died"])} nodes died')
+    print('\n'.join(found['wrong'] + found['died']))
+    draw_faults(found, options.figures)
+    options.page.write_text(fill(options.page.read_text(), fault_sections(found)))
+    return int(bool(found['wrong'] or found['died'] or any(found['statuses'].values())))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

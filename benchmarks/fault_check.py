@@ -1,0 +1,200 @@
+"""
+Whether what an averager published is true of the cycles it claims.
+
+Only the messages are known: which source and teeth an average is of follows from its times, and at
+which angle it begins from its phases. The rest must then agree: amplitudes, phases, waveform,
+counts, and its place behind the averages before it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from fault_machine import (equal_weights, exponential_weights, FloatArray, Run, TEETH, Window)
+import numpy as np
+from sa_jitter_ros.nodes.messages import AverageMessage
+
+AMPLITUDE = 5e-4  # of the largest value: what band-limited interpolation may cost an amplitude
+POINT = 4e-3  # and a point of the waveform, where samples are on one side of it only
+BELIEVED = 0.15  # of the pitch: pulses displaced by more must not be used
+LONGEST = 60  # trigger cycles that an exponential average is followed back
+RUNS = 8  # back to which averages are looked for
+
+
+class WrongAverageError(AssertionError):
+    """An average that is not that of the cycles it claims."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an average was found; `zeros` are the teeth at which its angle may have been 0."""
+
+    run: Run
+    first: int
+    last: int
+    zeros: frozenset[int]
+    values: Mapping[str, Any]
+
+
+class ShaftChecker:
+    """
+    Checks the averages of one shaft of one averager, in the order in which they come.
+
+    `settings` are the parameters that may be in force: while a change is on its way, the old ones
+    and the new ones.
+    """
+
+    def __init__(self, name: str, runs: Sequence[Run], settings: Sequence[Mapping[str, Any]], *,
+                 delivered: bool) -> None:
+        self._name, self._runs, self._settings = name, runs, settings
+        self._delivered = delivered  # teeth that were lost on the way are missing as well
+        self.last: Place | None = None
+        self._sequence = 0
+        self.checked = 0
+
+    def start_anew(self, sequence: int = 0) -> None:
+        """Expect this sequence next: the node was started again, or an average was wrong."""
+        self._sequence, self.last = sequence, None
+
+    def check(self, amplitude: AverageMessage, waveform: AverageMessage) -> Place:
+        """Return where the average is of; raises `WrongAverageError`."""
+        header = amplitude.header
+        if waveform.header != header:
+            raise WrongAverageError(f'{self._name}: waveform and amplitudes differ in {header}')
+        if header.sequence != self._sequence:
+            raise WrongAverageError(f'{self._name}: sequence {header.sequence} behind '
+                                    f'{self._sequence - 1}')
+        place, reasons = None, []
+        for run in reversed(self._runs[-RUNS:]):
+            first, last = run.tooth_at(header.start_time), run.tooth_at(header.end_time)
+            if first is None or last is None:
+                continue
+            for values in reversed(self._settings):
+                found = self._matches(run, first, last, amplitude, waveform, values)
+                if isinstance(found, Place):
+                    place = found
+                    break
+                reasons.append(f'run {run.number}: {found}')
+            if place:
+                break
+        if place is None:
+            raise WrongAverageError(f'{self._name}: {header} is of no source: '
+                                    f'{"; ".join(reasons) or "no teeth at these times"}')
+        self.last = place
+        self._sequence += 1
+        self.checked += 1
+        return place
+
+    def _matches(self, run: Run, first: int, last: int, amplitude: AverageMessage,
+                 waveform: AverageMessage, values: Mapping[str, Any]) -> Place | str:
+        """Return the place, or what does not agree."""
+        header, table = amplitude.header, amplitude.values
+        step = values['pulses_per_trigger'] or TEETH
+        ratio, orders = values[f'{self._name}.ratio'], values[f'{self._name}.orders']
+        count, r = values['trigger_cycles'], ratio * step / TEETH
+        if header.trigger_cycles != count or not np.array_equal(table[0, :, 0], orders):
+            return f'other trigger cycles or orders than {count}, {orders}'
+        if last - first != count * step:
+            return f'teeth {first} to {last} are not {count} trigger cycles'
+        if len(table) != run.channels:
+            return f'{len(table)} channels of {run.channels}'
+        speed = count * step / TEETH / (header.end_time - header.start_time)
+        if abs(header.mean_trigger_speed - speed) > 1e-9 * speed:
+            return f'speed {header.mean_trigger_speed} instead of {speed}'
+        exponential = values['averaging'] == 'exponential'
+        pulses = self._pulses(run, first, last, step, values, LONGEST if exponential else count)
+        if isinstance(pulses, str):
+            return pulses
+        return self._agrees(Window(run, pulses, r, count), amplitude, waveform, values, first)
+
+    def _pulses(self, run: Run, first: int, last: int, step: int, values: Mapping[str, Any],
+                longest: int) -> FloatArray | str:
+        """Return the pulses (tau) of as many usable cycles as end at `last`, at least these."""
+        pitch = 1.0 / (TEETH * run.speed)
+        absent = run.missing | run.undelivered if self._delivered else run.missing
+        gaps = absent if values['missing_pulses'] == 'break' else set()
+        begin = max(last - longest * step, 0)
+        bad = [tooth for tooth in range(begin, last + 1) if tooth in gaps
+               or abs(run.displaced.get(tooth, 0.0)) > BELIEVED * pitch]
+        if bad and bad[-1] >= first:
+            return f'tooth {bad[-1]} is missing or displaced'
+        begin = max([begin, *(tooth + 1 for tooth in bad)])
+        begin = last - (last - begin) // step * step
+        present = np.array([tooth for tooth in range(max(begin - 10, 0), last + 10)
+                            if tooth not in absent])
+        pulses = np.interp(np.arange(begin, last + 1, step), present, run.times(present))
+        for k in range(len(pulses) - 1, 0, -1):
+            if not run.sent(pulses[k - 1], pulses[k]):
+                if k > len(pulses) - 1 - (last - first) // step:
+                    return f'vibration between {pulses[k - 1]} s and {pulses[k]} s was lost'
+                return pulses[k:]
+        return pulses
+
+    def _agrees(self, window: Window, amplitude: AverageMessage, waveform: AverageMessage,
+                values: Mapping[str, Any], first: int) -> Place | str:
+        """Compare with the truth at every angle at which the average may begin."""
+        header, table, run = amplitude.header, amplitude.values, window.run
+        count, orders = header.trigger_cycles, table[0, :, 0]
+        step = values['pulses_per_trigger'] or TEETH
+        gain = np.arange(1, run.channels + 1)[:, None]
+        measured = (table[..., 1] * np.exp(1j * table[..., 2])) / gain
+        limit = AMPLITUDE * run.scale
+        if np.ptp(measured.real, axis=0).max() > limit:
+            return 'channels disagree'
+        cycles = window.amplitudes(orders)
+        starts = np.arange(first // step + 1)  # trigger cycles since the angle was 0
+        turn = np.exp(-2j * np.pi * window.cycles * np.outer(starts, orders))
+        lengths = [count]
+        if values['averaging'] == 'exponential':
+            lengths = list(range(count, len(cycles) + 1))
+        best = np.inf
+        for length in lengths:
+            weights = (exponential_weights(length, count) if values['averaging'] == 'exponential'
+                       else equal_weights(length))
+            error = np.abs(measured[0] - weights @ cycles[-length:] * turn).max(axis=1)
+            best = min(best, error.min())
+            fits = [int(start) for start in starts[error < limit] if start >= length - count]
+            # the waveform knows the angle but for whole turns
+            turns = {start: round(start * window.cycles % 1.0, 9) % 1.0 for start in fits}
+            agrees = {turn: self._waveform_agrees(
+                window.latest(length), start - (length - count), waveform, values, gain)
+                for turn, start in {turn: start for start, turn in turns.items()}.items()}
+            zeros = frozenset(first - start * step for start in fits if agrees[turns[start]])
+            if zeros:
+                return self._follows(Place(run, first, first + count * step, zeros, values), step)
+        return f'amplitudes off by {best:.3g} (limit {limit:.3g}), or the waveform is'
+
+    def _waveform_agrees(self, window: Window, start: int, waveform: AverageMessage,
+                         values: Mapping[str, Any], gain: FloatArray) -> bool:
+        r, count = window.cycles, window.trigger_cycles
+        whole = window.waveforms(start, waveform.values.shape[1])
+        told = len(whole)
+        if values['averaging'] == 'exponential':
+            told = min(told, int(count * r))
+            weights = exponential_weights(len(whole), max(count * r, 1.0))
+        else:
+            weights = equal_weights(len(whole))
+        if waveform.header.fundamental_cycles != told:
+            return False
+        if not len(whole):
+            return bool(np.isnan(waveform.values).all())
+        error = np.abs(waveform.values / gain - weights @ whole).max()
+        return bool(error < POINT * window.run.scale)
+
+    def _follows(self, place: Place, step: int) -> Place | str:
+        """Compare with the average before: order, overlap, and an angle that runs on."""
+        last = self.last
+        if last is None or last.run is not place.run:
+            if last is not None and last.run.number > place.run.number:
+                return f'behind one of run {last.run.number}'
+            return place
+        block = place.values['averaging'] == 'block'
+        if place.first < (last.last if block and last.values is place.values else last.first):
+            return f'teeth from {place.first} on, behind teeth {last.first} to {last.last}'
+        if last.values is place.values and place.first == (
+                last.last if block else last.first + step):
+            zeros = place.zeros & last.zeros
+            if not zeros:
+                return 'the angle does not run on'
+            return Place(place.run, place.first, place.last, zeros, place.values)
+        return place
