@@ -677,6 +677,10 @@ def test_counts_of_pulses_outlive_their_validator():
     before = target.pulse_counts
     target.change_pulses(PulseValidator(interval_tolerance=0.2))
     assert target.pulse_counts == before
+    target.change_pulses(PulseValidator())
+    target.add_pulses(np.array([9.0]))  # waits for its like
+    target.change_pulses(PulseValidator())
+    assert target.pulse_counts.unlocked == 1
     assert (before.accepted, before.doubles) == (len(pulses), 1)
     assert target.counts.cycles_dropped == len(pulses) - 1  # they waited for vibration
     target.add_pulses(machine.pulses(1.0, 2.0))

@@ -67,6 +67,11 @@ class IntervalJudge:
         """Whether `take_regular` may be used."""
         return self._calm >= _CALM
 
+    @property
+    def waiting(self) -> int:
+        """Number of pulses not yet matched to the target."""
+        return len(self._pending)
+
     def take_regular(self, pulses: FloatArray) -> int:
         """Accept the regular pulses (n,) with which these begin; return how many there are."""
         assert self._lock is not None

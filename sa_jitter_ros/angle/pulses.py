@@ -9,7 +9,7 @@ fits them and not the old sequence, makes them a new run. If the last pulse had 
 by a regular one, it is that one which is out of order.
 """
 
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from operator import add
 from typing import Literal
 
@@ -138,6 +138,12 @@ class PulseValidator:
         return PulseCounts(
             **self._judge.counts, out_of_order=self._out_of_order, restarts=self._restarts,
             non_finite=self._non_finite, cycles_discarded=self._clock.discarded)
+
+    def finish(self) -> PulseCounts:
+        """Return the counts when no pulse follows: those that still wait are unlocked."""
+        counts = self.counts
+        return replace(
+            counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
 
     def update(self, times: npt.ArrayLike) -> TriggerPulses:
         """

@@ -109,7 +109,7 @@ class StreamingAverager:
 
     def change_pulses(self, validator: PulseValidator) -> None:
         """Go on with another validator: pulses so far are forgotten, the angle starts anew."""
-        self._pulse_counts = self.pulse_counts
+        self._pulse_counts += self.validator.finish()
         self.validator = validator
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
         self._triggers.clear()
