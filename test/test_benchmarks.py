@@ -122,3 +122,39 @@ def test_measured_cases_are_run_as_a_user_does(benchmark, tmp_path):
     assert {line.count('|') for line in lines} == {12}
     assert lines[2].startswith('| used | 5 | none | - | 0.0% |')
     assert cases.error_figure([used]).axes
+
+
+@pytest.mark.slow
+def test_fault_campaign_finds_nothing_and_writes_its_page(
+        benchmark, process_environment, tmp_path):
+    page = tmp_path / 'reliability.md'
+    page.write_text((ROOT / 'docs' / 'reliability.md').read_text())
+    done = subprocess.run(
+        [sys.executable, FOLDER / 'fault_campaign.py', '--scenes', '4', '--seed', '3', '--numbers',
+         tmp_path / 'faults.json', '--page', page, '--figures', tmp_path], capture_output=True,
+        env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
+        timeout=280, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / 'faults.json').read_text())
+    assert sum(found['faults'].values()) > 30
+    assert min(found['averages'].values()) > 10
+    assert '**0 things were wrong**' in page.read_text()
+    assert (tmp_path / 'reliability-faults.png').exists()
+
+
+@pytest.mark.slow
+def test_soak_loses_nothing_and_writes_its_page(process_environment, tmp_path):
+    page = tmp_path / 'reliability.md'
+    page.write_text((ROOT / 'docs' / 'reliability.md').read_text())
+    done = subprocess.run(
+        [sys.executable, FOLDER / 'soak.py', '--minutes', '0.15', '--channels', '2', '--numbers',
+         tmp_path / 'soak.json', '--page', page, '--figures', tmp_path], capture_output=True,
+        env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
+        timeout=200, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads((tmp_path / 'soak.json').read_text())
+    assert len(found['end']) >= found['expected'] > 30
+    assert min(found['latency']) > 0.0
+    assert {'synchronous_averager', 'jitter_predictor', 'source'} == found['rss'].keys()
+    assert '| jitter_predictor |' in page.read_text()
+    assert (tmp_path / 'soak.png').exists()

@@ -1,0 +1,80 @@
+"""Tables and figures of docs/reliability.md from what the fault campaign and the soak found."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+import numpy as np
+from performance_page import table
+
+SETTLED = 60.0  # s after its start from which a node's memory is judged
+
+
+def growth(rss: Sequence[Sequence[float]]) -> tuple[float, float, float]:
+    """Return memory (MB) when settled, at the end, and its trend in MB an hour (NaN if short)."""
+    times, values = np.array(rss).T
+    settled = times > times[0] + SETTLED
+    if np.count_nonzero(settled) < 10:
+        return float(values[0]), float(values[-1]), float('nan')
+    slope = np.polyfit(times[settled], values[settled], 1)[0]
+    return float(values[settled][0]), float(values[-1]), float(3600.0 * slope)
+
+
+# --- the campaign --------------------------------------------------------------------------------
+
+def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
+    """Return the contents of the campaign's sections."""
+    faults, checked = found['faults'], found['checked']
+    rows = [(kind, f'{count:,}', f'{checked[kind]:,}') for kind, count in faults.items()]
+    averages, extra = found['averages'], found['recovery']
+    again = [scenes for scenes in extra if scenes]
+    later = f'; {len(again)} needed up to {max(again)} more' if again else ''
+    summary = (
+        f'{sum(faults.values()):,} faults in {found["scenes"]} scenes and {found["seconds"]:.0f} '
+        f's (seed {found["seed"]}): {sum(averages.values()):,} averages were published and '
+        f'checked ({", ".join(f"{name} {count:,}" for name, count in averages.items())}), '
+        f'**{len(found["wrong"])} things were wrong**, {len(found["died"])} nodes died of '
+        f'themselves. In {len(extra) - len(again)} of {len(extra)} scenes all averages were back '
+        f'within the faultless 1.4 s at its end{later}.')
+    memory = [(role, f'{start:.1f}', f'{end:.1f}', f'{trend:+.1f}')
+              for role, (start, end, trend) in (
+                  (role, growth(rss)) for role, rss in found['rss'] if len(rss) > 20)]
+    return {'campaign': summary,
+            'faults': table(('fault', 'injected', 'averages checked in scenes with it'), rows),
+            'memory': table(('node', f'MB {SETTLED:.0f} s after its start', 'at the end',
+                             'trend in MB an hour'), memory)}
+
+
+def draw_faults(found: Mapping[str, Any], folder: Path) -> None:
+    """Draw faults by kind, and the memory of every process over time."""
+    kinds = list(found['faults'])[::-1]
+    figure = Figure(figsize=(10.0, 0.16 * len(kinds) + 3.6), layout='constrained')
+    bars, memory = figure.subplots(2, 1, height_ratios=(0.16 * len(kinds), 2.6))
+    place = np.arange(len(kinds))
+    bars.barh(place + 0.2, [found['checked'][kind] for kind in kinds], 0.4, color='tab:blue',
+              label='averages checked in scenes with it, all true' if not found['wrong']
+              else 'averages checked in scenes with it')
+    bars.barh(place - 0.2, [found['faults'][kind] for kind in kinds], 0.4, color='tab:orange',
+              label='injected')
+    bars.set_yticks(place, kinds, fontsize=7)
+    bars.set_ylim(-0.6, len(kinds) - 0.4)
+    bars.set_xscale('log')
+    bars.legend(loc='upper center', bbox_to_anchor=(0.5, 1.07), ncols=2, fontsize=8)
+    bars.grid(axis='x', alpha=0.3)
+    roles = list(dict.fromkeys(role for role, _ in found['rss']))
+    for role, rss in found['rss']:
+        if rss:
+            times, values = np.array(rss).T
+            first = role in roles
+            memory.plot(times, values, '.-', markersize=2, linewidth=0.8,
+                        color=f'C{list(dict.fromkeys(r for r, _ in found["rss"])).index(role)}',
+                        label=role if first else None)
+            if first:
+                roles.remove(role)
+    memory.set_xlabel('time [s]; a line ends where its process was killed')
+    memory.set_ylabel('resident memory [MB]')
+    memory.set_ylim(bottom=0.0)
+    memory.legend(fontsize=8, ncols=5)
+    memory.grid(alpha=0.3)
+    figure.savefig(folder / 'reliability-faults.png', dpi=110)

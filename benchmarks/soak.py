@@ -1,0 +1,209 @@
+"""
+Machine time at the highest sustained rate: memory and latency of the nodes over half an hour.
+
+    .venv/bin/python benchmarks/soak.py --minutes 30 --channels 64
+
+Source, averager (on a core of its own) and predictor are processes of their own over DDS. The
+source publishes vibration at 93.75 kHz in real time, as in `graph_speed.py`. Numbers go to
+`out/soak.json`, figure and table to docs/reliability.md. The exit status is 1 if anything was
+dropped, lost or missing.
+"""
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+import json
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+from typing import Any
+
+import graph_speed
+from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
+                         TRIGGER_CYCLES)
+from matplotlib.figure import Figure
+import numpy as np
+from performance_page import fill, table
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from reliability_page import growth, SETTLED
+
+ROOT = Path(__file__).resolve().parents[1]
+SPAN = 30.0  # s over which latencies are summed up
+PERIOD = 5.0  # s between two looks at the memory
+NODES = {
+    'synchronous_averager': {'trigger_cycles': TRIGGER_CYCLES, 'shaft.orders': list(ORDERS)},
+    'jitter_predictor': {'follow_shaft_speed': True, 'trigger_cycles': TRIGGER_CYCLES,
+                         'orders': list(ORDERS)}}
+
+
+def resident(process: int) -> float:
+    """Return the megabytes that a process holds."""
+    status = Path(f'/proc/{process}/status').read_text()
+    return int(next(line for line in status.splitlines() if line.startswith('VmRSS')).split()[1]
+               ) / 1e3
+
+
+@contextmanager
+def nodes(correct: bool) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """Start the nodes, the averager on the last core, and end them by SIGINT."""
+    cores, running = sorted(os.sched_getaffinity(0)), {}
+    try:
+        for name, parameters in NODES.items():
+            code = f'from sa_jitter_ros.nodes.{name} import main; raise SystemExit(main())'
+            arguments = ['--ros-args', '--log-level', 'error']
+            for key, value in parameters.items():
+                arguments += ['-p', f'{key}:={str(value).lower()}']
+            if name == 'synchronous_averager':
+                arguments += ['-p', f'correct_jitter:={str(correct).lower()}']
+            core = cores[-1] if name == 'synchronous_averager' else cores[0]
+            running[name] = subprocess.Popen(
+                [sys.executable, '-c', code, *arguments], text=True,
+                preexec_fn=partial(os.sched_setaffinity, 0, {core}))
+        yield running
+    finally:
+        for process in running.values():
+            process.send_signal(signal.SIGINT)
+        for name, process in running.items():
+            if process.wait(timeout=30.0):
+                raise RuntimeError(f'{name} ended with status {process.returncode}')
+
+
+def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
+         report: Callable[[str], None]) -> dict[str, Any]:
+    """Run for so long; return latencies, memory and what the averager has counted."""
+    os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
+    length = block_samples(channels, block_seconds)
+    context = rclpy.Context()
+    context.init(args=[])
+    sink = Sink(context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(sink.node)
+
+    def spin(until: Callable[[], Any], limit: float) -> bool:
+        end = time.monotonic() + limit
+        while not until() and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.2)
+        return bool(until())
+
+    with nodes(correct) as running:
+        if not spin(lambda: sink.status, 60.0):
+            raise RuntimeError('the averager was not heard within 60 s')
+        source = subprocess.Popen(
+            [sys.executable, graph_speed.__file__, '--publish', str(channels), str(seconds),
+             str(length)], stdout=subprocess.PIPE, text=True)
+        watched = {**{name: item.pid for name, item in running.items()}, 'source': source.pid}
+        rss: dict[str, list[tuple[float, float]]] = {name: [] for name in watched}
+        begin = time.monotonic()
+        while source.poll() is None:
+            for name, process in watched.items():
+                rss[name].append((time.monotonic() - begin, resident(process)))
+            report(f'{time.monotonic() - begin:.0f} of {seconds:.0f} s, {len(sink.ends)} averages')
+            spin(lambda: source.poll() is not None, PERIOD)
+        told = json.loads(source.communicate()[0])
+        spin(lambda: False, 3.0)
+    context.try_shutdown()
+    counts = sink.status[-1][3]
+    return {
+        'channels': channels, 'seconds': seconds, 'correct_jitter': correct,
+        'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': told['latest'],
+        'end': sink.ends, 'latency': [arrival - told['start'] - end for arrival, end in zip(
+            sink.arrivals, sink.ends)],
+        'expected': int((seconds * SPEED - 1) / TRIGGER_CYCLES), 'rss': rss,
+        'counts': {key: int(counts[key]) for key in (*KEYS, 'samples_lost')},
+        'messages': list(dict.fromkeys(item[2] for item in sink.status if item[1]))}
+
+
+# --- the page ------------------------------------------------------------------------------------
+
+def spans(found: Mapping[str, Any]) -> np.ndarray:
+    """Return (span, 4): its middle (s), and the median, 99 % and largest latency (ms) in it."""
+    end, latency = np.array(found['end']), 1e3 * np.array(found['latency'])
+    width = min(SPAN, found['seconds'] / 4.0)
+    number = (end // width).astype(int)
+    return np.array([(width * (k + 0.5), *np.percentile(latency[number == k], (50, 99, 100)))
+                     for k in np.unique(number)])
+
+
+def section(found: Mapping[str, Any]) -> str:
+    """Return the text and tables of the page."""
+    latency = 1e3 * np.array(found['latency'])
+    counted = ', '.join(f'{key} {value}' for key, value in found['counts'].items())
+    jitter = 'with' if found['correct_jitter'] else 'without'
+    text = (
+        f'{found["seconds"] / 60.0:g} minutes at {found["channels"]} channels of {RATE / 1e3:g} '
+        f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {jitter} `correct_jitter`, load '
+        f'average {found["load"][1]}: {len(latency):,} averages of {found["expected"]:,}; latency '
+        f'from the last pulse of an average to its arrival {np.median(latency):.0f} ms in the '
+        f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
+        f'The source was late by up to {1e3 * found["source_late"]:.0f} ms itself. Counted: '
+        f'{counted}.')
+    every = spans(found)
+    every = every[:: max(len(every) // 10, 1)]
+    rows = [(f'{start / 60.0:.2f}', *(f'{value:.0f}' for value in values))
+            for start, *values in every]
+    memory = []
+    for name, rss in found['rss'].items():
+        start, end, trend = growth(rss)
+        memory.append((name, f'{start:.1f}', f'{end:.1f}', f'{trend:+.1f}'))
+    return '\n\n'.join((text, table(('minute', 'latency in ms, median', '99 %', 'largest'), rows),
+                        table(('process', f'MB {SETTLED:.0f} s after its start', 'at the end',
+                               'trend in MB an hour'), memory)))
+
+
+def draw(found: Mapping[str, Any], file: Path) -> None:
+    """Draw latency and memory over time."""
+    figure = Figure(figsize=(9.0, 6.0), layout='constrained')
+    above, below = figure.subplots(2, 1, sharex=True)
+    every = spans(found)
+    for column, name in ((3, 'largest'), (2, '99 %'), (1, 'median')):
+        above.plot(every[:, 0] / 60.0, every[:, column], 'o-', markersize=3, label=name)
+    above.set_ylabel('latency from the last pulse [ms]')
+    above.set_ylim(bottom=0.0)
+    for name, rss in found['rss'].items():
+        times, values = np.array(rss).T
+        below.plot(times / 60.0, values, label=name)
+    below.set_xlabel('time [min]')
+    below.set_ylabel('resident memory [MB]')
+    below.set_ylim(bottom=0.0)
+    for axes in (above, below):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, ncols=3)
+    above.set_title(f'{found["channels"]} channels at {RATE / 1e3:g} kHz, {len(found["end"]):,} '
+                    f'averages of {found["expected"]:,}', fontsize=10)
+    figure.savefig(file, dpi=110)
+
+
+def main() -> int:
+    """Run, keep the numbers, and write the page."""
+    parser = argparse.ArgumentParser(description='Run the averager at full rate for long.')
+    parser.add_argument('--minutes', type=float, default=30.0)
+    parser.add_argument('--channels', type=int, default=64)
+    parser.add_argument('--correct-jitter', action='store_true')
+    parser.add_argument('--block-seconds', type=float, default=0.05, help='of a message, at most')
+    parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'soak.json')
+    parser.add_argument('--page', type=Path, default=ROOT / 'docs' / 'reliability.md')
+    parser.add_argument('--figures', type=Path, default=ROOT / 'docs' / 'figures')
+    parser.add_argument('--only-write', action='store_true', help='from the numbers of last time')
+    options = parser.parse_args()
+    if not options.only_write:
+        found = soak(options.channels, 60.0 * options.minutes, correct=options.correct_jitter,
+                     block_seconds=options.block_seconds,
+                     report=lambda text: print(text, file=sys.stderr, flush=True))
+        options.numbers.parent.mkdir(parents=True, exist_ok=True)
+        options.numbers.write_text(json.dumps(found) + '\n')
+    found = json.loads(options.numbers.read_text())
+    print(section(found))
+    draw(found, options.figures / 'soak.png')
+    options.page.write_text(fill(options.page.read_text(), {'soak': section(found)}))
+    lost = any(found['counts'].values()) or len(found['end']) < found['expected']
+    print('\n'.join(found['messages']))
+    return int(lost)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
