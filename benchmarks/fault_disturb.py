@@ -58,7 +58,6 @@ class Disturber:
         self.faults: list[str] = []
         self.wrong: list[str] = []
         self.rejected = dict.fromkeys(('predictor', 'analyser'), 0)
-        self._latched = False
         self._asked: list[tuple[str, str, Any, bool, Future]] = []
 
     def plan(self, *, kills: bool) -> list[Callable[[], None]]:
@@ -130,7 +129,6 @@ class Disturber:
                                tuple(self.rng.standard_normal(int(self.rng.integers(7)))))
         self._graph.send(topic, message)
         self.rejected['analyser'] += 1
-        self._latched |= topic == 'prediction'
 
     def _stall(self) -> None:
         role = str(self.rng.choice(list(ROLES)))
@@ -143,6 +141,4 @@ class Disturber:
         self._killed(role)
         if role in self.settings:
             self.settings[role][:] = [dict(ROLES[role].parameters)]
-        if role in self.rejected:  # what is latched comes again
-            self.rejected[role] = int(role == 'analyser' and self._latched)
         self._graph.start([role])

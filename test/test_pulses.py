@@ -369,3 +369,23 @@ def test_uneven_cam_locks(shared_data, channel):
 def test_a_few_times_over_and_over_in_any_order(times):
     _, runs, *_ = validate(times, cuts=range(1, len(times)))
     assert all((np.diff(run) > 0.0).all() for run in runs)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_every_pulse_is_counted_once(seed):
+    """Whatever comes: regular stretches, strays, repeats, steps ahead and back, no numbers."""
+    rng = np.random.default_rng(seed)
+    parts, time = [], 0.0
+    for _ in range(40):
+        stretch = time + 0.05 * np.arange(rng.integers(1, 12))
+        parts += [stretch, rng.choice(stretch, 1) + rng.normal(0.0, 0.04, 1),
+                  rng.choice([stretch[-1], np.nan, 1e6], 1)]
+        time = stretch[-1] + rng.choice([0.05, 0.1, 0.065, -3.0, 7.0, 0.0])
+    pulses = np.concatenate(parts)
+    validator = PulseValidator()
+    for block in np.array_split(pulses, 30):
+        validator.update(block)
+    counts = validator.finish()
+    assert pulses.size == sum((
+        counts.accepted, counts.doubles, counts.early, counts.out_of_order, counts.non_finite,
+        counts.unlocked))

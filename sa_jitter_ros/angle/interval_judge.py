@@ -49,13 +49,15 @@ class IntervalJudge:
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
              'unlocked', 'relearnt'), 0)
+        self._pending: list[float] = []  # pulses not yet matched to the target
         self.forget()
 
     def forget(self) -> None:
         """Be ready for a sequence of which nothing is known."""
         self._clock.stop()
         self._lock: Lock | None = None
-        self._pending: list[float] = []  # pulses not yet matched to the target
+        self.counts['unlocked'] += len(self._pending)
+        self._pending = []
         self._recent: deque[float] = deque(maxlen=_AGREEING + 1)  # dropped ones too
         self._intervals: deque[float] = deque(maxlen=3)
         self._slot = 0

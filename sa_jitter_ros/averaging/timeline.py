@@ -83,6 +83,7 @@ class VibrationTimeline:
     _suspect: SampleBlock | None = None
     _odd: tuple[int, float] | None = None
     _clock: Clock | None = None
+    _gap: tuple[int, int] = (0, 0)  # first index left out, and next one that came
 
     @property
     def layout(self) -> tuple[int, float] | None:
@@ -139,10 +140,22 @@ class VibrationTimeline:
         return taken
 
     def epoch_near(self, time: float, earliest: int) -> int:
-        """Epoch, of those from `earliest` on, whose held samples are nearest to a time (s)."""
-        away = [(max(item.start_time - time, time - item.end_time, 0.0), item.epoch)
-                for item in self.stretches if item.epoch >= earliest]
-        return min(away)[1] if away else max(earliest, self.epoch)
+        """
+        Epoch, of those from `earliest` on, whose held samples are nearest to a time (s).
+
+        Of two that overlap it is the earlier one, and beyond its end for as long as they overlap:
+        the last samples before a restart may be lost.
+        """
+        found, away, following = max(earliest, self.epoch), np.inf, np.inf
+        for epoch in sorted({item.epoch for item in self.stretches}, reverse=True):
+            held = [item for item in self.stretches if item.epoch == epoch]
+            begin = min(item.start_time for item in held)
+            end = max(item.end_time for item in held)
+            distance = max(begin - time, time - end - max(end - following, 0.0), 0.0)
+            if epoch >= earliest and distance <= away:
+                found, away = epoch, distance
+            following = begin
+        return found
 
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
@@ -215,6 +228,7 @@ class VibrationTimeline:
     def _new_run(self, block: SampleBlock) -> None:
         self._close()
         if block.start_time <= self.end_time:
+            self._forget_jump_ahead(block)
             self.epoch += 1
             self.counts.restarts += 1
             self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
@@ -224,8 +238,19 @@ class VibrationTimeline:
             self.messages.append(f'source goes on at {block.start_time:.6g} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = Clock(block.start_time, block.index, block.sample_rate)
+        self._gap = 0, 0
         self._store(block.samples, block.index)
         self._last = block
+
+    def _forget_jump_ahead(self, block: SampleBlock) -> None:
+        """A block in the latest gap tells that it was the jump ahead which was wrong."""
+        first, end = self._gap
+        if self._clock is not None and first <= block.index < end and abs(
+                block.start_time - self._clock.time_of(block.index)) <= self.time_tolerance:
+            for item in self.stretches:
+                if item.clock is self._clock and item.index >= end:
+                    self.counts.samples_dropped += item.trim(item.end_index)
+            self._tidy()
 
     def _continue(self, block: SampleBlock) -> None:
         assert self._last is not None
@@ -240,6 +265,7 @@ class VibrationTimeline:
         if block.index > expected:
             self.counts.gaps += 1
             self.counts.samples_lost += block.index - expected
+            self._gap = expected, block.index
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
             self._close()
         # a block that overlaps what was received adds its new part only
