@@ -10,7 +10,8 @@ from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.expectation import expect, Lines
 from sa_jitter_ros.closure.gathering import line_evidence
 from sa_jitter_ros.closure.observation import observe
-from sa_jitter_ros.closure.trace import STEADY, trace
+from sa_jitter_ros.closure.scoring import STEADY
+from sa_jitter_ros.closure.trace import trace
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.errors import SignalError

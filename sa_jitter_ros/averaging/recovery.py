@@ -77,8 +77,8 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
     pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
     pulse error. `orders` restricts the recovery to these; without it, the at most `most_orders`
-    orders are taken that stand out most: integer ones and those in `also`. `with_ripple` fits a speed ripple u (1 - u) of
-    every cycle jointly.
+    orders are taken that stand out most: integer ones and those in `also`. `with_ripple` fits a
+    speed ripple u (1 - u) of every cycle jointly.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     ratio or standard deviation that is not positive.

@@ -243,7 +243,7 @@ class VibrationTimeline:
         self._last = block
 
     def _forget_jump_ahead(self, block: SampleBlock) -> None:
-        """A block in the latest gap tells that it was the jump ahead which was wrong."""
+        """Drop what a wrong jump ahead brought, which a block in the gap before it gives away."""
         first, end = self._gap
         if self._clock is not None and first <= block.index < end and abs(
                 block.start_time - self._clock.time_of(block.index)) <= self.time_tolerance:

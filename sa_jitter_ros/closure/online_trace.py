@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Acquisition, Observation
 from sa_jitter_ros.closure.online import Average, good_lines, named, places
-from sa_jitter_ros.closure.trace import Bench, require_acquisitions, Trace, trace_bench
+from sa_jitter_ros.closure.scoring import Bench
+from sa_jitter_ros.closure.trace import require_acquisitions, Trace, trace_bench
 from sa_jitter_ros.closure.trigger_pulses import TriggerPulses
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.evidence import LineEvidence

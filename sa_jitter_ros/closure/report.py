@@ -6,8 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.closure.candidates import Candidate
 from sa_jitter_ros.closure.residual import Residual
-from sa_jitter_ros.closure.trace import Candidate, Trace
+from sa_jitter_ros.closure.trace import Trace
 from sa_jitter_ros.effects import parameter_ranges
 from sa_jitter_ros.effects.evidence import Finding
 

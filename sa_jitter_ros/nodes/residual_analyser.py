@@ -13,11 +13,12 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
+from sa_jitter_ros.closure.candidates import SIGNIFICANT
 from sa_jitter_ros.closure.online import (Average, Batch, compare, declared_by, Published,
                                           require_comparable)
 from sa_jitter_ros.closure.online_trace import trace_averages
 from sa_jitter_ros.closure.report import report
-from sa_jitter_ros.closure.trace import SIGNIFICANT, Trace
+from sa_jitter_ros.closure.trace import Trace
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.nodes import jitter_predictor

@@ -1,0 +1,124 @@
+"""
+Candidates: every effect that is not there yet, fitted, scored and, mostly, rejected.
+
+An effect is added when its own physical evidence speaks for it, nothing in its goodness of fit
+speaks against it, and the held-out acquisitions are predicted better with it; the one with the
+most specific evidence first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sa_jitter_ros.closure.residual import ACCURACY, Residual
+from sa_jitter_ros.closure.scoring import Bench
+from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.pulse_covariance import log_likelihood
+
+#: A residual with a smaller p value is no chance.
+SIGNIFICANT = 0.02
+_EVIDENCE = 1e-3
+# Held-out pulse errors that are e^7 times likelier by chance are rarer than e^-7.
+_TOLD, _MOVED = 7.0, 0.01
+_DECISIVE, _MATERIAL = 1e-6, 2.0 * ACCURACY
+# Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
+_SAME = 0.01
+# Most specific evidence first: what one sees in the pulse times themselves, then in the order of
+# the pulse errors, then in their size, then in amplitudes.
+_TIERS = (
+    ('missing_pulses',), ('keyphasor_quantisation',), ('target_geometry', 'clock_skew'),
+    ('speed_fluctuation', 'phase_wander'), ('correlated_jitter',), ('excess_jitter',),
+    ('interpolation_loss',), ('amplitude_modulation', 'interfering_tone'), ('additive_noise',))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect in one round: its finding, its score on held-out acquisitions, its rejection."""
+
+    name: str
+    stage: int
+    finding: Finding
+    held_out_score: float | None
+    rejected_because: str
+
+
+def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
+            own: float, significant: bool) -> list[Candidate]:
+    """Fit every effect that is not there yet and score it on the held-out acquisitions."""
+    effects = [finding.effect for finding in chosen if finding.effect is not None]
+    taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
+    number = len(chosen) + 1
+    unneeded = (f'not needed: nothing significant remains (p = {current.p_value:.2g})')
+    found = []
+    for name, kind in EFFECTS.items():
+        if name in taken:
+            continue
+        untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
+        finding = absent(name, untold) if untold else kind.fit(evidence)
+        if finding.effect is None:
+            found.append(Candidate(name, number, finding, None,
+                                   finding.against if significant else unneeded))
+            continue
+        left = bench.unsteadiness([*effects, finding.effect]) if kind.scatters else own
+        score = bench.score([*effects, finding.effect], [*chosen, finding], unsteadiness=left)
+        rejected = finding.against
+        if not rejected and finding.p_value > _EVIDENCE:
+            rejected = f'its evidence may be chance: {finding.evidence}'
+        gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
+            kind.scatters) else ('attenuation', score.score, current.score)
+        p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
+        decisive = own > ACCURACY and left**2 < 0.5 * own**2 if kind.scatters else (
+            _decisive(finding, current, score))
+        told = not kind.scatters and _told(bench, effects, finding, current, score)
+        needed = p_value < SIGNIFICANT or kind.seen or decisive or told
+        moves = kind.scatters or kind.seen or _moved(bench, effects, finding.effect) > ACCURACY
+        if not rejected and not moves:
+            rejected = (f'it is too small to matter: the attenuation of no line changes by more '
+                        f'than {ACCURACY:g}')
+        if not rejected and not needed:
+            rejected = (f'not needed: the {gained} leaves nothing significant '
+                        f'(p = {min(p_value, 1.0):.2g})')
+        if not rejected and not (new > old or told or (kind.seen and new > old - _SAME)):
+            rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
+                        f'{new:.3f} after {old:.3f}')
+        found.append(Candidate(name, number, finding, new, rejected))
+    return found
+
+
+def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
+    """Return the candidate of the first tier that has one, the best score within it."""
+    for tier in _TIERS:
+        left = [item for item in candidates if item.name in tier and not item.rejected_because]
+        if left:
+            return max(left, key=lambda item: item.held_out_score or 0.0)
+    left = [item for item in candidates if not item.rejected_because]
+    return max(left, key=lambda item: item.held_out_score or 0.0) if left else None
+
+
+def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
+    """Return the largest RMS, over the acquisitions, by which an effect moves a prediction."""
+    without, with_it = (bench.expect(known, bench.held_out).attenuation
+                        for known in (effects, [*effects, more]))
+    return float(np.sqrt(np.mean((with_it - without) ** 2, axis=0).max()))
+
+
+def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
+    """Tell whether an effect predicts what the declared model takes for chance."""
+    return (finding.p_value < _DECISIVE and before.rms > _MATERIAL
+            and after.rms < 0.5 * before.rms)
+
+
+def _told(bench: Bench, effects: Sequence[Effect], finding: Finding, before: Residual,
+          after: Residual) -> bool:
+    """
+    Tell whether held-out pulse errors tell an effect that the attenuation is too rough to tell.
+
+    Beside a large effect, the chance of few averages hides another; but it must explain them.
+    """
+    moved = float(np.sqrt(np.mean((after.mean - before.mean) ** 2)))
+    if finding.effect is None or moved < _MOVED or after.p_attenuation < SIGNIFICANT:
+        return False
+    without, with_it = (log_likelihood(bench.gather(known, bench.held_out))
+                        for known in (effects, [*effects, finding.effect]))
+    return with_it - without > _TOLD
