@@ -169,6 +169,15 @@ def test_acceleration_is_fitted_within_its_error(rng):
     check(z_scores(found, acceleration_std=80.0)['acceleration_std'])
 
 
+def test_wandering_source_is_no_acceleration(rng):
+    """The ripple follows the errors in both cases, the pulses only in one."""
+    errors, bump = (3e-4 * item for item in recovered(sines(rng, ACCELERATION_BAND)))
+    found = EFFECTS['speed_fluctuation'].fit(evidence_of(
+        rng, declared(rng) + errors, moving=errors,
+        ripple=bump + rng.normal(0.0, 1e-6, bump.shape), ripple_error=1e-6))
+    assert 'the source moves' in found.against
+
+
 def test_noise_is_fitted_within_its_error(rng):
     found = []
     for _ in range(60):

@@ -156,7 +156,12 @@ def test_speed_fluctuation_has_the_closed_form_at_small_size():
     effect = make_effect('speed_fluctuation', acceleration_std=20.0)
     prediction = predict_with(quiet, [effect])
     cycles = 20.0 / (2.0 * np.pi)
-    loss = (2.0 * np.pi * np.array(MODEL.orders)) ** 2 * 25.0**-4 * cycles**2 / 240.0
+    # 1/240 for a constant acceleration; the share of it that a sine is off its chord by
+    u, turns = np.meshgrid(np.linspace(0.0, 1.0, 401), 2j * np.pi * np.linspace(0.05, 0.2, 101))
+    bend = np.abs((np.exp(turns * u) - 1.0 + u - u * np.exp(turns)) / turns**2) ** 2
+    share = 120.0 * bend[:, :-1].mean()
+    assert share == pytest.approx(0.9703, abs=1e-4)
+    loss = (2.0 * np.pi * np.array(MODEL.orders)) ** 2 * 25.0**-4 * cycles**2 / 240.0 * share
     assert np.abs(prediction.moments.mean) == pytest.approx(1.0 - loss, rel=0.0, abs=0.7 * loss[
         -1] ** 2 + 1e-6)
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import (
-    ACCELERATION_BAND, flat_band_correlation, ripple_of_acceleration)
+    ACCELERATION_BAND, chord_share, flat_band_correlation, ripple_of_acceleration)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import (
@@ -25,8 +25,8 @@ class SpeedFluctuation(Effect):
     """
     Random acceleration of the tach shaft, nearly constant within a trigger cycle.
 
-    The linear law then errs by -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing at the
-    pulses, most in the middle. Other laws err by what the acceleration changes from cycle to
+    The linear law then errs by nearly -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing
+    at the pulses, most in the middle. Other laws err by what the acceleration changes from cycle to
     cycle.
     """
 
@@ -48,7 +48,7 @@ class SpeedFluctuation(Effect):
         """Fit the ripple inside the cycles, which the true pulse times must show as well."""
         model = evidence.model
         curve = np.diff(evidence.times_left - evidence.errors, 2, axis=1)
-        expected = 0.25 * (curve[:, :-1] + curve[:, 1:])  # s, at all cycles but the outer two
+        expected = _inside(curve)  # s, at all cycles but the outer two
         ripple = evidence.ripple[:, 1:-1]
         if not np.all(np.isfinite(ripple)) or expected.size < 12:
             return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
@@ -71,15 +71,24 @@ class SpeedFluctuation(Effect):
         if r**2 * (1.0 + noise / variance) < 0.4:
             against = (f'the acceleration between the pulses explains {r**2:.0%} of the error '
                        'inside the cycles: something faster moves')
+        # Jitter of the pulses has no part in the ripple, a moving source none in the pulses.
+        product = ripple * _inside(np.diff(evidence.times_left, 2, axis=1))
+        share = float(product.mean() / np.mean(ripple * expected))
+        unsure = float(product.std() / np.sqrt(product.size) / abs(np.mean(ripple * expected)))
+        if share < 0.5 and share + 3.0 * unsure < 1.0:
+            against = (f'the pulse times show {share:.0%} +- {unsure:.0%} of the acceleration: '
+                       'the source moves')
         return Finding(cls.name, cls(unit * size), {'acceleration_std': unit * error},
                        float(p_value), text, against)
 
 
 def _of_linear_law(variance: float) -> Covariance:
-    """Return that of the angle for accelerations of `variance`, constant within a cycle."""
+    """Return that of the angle for accelerations of `variance`, nearly constant in a cycle."""
+    size = 0.25 * variance * chord_share(ACCELERATION_BAND)
+
     def covariance(u: Array, v: Array, lag: int) -> Array:
         keep = float(flat_band_correlation(lag, ACCELERATION_BAND))
-        return np.asarray(0.25 * variance * keep * u * (1.0 - u) * v * (1.0 - v))
+        return np.asarray(size * keep * u * (1.0 - u) * v * (1.0 - v))
 
     return covariance
 
@@ -110,3 +119,8 @@ def _of_law(variance: float, weights: PulseWeights) -> Covariance:
 def _cycles(model: DeclaredModel, acceleration: float) -> float:
     """Return an acceleration in rad/s^2 of the tach shaft in trigger cycles/s^2."""
     return acceleration / (2.0 * np.pi * model.trigger_revolutions)
+
+
+def _inside(bends: Array) -> Array:
+    """Return the ripple of cycles that second differences at both their ends make."""
+    return np.asarray(0.25 * (bends[:, :-1] + bends[:, 1:]))
