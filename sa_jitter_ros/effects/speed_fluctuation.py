@@ -26,8 +26,8 @@ class SpeedFluctuation(Effect):
     Random acceleration of the tach shaft, nearly constant within a trigger cycle.
 
     The linear law then errs by nearly -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing
-    at the pulses, most in the middle. Other laws err by what the acceleration changes from cycle to
-    cycle.
+    at the pulses, most in the middle. Other laws err by what the acceleration changes from cycle
+    to cycle.
     """
 
     name: ClassVar[str] = 'speed_fluctuation'
