@@ -30,6 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
 EXTRA = 5  # faultless scenes within which every average must have come back
 HELD = 4  # pulses that may be waiting to be judged
+SLACK = 8  # teeth behind an average until it is published
 
 
 class Campaign:
@@ -108,7 +109,7 @@ class Campaign:
             self._base = {}  # counts again from the next look on
 
     def _check(self, scene: Scene) -> set[Any]:
-        """Check what has come; return the averages that are of the scene's tail."""
+        """Check what has come; return which averages have reached the scene's end."""
         well = set()
         for key, checker in self.checkers.items():
             for amplitude, waveform in self.graph.inboxes[key].take():
@@ -118,12 +119,14 @@ class Campaign:
                     self.wrong.append(f'{key[0]}: {error}')
                     checker.start_anew(amplitude.header.sequence + 1)
                     continue
-                if place.run is scene.run and place.first >= scene.tail:
+                # the last whole average of the scene: little is left in any queue
+                if place.run is scene.run and scene.tail <= place.first and (
+                        2 * place.last - place.first + SLACK >= scene.last):
                     well.add(key)
         return well
 
     def _wait(self, scene: Scene) -> set[Any]:
-        """Wait for averages of the scene's tail; return which have not come."""
+        """Wait for the last averages of the scene; return which have not come."""
         waiting = set(self.checkers)
         waiting -= self._check(scene)
 
