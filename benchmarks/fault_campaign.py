@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
 EXTRA = 5  # faultless scenes within which every average must have come back
 HELD = 4  # pulses that may be waiting to be judged
-SLACK = 8  # teeth behind an average until it is published
+SLACK = 24  # teeth behind an average until it is published: a spline reads eight cycles ahead
 
 
 class Campaign:
@@ -101,9 +101,10 @@ class Campaign:
     def _killed(self, role: str) -> None:
         """Begin anew in all accounts of a node, once what it had published is checked."""
         self._check(self._scene)
-        for (of, _), checker in self.checkers.items():
-            if of == role:
+        for key, checker in self.checkers.items():
+            if key[0] == role:
                 checker.start_anew()
+                self.graph.inboxes[key].forget()
         self._refused.pop(role, None)
         if role == 'direct':
             self._base = {}  # counts again from the next look on

@@ -112,8 +112,9 @@ class Inbox:
         return pairs
 
     def forget(self) -> None:
-        """Drop a half that will not be completed."""
-        self._waves.clear(), self._amplitudes.clear()
+        """Drop what a killed node published only half of."""
+        self._waves.clear()
+        self._amplitudes.clear()
 
 
 class Graph:
@@ -182,7 +183,8 @@ class Graph:
         if not self.spin(lambda: all(self.lives[role].heard for role in roles), 60.0):
             raise RuntimeError(f'{roles} were not heard within 60 s')
         wanted = {'direct': ('vibration', 'tach_pulse'), 'averager': ('vibration',),
-                  'detector': ('tach_waveform',)}
+                  'detector': ('tach_waveform',), 'predictor': ('shaft_speed',),
+                  'analyser': ('shaft/order_amplitude', 'shaft/pulse_error', 'prediction')}
         self.spin(lambda: all(
             self.publishers[topic].get_subscription_count() > before[topic]
             for role in roles for topic in wanted.get(role, ())), 10.0)
