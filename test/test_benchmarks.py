@@ -93,12 +93,15 @@ def test_machines_of_another_simulator_attenuate_as_theory_says(benchmark):
 
 
 @pytest.mark.slow
-def test_loop_is_judged_on_a_machine_of_another_simulator(benchmark, tmp_path):
+@pytest.mark.parametrize(('effects', 'seed', 'row'), [
+    ((), 4, '| declared model | 1 | 1 | 1 - |'),  # an order between the lines of the trigger cycle
+    (('excess_jitter',), 0, '| excess_jitter | 1 | 1 | 1 excess_jitter |')])
+def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, effects, seed, row):
     confusion = benchmark('independent_confusion')
-    run = confusion.judge(('excess_jitter',), 0, tmp_path)
+    run = confusion.judge(effects, seed, tmp_path)
     assert run.right, run
-    assert run.after < 0.2 * run.before
-    assert '| excess_jitter | 1 | 1 | 1 excess_jitter |' in confusion.table([run])
+    assert run.after <= 0.2 * run.before or not effects
+    assert row in confusion.table([run])
 
 
 def test_page_without_a_section_is_refused(benchmark):

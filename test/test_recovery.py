@@ -202,6 +202,15 @@ def test_given_orders_are_the_only_ones(rng):
     assert not recover(cycles, pulses, declared=declared(0.2), orders=[21.5]).accepted
 
 
+def test_a_known_order_of_another_shaft_helps_and_does_not_disturb(rng):
+    errors = jitter(rng, 0.3, count=40)
+    cycles, pulses = simulate(rng, errors, {18: [1.0], 20.3226: [0.9]}, ratio=3.0, noise=0.3)
+    recovery = recover(cycles, pulses, declared=declared(0.3), ratio=3.0, also=[20.3226])
+    assert 20.3226 in recovery.orders
+    # a mean square of 41 normal variables
+    assert np.mean(z_scores(recovery, errors) ** 2) < 1.0 + 4.0 * np.sqrt(2.0 / errors.size)
+
+
 def test_speed_ripple_inside_the_cycle_is_told_from_pulse_errors(rng):
     errors = jitter(rng, 0.2)
     ripple = 4.0 * declared(0.2) * rng.standard_normal(100)
