@@ -9,16 +9,17 @@ import numpy as np
 from performance_page import table
 
 SETTLED = 60.0  # s after its start from which a node's memory is judged
+LONG = 240.0  # s that a node must have lived for a trend
 
 
-def growth(rss: Sequence[Sequence[float]]) -> tuple[float, float, float]:
-    """Return memory (MB) when settled, at the end, and its trend in MB an hour (NaN if short)."""
+def growth(rss: Sequence[Sequence[float]]) -> tuple[str, str, str]:
+    """Return memory (MB) when settled, at the end, and its trend (MB an hour, - if short)."""
     times, values = np.array(rss).T
     settled = times > times[0] + SETTLED
-    if np.count_nonzero(settled) < 10:
-        return float(values[0]), float(values[-1]), float('nan')
-    slope = np.polyfit(times[settled], values[settled], 1)[0]
-    return float(values[settled][0]), float(values[-1]), float(3600.0 * slope)
+    if np.ptp(times) < LONG:
+        return f'{values[settled.argmax()]:.1f}', f'{values[-1]:.1f}', '-'
+    slope = 3600.0 * np.polyfit(times[settled], values[settled], 1)[0]
+    return f'{values[settled][0]:.1f}', f'{values[-1]:.1f}', f'{slope:+.1f}'
 
 
 # --- the campaign --------------------------------------------------------------------------------
@@ -37,9 +38,8 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
         f'**{len(found["wrong"])} things were wrong**, {len(found["died"])} nodes died of '
         f'themselves. In {len(extra) - len(again)} of {len(extra)} scenes all averages were back '
         f'within the faultless 1.4 s at its end{later}.')
-    memory = [(role, f'{start:.1f}', f'{end:.1f}', f'{trend:+.1f}')
-              for role, (start, end, trend) in (
-                  (role, growth(rss)) for role, rss in found['rss'] if len(rss) > 20)]
+    memory = [(role, *growth(rss)) for role, rss in found['rss']
+              if rss and rss[-1][0] - rss[0][0] > LONG]
     return {'campaign': summary,
             'faults': table(('fault', 'injected', 'averages checked in scenes with it'), rows),
             'memory': table(('node', f'MB {SETTLED:.0f} s after its start', 'at the end',

@@ -124,7 +124,7 @@ def spans(found: Mapping[str, Any]) -> np.ndarray:
     """Return (span, 4): its middle (s), and the median, 99 % and largest latency (ms) in it."""
     end, latency = np.array(found['end']), 1e3 * np.array(found['latency'])
     width = min(SPAN, found['seconds'] / 4.0)
-    number = (end // width).astype(int)
+    number = np.minimum(end // width, found['seconds'] // width - 1.0)
     return np.array([(width * (k + 0.5), *np.percentile(latency[number == k], (50, 99, 100)))
                      for k in np.unique(number)])
 
@@ -148,8 +148,7 @@ def section(found: Mapping[str, Any]) -> str:
             for start, *values in every]
     memory = []
     for name, rss in found['rss'].items():
-        start, end, trend = growth(rss)
-        memory.append((name, f'{start:.1f}', f'{end:.1f}', f'{trend:+.1f}'))
+        memory.append((name, *growth(rss)))
     return '\n\n'.join((text, table(('minute', 'latency in ms, median', '99 %', 'largest'), rows),
                         table(('process', f'MB {SETTLED:.0f} s after its start', 'at the end',
                                'trend in MB an hour'), memory)))
@@ -163,7 +162,7 @@ def draw(found: Mapping[str, Any], file: Path) -> None:
     for column, name in ((3, 'largest'), (2, '99 %'), (1, 'median')):
         above.plot(every[:, 0] / 60.0, every[:, column], 'o-', markersize=3, label=name)
     above.set_ylabel('latency from the last pulse [ms]')
-    above.set_ylim(bottom=0.0)
+    above.set_yscale('log')
     for name, rss in found['rss'].items():
         times, values = np.array(rss).T
         below.plot(times / 60.0, values, label=name)
