@@ -93,9 +93,9 @@ class Campaign:
             self.graph.send(topic, message)
             if number % 20 == 0:
                 self._check(scene)
-        for _, topic, message in scene.events:
-            if topic == 'tach_pulse':
-                self._expected['pulses' if message.source == KEYPHASOR else 'foreign'] += 1
+        self._expected['pulses'] += sum(
+            topic == 'tach_pulse' and message.source == KEYPHASOR
+            for _, topic, message in scene.events)
         self._expected['messages_rejected'] += scene.rejected
 
     def _killed(self, role: str) -> None:

@@ -132,7 +132,6 @@ class FaultySource:
         span = first / RATE, end / RATE
         if faults:
             self._spoil_teeth(scene, run, span)
-        # a run's first blocks tell that it is one: they are whole, as the last ones of a piece
         for topic, make in (('vibration', run.block), ('tach_waveform', run.waveform)):
             lag = 0.0 if topic == 'vibration' else self._lags[1]
             for index, message in self._blocks(scene, topic, make, first, end, faults):
@@ -155,7 +154,7 @@ class FaultySource:
             blocks.append(make(first, min(size, end - first)))
             first += len(blocks[-1].samples[0])
         kinds, weights = list(BLOCKS), np.array(list(BLOCKS.values()), dtype=float)
-        number, calm = 0, 2
+        number, calm = 0, 2  # the first two tell that it is another run
         while number < len(blocks):
             block = blocks[number]
             if (not faults or number < calm or number > len(blocks) - 5 or rng.random() > 0.4):

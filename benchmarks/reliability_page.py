@@ -8,18 +8,18 @@ from matplotlib.figure import Figure
 import numpy as np
 from performance_page import table
 
-SETTLED = 60.0  # s after its start from which a node's memory is judged
+MEMORY = ('MB half way', 'at the end', 'trend between in MB an hour')
 LONG = 240.0  # s that a node must have lived for a trend
 
 
 def growth(rss: Sequence[Sequence[float]]) -> tuple[str, str, str]:
-    """Return memory (MB) when settled, at the end, and its trend (MB an hour, - if short)."""
+    """Return memory (MB) half way and at the end, and the trend between (MB an hour)."""
     times, values = np.array(rss).T
-    settled = times > times[0] + SETTLED
-    if np.ptp(times) < LONG:
-        return f'{values[settled.argmax()]:.1f}', f'{values[-1]:.1f}', '-'
-    slope = 3600.0 * np.polyfit(times[settled], values[settled], 1)[0]
-    return f'{values[settled][0]:.1f}', f'{values[-1]:.1f}', f'{slope:+.1f}'
+    later = times >= times.mean()
+    trend = '-'
+    if np.ptp(times) >= LONG:
+        trend = f'{3600.0 * np.polyfit(times[later], values[later], 1)[0]:+.1f}'
+    return f'{values[later][0]:.1f}', f'{values[-1]:.1f}', trend
 
 
 # --- the campaign --------------------------------------------------------------------------------
@@ -42,8 +42,7 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
               if rss and rss[-1][0] - rss[0][0] > LONG]
     return {'campaign': summary,
             'faults': table(('fault', 'injected', 'averages checked in scenes with it'), rows),
-            'memory': table(('node', f'MB {SETTLED:.0f} s after its start', 'at the end',
-                             'trend in MB an hour'), memory)}
+            'memory': table(('node', *MEMORY), memory)}
 
 
 def draw_faults(found: Mapping[str, Any], folder: Path) -> None:

@@ -30,7 +30,7 @@ import numpy as np
 from performance_page import fill, table
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from reliability_page import growth, SETTLED
+from reliability_page import growth, MEMORY
 
 ROOT = Path(__file__).resolve().parents[1]
 SPAN = 30.0  # s over which latencies are summed up
@@ -150,8 +150,7 @@ def section(found: Mapping[str, Any]) -> str:
     for name, rss in found['rss'].items():
         memory.append((name, *growth(rss)))
     return '\n\n'.join((text, table(('minute', 'latency in ms, median', '99 %', 'largest'), rows),
-                        table(('process', f'MB {SETTLED:.0f} s after its start', 'at the end',
-                               'trend in MB an hour'), memory)))
+                        table(('process', *MEMORY), memory)))
 
 
 def draw(found: Mapping[str, Any], file: Path) -> None:
