@@ -61,6 +61,12 @@ class NodeBench:
         assert self.spin(lambda: self.handled >= self.sent)
         self.spin(timeout=0.03)
 
+    def diagnostics_when_asked(self):
+        """Stop the node's status at 1 Hz: a status tells only what came since the one before."""
+        for timer in self.node.timers:
+            if timer.callback == self.node.publish_diagnostics:
+                timer.cancel()
+
     def diagnostics(self):
         """Return level, message and values of the node's status now."""
         self.settle()

@@ -274,6 +274,7 @@ def malformed():
     pytest.param(message, says, id=name) for name, message, says in malformed()])
 def test_malformed_block_is_rejected_with_its_reason_and_nothing_else(bench, message, says):
     b = bench()
+    b.diagnostics_when_asked()
 
     def with_it(number, block):
         return [block, message] if number == 5 else [block]
