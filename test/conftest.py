@@ -61,9 +61,11 @@ def executor_for(ros_context):
     """
     Return a function that puts nodes into one single-threaded executor.
 
-    ``spin = executor_for(node, other)`` returns ``spin(until, timeout=10.0)``, which serves
+    ``spin = executor_for(node, other)`` returns ``spin(until, timeout=60.0)``, which serves
     callbacks until ``until()`` is true and returns whether it was so before ``timeout`` seconds:
-    ``assert spin(lambda: len(received) == 3)``. The nodes are destroyed after the test.
+    ``assert spin(lambda: len(received) == 3)``. ``spin.settle(seen)`` serves them until what
+    ``seen()`` returns stays the same: all that was sent in this process has then arrived, however
+    busy the machine is. The nodes are destroyed after the test.
     """
     executors = pytest.importorskip('rclpy.executors')
     made = []
@@ -74,7 +76,7 @@ def executor_for(ros_context):
         for node in nodes:
             executor.add_node(node)
 
-        def spin(until=lambda: False, timeout=10.0):
+        def spin(until=lambda: False, timeout=60.0):
             deadline = time.monotonic() + timeout
             while not until():
                 if time.monotonic() > deadline:
@@ -82,6 +84,13 @@ def executor_for(ros_context):
                 executor.spin_once(timeout_sec=0.02)
             return True
 
+        def settle(seen, rounds=40):
+            same, last = 0, seen()
+            while same < rounds:  # a round serves one of the callbacks that are ready
+                executor.spin_once(timeout_sec=0.001)
+                same, last = (same + 1 if seen() == last else 0), seen()
+
+        spin.settle = settle
         return spin
 
     yield executor_of

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+from bench import BENCH_QOS
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import pytest
@@ -10,7 +11,6 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.nodes import messages, recording_player
-from sa_jitter_ros.nodes.base import INPUT_QOS
 from sa_jitter_ros.nodes.playback import Pacer
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
 from sa_jitter_ros.recordings import ArraySource, Recording, write_npz
@@ -50,7 +50,7 @@ class Bench:
                  lambda m: self.waveform.append(other.decode(m))),
                 (pulse, 'tach_pulse', self._on_pulse),
                 (DiagnosticArray, '/diagnostics', lambda m: self.status.append(m.status[0]))):
-            self.bench.create_subscription(kind, topic, callback, INPUT_QOS)
+            self.bench.create_subscription(kind, topic, callback, BENCH_QOS)
         self.spin = executor_for(self.node, self.bench)
 
     def _on_pulse(self, message):
@@ -66,7 +66,7 @@ class Bench:
     def play(self):
         """Play to the end and let the last messages come in."""
         assert self.spin(self.ended)
-        self.spin(timeout=0.2)
+        self.spin.settle(lambda: (len(self.blocks), len(self.waveform), len(self.pulses)))
 
     def samples(self):
         """Return the received samples, checked to be without gaps."""

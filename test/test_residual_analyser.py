@@ -3,7 +3,7 @@
 from dataclasses import replace
 import json
 
-from bench import NodeBench
+from bench import BENCH_QOS, NodeBench
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
@@ -220,7 +220,7 @@ class AnalyserBench(NodeBench):
         """Publish a prediction."""
         self.prediction.publish(messages.encode_prediction(
             prediction_message(predict_with(replace(MODEL, **changes)))))
-        self.spin(timeout=0.1)
+        self.settle()
 
     def average(self, averages, *, corrected=True):
         """Publish averages."""
@@ -352,7 +352,7 @@ def test_bad_messages_are_counted(bench):
                     messages.encode_prediction(replace(table, values=table.values[:, :6])),
                     messages.encode_prediction(replace(table, trigger_speed=float('nan')))):
         b.prediction.publish(message)
-        b.spin(timeout=0.1)
+        b.settle()
     assert b.status()['messages_rejected'] == 10
     assert b.diagnostics()[2]['averages'] == '0'
 
@@ -421,6 +421,7 @@ class Chain:
         self.bench = Node('bench', context=context)
         self.vibration = self.bench.create_publisher(Float64MultiArray, 'vibration', INPUT_QOS)
         self.tach = self.bench.create_publisher(Float64MultiArray, 'tach_pulse', INPUT_QOS)
+        self.bench.create_subscription(Float64MultiArray, 'vibration', self._hear, BENCH_QOS)
         self.residuals, self.reports = [], []
         self.bench.create_subscription(
             Float64MultiArray, 'residual',
@@ -431,7 +432,10 @@ class Chain:
         self.spin = executor_for(self.averager, self.predictor, self.analyser, self.bench)
         assert self.spin(lambda: self.vibration.get_subscription_count()
                          and self.tach.get_subscription_count())
-        self.at = 0
+        self.at = self.heard = 0
+
+    def _hear(self, block):
+        self.heard += block.layout.dim[1].size
 
     def play(self, until):
         """Play the machine in blocks of a quarter of a second until something has happened."""
@@ -444,7 +448,7 @@ class Chain:
             self.vibration.publish(messages.encode_samples(messages.SampleBlock(
                 self.machine.vibration(self.at, self.at + size), start, self.rate, self.at)))
             self.at += size
-            self.spin(timeout=0.01)
+            assert self.spin(lambda: self.heard >= self.at)
         raise AssertionError(f'nothing happened: {self.analyser.summary()}')
 
 

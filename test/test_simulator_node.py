@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 
+from bench import BENCH_QOS
 import numpy as np
 import pytest
 from rclpy.node import Node
@@ -14,7 +15,6 @@ from rclpy.parameter import Parameter
 from sa_jitter_ros.effects import EFFECTS, parameter_ranges
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
-from sa_jitter_ros.nodes.base import INPUT_QOS
 from sa_jitter_ros.nodes.machine_simulator import EFFECT_DEFAULTS, MachineSimulator
 from sa_jitter_ros.simulation import effects as simulation_effects
 from sensor_msgs.msg import TimeReference
@@ -36,16 +36,17 @@ class Bench:
             decoder = messages.SampleDecoder('std_msgs/Float64MultiArray', sample_rate=0.0)
             self.bench.create_subscription(
                 Float64MultiArray, topic,
-                lambda m, items=items, decoder=decoder: items.append(decoder.decode(m)), INPUT_QOS)
+                lambda m, items=items, decoder=decoder: items.append(decoder.decode(m)),
+                BENCH_QOS)
         self.bench.create_subscription(
             TimeReference, 'tach_pulse',
-            lambda m: self.pulses.extend(messages.decode_pulse_reference(m)[0]), INPUT_QOS)
+            lambda m: self.pulses.extend(messages.decode_pulse_reference(m)[0]), BENCH_QOS)
         self.spin = executor_for(self.node, self.bench)
 
     def play(self):
         """Simulate to the end and let the last messages come in."""
         assert self.spin(lambda: not self.node.get_parameter('playing').value)
-        self.spin(timeout=0.2)
+        self.spin.settle(lambda: (len(self.pulses), *map(len, self.received.values())))
 
     def samples(self, topic):
         """Return the samples of a topic, checked to be on time and without gaps."""

@@ -44,7 +44,8 @@ def play(b, samples, *, size=250, start=0.0, index=0, skip=(),
             b.send('tach_waveform', encode(SampleBlock(
                 samples[None, first:first + size], start + first / RATE, RATE, index + first)))
     b.settle()
-    b.spin(timeout=0.15)  # pulses found at once are sent in portions
+    assert b.spin(lambda: not b.node._waiting)  # pulses found at once are sent in portions
+    b.settle()
 
 
 def pulses(b):
