@@ -19,8 +19,10 @@ import time
 from typing import Any
 
 from fault_check import ShaftChecker, WrongAverageError
+from fault_correction import check_correction
 from fault_disturb import Disturber
 from fault_graph import Graph, ROLES, SHAFTS
+from fault_residual import check_report, ResidualChecker
 from fault_source import FaultySource, KEYPHASOR, Scene
 import numpy as np
 from performance_page import fill
@@ -45,6 +47,8 @@ class Campaign:
                               delivered=key[0] == 'direct') for key in SHAFTS}
         self.faults: Counter[str] = Counter()
         self.checked: Counter[str] = Counter()  # averages of scenes with a fault, by its kind
+        self.corrected: Counter[str] = Counter()  # averages by what became of their correction
+        self.residuals, self.verdicts = ResidualChecker(), Counter[str]()
         self.wrong = self.disturber.wrong  # to which both add
         self._scene = Scene(self.source.runs[-1])
         self.recovery: list[int] = []  # faultless scenes that were needed, scene by scene
@@ -72,6 +76,7 @@ class Campaign:
         self.recovery.append(extra)
         self.wrong += [f'{key}: no average after {EXTRA} faultless scenes' for key in waiting]
         self.disturber.settle()
+        self._check_residuals()
         self.graph.watch()
         self.faults += faults
         for kind in faults:
@@ -113,13 +118,19 @@ class Campaign:
         """Check what has come; return which averages have reached the scene's end."""
         well = set()
         for key, checker in self.checkers.items():
-            for amplitude, waveform in self.graph.inboxes[key].take():
+            settings = self.disturber.settings[key[0]]
+            for received in self.graph.inboxes[key].take():
                 try:
-                    place = checker.check(amplitude, waveform)
+                    place = checker.check(received.amplitude, received.waveform)
+                    corrected = check_correction(key[1], received, place, settings)
                 except WrongAverageError as error:
                     self.wrong.append(f'{key[0]}: {error}')
-                    checker.start_anew(amplitude.header.sequence + 1)
+                    checker.start_anew(received.amplitude.header.sequence + 1)
                     continue
+                if corrected:
+                    self.residuals.add_average(received.amplitude)
+                if settings[-1].get('correct_jitter'):
+                    self.corrected['corrected' if corrected else 'refused'] += 1
                 # the last whole average of the scene: little is left in any queue
                 if place.run is scene.run and scene.tail <= place.first and (
                         2 * place.last - place.first + SLACK >= scene.last):
@@ -138,10 +149,33 @@ class Campaign:
         self.graph.spin(come, 4.0)
         return waiting
 
+    def _check_residuals(self) -> None:
+        """Check what predictor and analyser have published."""
+        graph = self.graph
+        residuals, graph.residuals = graph.residuals, []
+        reports, graph.reports = graph.reports, []
+        graph.spin(lambda: False, 0.1)  # what they are of was sent before and has come by then
+        self._check(self._scene)
+        for prediction in graph.predictions:
+            self.residuals.add_prediction(prediction)
+        graph.predictions.clear()
+        for residual in residuals:
+            self._try(lambda residual=residual: self.residuals.check(residual))
+        for text in reports:
+            self._try(lambda text=text: self.verdicts.update([check_report(text)]))
+
+    def _try(self, check: Callable[[], None]) -> None:
+        try:
+            check()
+        except WrongAverageError as error:
+            self.wrong.append(str(error))
+
     def account(self) -> None:
         """Compare what `direct` and the others have counted with what was sent."""
         status = self.graph.quiet_status('direct')
         self._check(self._scene)
+        self.wrong += [f'{key}: {inbox.left} messages of no average'
+                       for key, inbox in self.graph.inboxes.items() if inbox.left]
         if self._base:
             grown = {key: int(value) - int(self._base[key]) for key, value in status.items()
                      if value.isdecimal() and self._base.get(key, '').isdecimal()}
@@ -190,7 +224,8 @@ def run(seed: int, scenes: int, report: Callable[[str], None]) -> dict[str, Any]
         'averages': {f'{role} {shaft}': checker.checked
                      for (role, shaft), checker in campaign.checkers.items()},
         'wrong': campaign.wrong, 'died': graph.died, 'statuses': statuses,
-        'recovery': campaign.recovery, 'heard': graph.heard,
+        'recovery': campaign.recovery, 'corrected': dict(campaign.corrected),
+        'residuals': campaign.residuals.checked, 'verdicts': dict(campaign.verdicts),
         'rss': [(role, life.rss) for role, life in lives]}
 
 

@@ -36,6 +36,25 @@ class Place:
     values: Mapping[str, Any]
 
 
+def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
+                    values: Mapping[str, Any], gain: FloatArray) -> bool:
+    """Whether a waveform is the mean of a window that begins `start` trigger cycles from 0."""
+    r, count = window.cycles, window.trigger_cycles
+    whole = window.waveforms(start, waveform.values.shape[1])
+    told = len(whole)
+    if values['averaging'] == 'exponential':
+        told = min(told, int(count * r))
+        weights = exponential_weights(len(whole), max(count * r, 1.0))
+    else:
+        weights = equal_weights(len(whole))
+    if waveform.header.fundamental_cycles != told:
+        return False
+    if not len(whole):
+        return bool(np.isnan(waveform.values).all())
+    error = np.abs(waveform.values / gain - weights @ whole).max()
+    return bool(error < POINT * window.run.scale)
+
+
 class ShaftChecker:
     """
     Checks the averages of one shaft of one averager, in the order in which they come.
@@ -156,30 +175,13 @@ class ShaftChecker:
             fits = [int(start) for start in starts[error < limit] if start >= length - count]
             # the waveform knows the angle but for whole turns
             turns = {start: round(start * window.cycles % 1.0, 9) % 1.0 for start in fits}
-            agrees = {turn: self._waveform_agrees(
+            agrees = {turn: waveform_agrees(
                 window.latest(length), start - (length - count), waveform, values, gain)
                 for turn, start in {turn: start for start, turn in turns.items()}.items()}
             zeros = frozenset(first - start * step for start in fits if agrees[turns[start]])
             if zeros:
                 return self._follows(Place(run, first, first + count * step, zeros, values), step)
         return f'amplitudes off by {best:.3g} (limit {limit:.3g}), or the waveform is'
-
-    def _waveform_agrees(self, window: Window, start: int, waveform: AverageMessage,
-                         values: Mapping[str, Any], gain: FloatArray) -> bool:
-        r, count = window.cycles, window.trigger_cycles
-        whole = window.waveforms(start, waveform.values.shape[1])
-        told = len(whole)
-        if values['averaging'] == 'exponential':
-            told = min(told, int(count * r))
-            weights = exponential_weights(len(whole), max(count * r, 1.0))
-        else:
-            weights = equal_weights(len(whole))
-        if waveform.header.fundamental_cycles != told:
-            return False
-        if not len(whole):
-            return bool(np.isnan(waveform.values).all())
-        error = np.abs(waveform.values / gain - weights @ whole).max()
-        return bool(error < POINT * window.run.scale)
 
     def _follows(self, place: Place, step: int) -> Place | str:
         """Compare with the average before: order, overlap, and an angle that runs on."""

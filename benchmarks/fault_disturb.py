@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from fault_graph import Graph, ORDERS, ROLES
+from fault_graph import Graph, ORDERS, ROLES, TOLD
 import numpy as np
 from rclpy.task import Future
 from sa_jitter_ros.nodes.messages import encode_array
@@ -17,16 +17,17 @@ VALID: dict[str, list[tuple[str, list[Any]]]] = {
         ('pulses_per_trigger', [0, 1, 2]), ('missing_pulses', ['break', 'bridge']),
         ('interval_tolerance', [0.2, 0.25, 0.28]), ('gear.samples_per_revolution', [0, 300, 512]),
         ('tach.mesh_orders', [[5.0], [12.0]]), ('keyphasor_rate', [0.0, 6400.0])],
-    'averager': [('trigger_cycles', [4, 6, 8]), ('shaft.orders', [ORDERS, [1.0, 5.0]]),
+    'averager': [('trigger_cycles', [4, 6, 6]), ('shaft.orders', [TOLD, [1.0, 5.0]]),
                  ('correct_jitter', [True, False]), ('keyphasor_rate', [0.0, 6400.0])],
     'predictor': [
-        ('trigger_cycles', [6, 40]), ('orders', [ORDERS, [1.0, 40.0]]), ('ratio', [1.0, 2.40789]),
+        ('trigger_cycles', [4, 6, 6]), ('orders', [TOLD, [1.0, 40.0]]),
+        ('ratio', [1.0, 1.0, 2.40789]),
         ('effects.excess_jitter.std', [1e-6, 2e-5]),
         ('effects.excess_jitter.enabled', [True, False]),
         ('jitter_distribution', ['uniform', 'normal', 'triangular'])],
     'detector': [('hysteresis', [0.1, 0.3]), ('minimum_interval', [0.0, 1e-3]),
                  ('learning_time', [0.2, 0.3])],
-    'analyser': [('acquisitions', [5, 20, 30])]}
+    'analyser': [('acquisitions', [4, 5, 6]), ('close_loop', [True, False])]}
 INVALID: dict[str, list[tuple[str, Any]]] = {
     'direct': [
         ('trigger_cycles', 0), ('trigger_cycles', 'many'), ('averaging', 'median'),

@@ -6,6 +6,7 @@ The graph under test: every node a process of its own over DDS, as its console s
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 import os
 from pathlib import Path
@@ -16,7 +17,9 @@ import time
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
+from fault_machine import MESH
 from graph_speed import free_domain
+import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
@@ -25,7 +28,8 @@ from rclpy.qos import QoSProfile
 from rclpy.task import Future
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.nodes.base import INPUT_QOS, LATCHED_QOS
-from sa_jitter_ros.nodes.messages import AverageMessage, decode_average
+from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
+                                          decode_residual, PredictionMessage, ResidualMessage)
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float64, Float64MultiArray, String
 
@@ -36,8 +40,9 @@ AVERAGER: dict[str, Any] = {
     'averaging': 'block', 'missing_pulses': 'break', 'keyphasor': 'keyphasor'}
 DIRECT = {**AVERAGER, 'shafts': ['tach', 'gear'], 'gear.ratio': 2.40789, 'tach.ratio': 1.0,
           'tach.orders': ORDERS, 'gear.orders': ORDERS}
-DETECTED = {**AVERAGER, 'shaft.orders': ORDERS, 'shaft.ratio': 1.0, 'correct_jitter': True}
-MODEL = {'pulses_per_revolution': 2, 'trigger_cycles': CYCLES, 'orders': ORDERS,
+TOLD = [1.0, 5.0, MESH]
+DETECTED = {**AVERAGER, 'shaft.orders': TOLD, 'shaft.ratio': 1.0, 'correct_jitter': True}
+MODEL = {'pulses_per_revolution': 2, 'trigger_cycles': CYCLES, 'orders': TOLD,
          'follow_shaft_speed': True, 'keyphasor_rate': 6400.0}
 DETECTOR = {'automatic_threshold': False, 'threshold': 0.5, 'learning_time': 0.3}
 
@@ -59,11 +64,13 @@ ROLES = {
     'averager': Role('synchronous_averager', 'synchronous_averager', DETECTED, (
         'tach_pulse:=detected_pulse',)),
     'predictor': Role('jitter_predictor', 'jitter_predictor', MODEL),
-    'analyser': Role('residual_analyser', 'residual_analyser', {'acquisitions': 20}),
+    'analyser': Role('residual_analyser', 'residual_analyser', {'acquisitions': 4}),
 }
 #: Topics of the averages that are checked, by role and shaft.
 SHAFTS = {('direct', 'tach'): 'direct/tach', ('direct', 'gear'): 'direct/gear',
           ('averager', 'shaft'): 'shaft'}
+#: What of an average is looked at; the latter two come with a corrected one only.
+KINDS = ('order_amplitude', 'synchronous_average', 'corrected_average', 'pulse_error')
 
 
 def shown(value: Any) -> str:
@@ -82,39 +89,53 @@ class Life:
     rss: list[tuple[float, float]] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Received:
+    """An average as its topics carry it."""
+
+    amplitude: AverageMessage
+    waveform: AverageMessage
+    corrected: AverageMessage | None
+    pulse_error: AverageMessage | None
+
+
 class Inbox:
-    """Averages of one shaft as they come: amplitudes and waveforms, paired in their order."""
+    """Averages of one shaft as they come; what belongs together is put together in its order."""
 
     def __init__(self, node: Any, topic: str) -> None:
-        self.malformed = 0
-        self._waves: list[AverageMessage] = []
-        self._amplitudes: list[AverageMessage] = []
+        self._waiting: dict[str, list[AverageMessage]] = {kind: [] for kind in KINDS}
         deep = QoSProfile(depth=1000, reliability=INPUT_QOS.reliability)
-        node.create_subscription(Float64MultiArray, f'{topic}/synchronous_average',
-                                 self._on_waveform, deep)
-        node.create_subscription(Float64MultiArray, f'{topic}/order_amplitude',
-                                 self._on_amplitude, deep)
+        for kind in KINDS:
+            node.create_subscription(Float64MultiArray, f'{topic}/{kind}', self._taking(kind),
+                                     deep)
 
-    def _on_waveform(self, message: Float64MultiArray) -> None:
-        self._waves.append(decode_average('synchronous_average', message))
+    def _taking(self, kind: str) -> Callable[[Float64MultiArray], None]:
+        def take(message: Float64MultiArray) -> None:
+            with suppress(MessageError):  # nonsense that was sent to the analyser
+                self._waiting[kind].append(decode_average(kind, message))
+        return take
 
-    def _on_amplitude(self, message: Float64MultiArray) -> None:
-        try:
-            self._amplitudes.append(decode_average('order_amplitude', message))
-        except MessageError:
-            self.malformed += 1
-
-    def take(self) -> list[tuple[AverageMessage, AverageMessage]]:
-        """Return the pairs that are complete."""
-        count = min(len(self._waves), len(self._amplitudes))
-        pairs = list(zip(self._amplitudes[:count], self._waves[:count]))
-        del self._amplitudes[:count], self._waves[:count]
-        return pairs
+    def take(self) -> list[Received]:
+        """Return the averages that are complete."""
+        found, waiting = [], self._waiting
+        while all(waiting[kind] for kind in KINDS[:2]):
+            corrected = bool(np.isfinite(waiting['order_amplitude'][0].values[..., 3:7]).any())
+            kinds = KINDS if corrected else KINDS[:2]
+            if not all(waiting[kind] for kind in kinds):
+                break
+            found.append(Received(*(waiting[kind].pop(0) if kind in kinds else None
+                                    for kind in KINDS)))
+        return found
 
     def forget(self) -> None:
         """Drop what a killed node published only half of."""
-        self._waves.clear()
-        self._amplitudes.clear()
+        for messages in self._waiting.values():
+            messages.clear()
+
+    @property
+    def left(self) -> int:
+        """Messages that belong to no complete average."""
+        return sum(map(len, self._waiting.values()))
 
 
 class Graph:
@@ -141,19 +162,28 @@ class Graph:
                 ('shaft/pulse_error', Float64MultiArray, INPUT_QOS),
                 ('prediction', Float64MultiArray, LATCHED_QOS))}
         self.inboxes = {key: Inbox(self.node, topic) for key, topic in SHAFTS.items()}
-        self.heard = dict.fromkeys(('prediction', 'residual', 'missing_effect'), 0)
-        for topic, kind in (('prediction', Float64MultiArray), ('residual', Float64MultiArray),
-                            ('missing_effect', String)):
-            self.node.create_subscription(kind, topic, self._counting(topic), LATCHED_QOS
-                                          if topic != 'residual' else INPUT_QOS)
+        self.predictions: list[PredictionMessage] = []
+        self.residuals: list[ResidualMessage] = []
+        self.reports: list[str] = []
+        deep = QoSProfile(depth=100, reliability=INPUT_QOS.reliability)
+        for topic, kind, take in (
+                ('prediction', Float64MultiArray, self._on_prediction),
+                ('residual', Float64MultiArray, self._on_residual),
+                ('missing_effect', String, self._on_report)):
+            self.node.create_subscription(kind, topic, take, deep)
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
         self._clients = {role: AsyncParameterClient(self.node, f'/{item.name}')
                          for role, item in ROLES.items()}
 
-    def _counting(self, topic: str) -> Callable[[Any], None]:
-        def count(message: Any) -> None:
-            self.heard[topic] += 1
-        return count
+    def _on_prediction(self, message: Float64MultiArray) -> None:
+        with suppress(MessageError):  # nonsense that was sent to the analyser
+            self.predictions.append(decode_prediction(message))
+
+    def _on_residual(self, message: Float64MultiArray) -> None:
+        self.residuals.append(decode_residual(message))
+
+    def _on_report(self, message: String) -> None:
+        self.reports.append(message.data)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -21,6 +21,7 @@ TEETH = 2  # pulses in a revolution
 SWELL_RATE = 0.11  # Hz
 EDGE = 4.0 / RATE  # s that an edge of the tach waveform takes
 WIDTH = 10.0 / RATE  # s of a pulse at half its height
+MESH = 30.0  # order of the tach shaft that tells of the pulses
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(160)
 NODES, WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 
@@ -32,8 +33,9 @@ class Run:
 
     Sample i has the header time `clock` + i / `RATE` and the index `index` + i, tooth j passes at
     `first_tooth` + j / (`TEETH` `speed`). `components` are (order of the tach shaft, amplitude,
-    phase); channel c holds c + 1 times as much. `displaced` (s) and `missing` are teeth, `strays`
-    pulses (tau) that no tooth made, `lost` spans (tau) without vibration.
+    phase); channel c holds c + 1 times as much. `jitter` (s) and `displaced` (s) are errors of
+    teeth, others are `missing`; `strays` are pulses (tau) that no tooth made, `lost` spans (tau)
+    without vibration.
     """
 
     number: int
@@ -44,6 +46,7 @@ class Run:
     channels: int
     components: tuple[tuple[float, float, float], ...]
     begin: float = 0.0
+    jitter: dict[int, float] = field(default_factory=dict)
     displaced: dict[int, float] = field(default_factory=dict)
     missing: set[int] = field(default_factory=set)
     undelivered: set[int] = field(default_factory=set)
@@ -90,8 +93,12 @@ class Run:
 
     def times(self, teeth: NDArray[np.int64]) -> FloatArray:
         """Return when (tau) the keyphasor shows these teeth."""
-        return self.first_tooth + teeth / (TEETH * self.speed) + np.array(
-            [self.displaced.get(int(tooth), 0.0) for tooth in teeth])
+        return self.first_tooth + teeth / (TEETH * self.speed) + self.errors(teeth)
+
+    def errors(self, teeth: NDArray[np.int64]) -> FloatArray:
+        """Return how much later (s) than it passes the keyphasor shows each tooth."""
+        return np.array([self.jitter.get(tooth, 0.0) + self.displaced.get(tooth, 0.0)
+                         for tooth in teeth.tolist()])
 
     def tooth_at(self, time: float) -> int | None:
         """Return the tooth, be it missing, whose pulse has this header time (s), or None."""

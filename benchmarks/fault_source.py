@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fault_machine import RATE, Run, TEETH
+from fault_machine import MESH, RATE, Run, TEETH
 import numpy as np
 from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.nodes.messages import encode_pulse_reference, encode_samples
@@ -25,6 +25,8 @@ BLOCKS = {'lost': 3, 'repeated': 2, 'swapped': 2, 'late': 2, 'not finite': 2, 'l
 TEETH_FAULTS = ('missing', 'double', 'stray', 'displaced', 'far displaced')
 PULSES = ('lost', 'repeated', 'swapped', 'late', 'foreign', 'wild')
 SPACING = 8  # teeth between two faults of teeth or pulses
+JITTER = 1.0 / RATE  # s, width of the errors that all teeth have: those of a keyphasor at `RATE`
+STEADY = 24  # teeth at the end of a scene without them: the next law may read eight cycles back
 REJECTED = ('layout', 'header', 'channels', 'rate')  # messages that are refused as such
 
 
@@ -46,7 +48,7 @@ class Scene:
 
 
 class FaultySource:
-    """Sends scene after scene; `runs` is the truth, `displace` allows displaced pulses."""
+    """Sends scene after scene; `runs` is the truth, `displace` allows errors of pulses."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
@@ -70,7 +72,7 @@ class FaultySource:
         size = rng.uniform(1.0, 4.0)
         components = tuple(
             (order, float(size * rng.uniform(0.3, 1.0)), float(rng.uniform(-np.pi, np.pi)))
-            for order in (1.0, 5.0, 5.0 * 2.40789))
+            for order in (1.0, 5.0, 5.0 * 2.40789, MESH))
         self._arrival += now
         self._sample = 0
         self.runs.append(Run(len(self.runs), speed, clock, index, first, channels, components))
@@ -130,6 +132,10 @@ class FaultySource:
         run, first = self.runs[-1], self._sample
         end = first + round(seconds * RATE)
         span = first / RATE, end / RATE
+        if self.displace:
+            teeth = run.teeth(*span).tolist()[:None if faults else -STEADY]
+            errors = self.rng.uniform(-0.5, 0.5, len(teeth)) * JITTER
+            run.jitter.update(zip(teeth, errors.tolist()))
         if faults:
             self._spoil_teeth(scene, run, span)
         for topic, make in (('vibration', run.block), ('tach_waveform', run.waveform)):
