@@ -1,5 +1,6 @@
 """The vibration's time line: what it keeps, in order and whole, of blocks that go wrong."""
 
+from contextlib import suppress
 import math
 
 from hypothesis import given, strategies as st
@@ -146,6 +147,38 @@ def test_swapped_blocks_lose_the_late_one():
     assert held(timeline) == [(0, 0.0, 99.0), (0, 200.0, 399.0)]
     assert (timeline.counts.gaps, timeline.counts.repeats) == (1, 1)
     assert 'samples 100 to 199 are repeated or out of order: dropped' in timeline.messages[-1]
+
+
+FATES = ('good', 'lost', 'late', 'repeated', 'wrong time', 'refused', 'twice late')
+
+
+@given(st.lists(st.tuples(st.sampled_from(FATES), st.integers(1, 3)), max_size=8))
+def test_every_sample_that_is_not_used_is_counted_once(fates):
+    """As lost or as dropped, whatever becomes of every fourth block."""
+    sent, counts = [], [10 + 7 * k for k in range(4 * len(fates) + 5)]
+    starts = np.concatenate(([0], np.cumsum(counts))).tolist()
+    lost = came = 0
+    for number, (start, count) in enumerate(zip(starts, counts)):
+        fate, later = fates[number // 4] if number % 4 == 1 and number // 4 < len(fates) else (
+            'good', 0)
+        good = block(start, count)
+        arrivals = {'lost': (), 'repeated': (number, number), 'late': (number + later + 0.5,),
+                    'twice late': 2 * (number + later + 0.5,)}.get(fate, (number,))
+        bad = {'wrong time': block(start, count, time=start / RATE + 9.0),
+               'refused': block(start, count, channels=2)}.get(fate, good)
+        sent += [(arrival, bad) for arrival in arrivals]
+        lost += count if fate in ('lost', 'late', 'twice late') else 0
+        came += count * len(arrivals)
+    timeline = VibrationTimeline()
+    for _, item in sorted(sent, key=lambda event: event[0]):
+        with suppress(SignalError):
+            timeline.add(item)
+    total = timeline.counts
+    assert total.samples_lost == lost
+    late = sum(counts[4 * k + 1] for k, (fate, _) in enumerate(fates) if 'late' in fate)
+    assert came - late == sum(len(item.samples) for item in timeline.stretches) + (
+        total.samples_dropped)
+    assert total.restarts == 0
 
 
 @pytest.mark.parametrize('length', [100, 150, 1000])

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.sample_ledger import SampleLedger
 from sa_jitter_ros.averaging.stretch import Clock, Stretch
 from sa_jitter_ros.errors import SignalError
 
@@ -43,7 +44,7 @@ class TimelineCounts:
     What happened to the samples so far.
 
     `samples_dropped` were received and entered no average, `samples_lost` are those that the jumps
-    of the index (`gaps`) left out.
+    of the index (`gaps`) left out, be it that they come too late. None is counted as both.
     """
 
     samples_dropped: int = 0
@@ -84,6 +85,7 @@ class VibrationTimeline:
     _odd: tuple[int, float] | None = None
     _clock: Clock | None = None
     _gap: tuple[int, int] = (0, 0)  # first index left out, and next one that came
+    _ledger: SampleLedger = field(default_factory=SampleLedger)
 
     @property
     def layout(self) -> tuple[int, float] | None:
@@ -104,7 +106,8 @@ class VibrationTimeline:
             changed = self._check(block)
         except SignalError:
             self.counts.blocks_rejected += 1
-            self.counts.samples_dropped += block.samples.shape[-1] if block.samples.ndim else 0
+            if block.samples.ndim == 2:
+                self._count_unused(block)
             raise
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
@@ -222,8 +225,11 @@ class VibrationTimeline:
 
     def _drop(self, block: SampleBlock, why: str) -> None:
         self.counts.repeats += 1
-        self.counts.samples_dropped += block.samples.shape[1]
+        self._count_unused(block)
         self.messages.append(f'samples {block.index} to {block.end_index - 1} {why}: dropped')
+
+    def _count_unused(self, block: SampleBlock) -> None:
+        self.counts.samples_dropped += self._ledger.drop((block.index, block.end_index))
 
     def _new_run(self, block: SampleBlock) -> None:
         self._close()
@@ -238,7 +244,7 @@ class VibrationTimeline:
             self.messages.append(f'source goes on at {block.start_time:.6g} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = Clock(block.start_time, block.index, block.sample_rate)
-        self._gap = 0, 0
+        self._gap, self._ledger = (0, 0), SampleLedger()
         self._store(block.samples, block.index)
         self._last = block
 
@@ -264,8 +270,8 @@ class VibrationTimeline:
             return
         if block.index > expected:
             self.counts.gaps += 1
-            self.counts.samples_lost += block.index - expected
             self._gap = expected, block.index
+            self.counts.samples_lost += self._ledger.lose(self._gap)
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
             self._close()
         # a block that overlaps what was received adds its new part only
