@@ -47,7 +47,7 @@ class Campaign:
                               delivered=key[0] == 'direct') for key in SHAFTS}
         self.faults: Counter[str] = Counter()
         self.checked: Counter[str] = Counter()  # averages of scenes with a fault, by its kind
-        self.corrected: Counter[str] = Counter()  # averages by what became of their correction
+        self.corrected = Counter(corrected=0, refused=0)  # averages with `correct_jitter`
         self.residuals, self.verdicts = ResidualChecker(), Counter[str]()
         self.wrong = self.disturber.wrong  # to which both add
         self._scene = Scene(self.source.runs[-1])

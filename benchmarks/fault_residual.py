@@ -49,7 +49,7 @@ class ResidualChecker:
         if not (table.size and np.isfinite(table).all() and 0.0 <= message.p_value <= 1.0):
             raise WrongResidualError(f'residual: {message}')
         order, observed, _, difference, _, z = table.T
-        close = dict(rtol=ROUNDING, atol=ROUNDING)
+        close = {'rtol': ROUNDING, 'atol': ROUNDING}
         if not (np.allclose(message.rms, np.sqrt(np.mean(difference**2)), **close)
                 and np.allclose(z, difference / table[:, 4], **close)):
             raise WrongResidualError(f'residual does not agree with itself: {message}')

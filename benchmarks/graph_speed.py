@@ -110,6 +110,7 @@ class Sink:
     def __init__(self, context: rclpy.Context) -> None:
         self.node = rclpy.create_node('sink', context=context)
         self.ends: list[float] = []
+        self.sequences: list[int] = []
         self.arrivals: list[float] = []
         self.status: list[tuple[float, int, str, dict[str, str]]] = []
         self.node.create_subscription(Float64MultiArray, 'shaft/synchronous_average',
@@ -119,6 +120,7 @@ class Sink:
     def _on_average(self, message: Float64MultiArray) -> None:
         self.arrivals.append(time.monotonic())
         self.ends.append(message.data[1])
+        self.sequences.append(int(message.data[2]))
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -29,6 +29,7 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
     faults, checked = found['faults'], found['checked']
     rows = [(kind, f'{count:,}', f'{checked[kind]:,}') for kind, count in faults.items()]
     averages, extra = found['averages'], found['recovery']
+    corrected, verdicts = found['corrected'], found['verdicts']
     again = [scenes for scenes in extra if scenes]
     later = f'; {len(again)} needed up to {max(again)} more' if again else ''
     summary = (
@@ -36,7 +37,11 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
         f's (seed {found["seed"]}): {sum(averages.values()):,} averages were published and '
         f'checked ({", ".join(f"{name} {count:,}" for name, count in averages.items())}), '
         f'**{len(found["wrong"])} things were wrong**, {len(found["died"])} nodes died of '
-        f'themselves. In {len(extra) - len(again)} of {len(extra)} scenes all averages were back '
+        f'themselves. Of the averages with `correct_jitter`, {corrected["corrected"]:,} were '
+        f'corrected and {corrected["refused"]:,} refused; {found["residuals"]:,} residuals were '
+        f'recomputed and {sum(verdicts.values()):,} traces looked through '
+        f'({", ".join(f"{name} {count:,}" for name, count in verdicts.items())}). In '
+        f'{len(extra) - len(again)} of {len(extra)} scenes all averages were back '
         f'within the faultless 1.4 s at its end{later}.')
     memory = [(role, *growth(rss)) for role, rss in found['rss']
               if rss and rss[-1][0] - rss[0][0] > LONG]

@@ -31,10 +31,12 @@ from performance_page import fill, table
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from reliability_page import growth, MEMORY
+from sa_jitter_ros.nodes.base import RESULT_QOS
 
 ROOT = Path(__file__).resolve().parents[1]
 SPAN = 30.0  # s over which latencies are summed up
 PERIOD = 5.0  # s between two looks at the memory
+PUBLISHED = TRIGGER_CYCLES / SPEED  # s from one average to the next
 NODES = {
     'synchronous_averager': {'trigger_cycles': TRIGGER_CYCLES, 'shaft.orders': list(ORDERS)},
     'jitter_predictor': {'follow_shaft_speed': True, 'trigger_cycles': TRIGGER_CYCLES,
@@ -111,7 +113,8 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
     return {
         'channels': channels, 'seconds': seconds, 'correct_jitter': correct,
         'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': told['latest'],
-        'end': sink.ends, 'latency': [arrival - told['start'] - end for arrival, end in zip(
+        'end': sink.ends, 'sequence': sink.sequences, 'published': int(counts['averages']),
+        'latency': [arrival - told['start'] - end for arrival, end in zip(
             sink.arrivals, sink.ends)],
         'expected': int((seconds * SPEED - 1) / TRIGGER_CYCLES), 'rss': rss,
         'counts': {key: int(counts[key]) for key in (*KEYS, 'samples_lost')},
@@ -129,16 +132,38 @@ def spans(found: Mapping[str, Any]) -> np.ndarray:
                      for k in np.unique(number)])
 
 
+def overwritten(found: Mapping[str, Any]) -> tuple[int, float]:
+    """
+    Return how many published averages did not arrive, and the shortest silence (s) around one.
+
+    A silence is the longest time between two arrivals of those that have part in the period in
+    which an average should have come.
+    """
+    sequence, end = np.array(found['sequence']), np.array(found['end'])
+    absent = np.setdiff1d(np.arange(found['published']), sequence)
+    arrival = np.concatenate(([-np.inf], end + np.array(found['latency']), [np.inf]))
+    due = np.interp(absent, sequence, end)
+    silences = [np.diff(arrival[after - 1:until + 1]).max() for after, until in zip(
+        np.searchsorted(arrival, due), np.searchsorted(arrival, due + PUBLISHED))]
+    return len(absent), float(min(silences, default=np.inf))
+
+
 def section(found: Mapping[str, Any]) -> str:
     """Return the text and tables of the page."""
     latency = 1e3 * np.array(found['latency'])
     counted = ', '.join(f'{key} {value}' for key, value in found['counts'].items())
+    absent, silence = overwritten(found)
+    silences = '' if not absent else (
+        f': they were due while nothing came for {silence:.1f} s or more, and a topic keeps the '
+        f'newest {RESULT_QOS.depth}, here of {RESULT_QOS.depth * PUBLISHED:g} s')
     jitter = 'with' if found['correct_jitter'] else 'without'
     text = (
         f'{found["seconds"] / 60.0:g} minutes at {found["channels"]} channels of {RATE / 1e3:g} '
         f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {jitter} `correct_jitter`, load '
-        f'average {found["load"][1]}: {len(latency):,} averages of {found["expected"]:,}; latency '
-        f'from the last pulse of an average to its arrival {np.median(latency):.0f} ms in the '
+        f'average {found["load"][1]}: {found["published"]:,} averages were published, at '
+        f'least {found["expected"]:,} were due; {absent:,} did not reach the watcher{silences}. '
+        f'The latency '
+        f'from the last pulse of an average to its arrival is {np.median(latency):.0f} ms in the '
         f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
         f'The source was late by up to {1e3 * found["source_late"]:.0f} ms itself. Counted: '
         f'{counted}.')
@@ -172,7 +197,7 @@ def draw(found: Mapping[str, Any], file: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, ncols=3)
     above.set_title(f'{found["channels"]} channels at {RATE / 1e3:g} kHz, {len(found["end"]):,} '
-                    f'averages of {found["expected"]:,}', fontsize=10)
+                    f'averages of {found["published"]:,}', fontsize=10)
     figure.savefig(file, dpi=110)
 
 

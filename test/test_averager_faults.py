@@ -6,18 +6,24 @@ thousand; here they go to one node in this process, so that its counts can be re
 """
 
 from collections import Counter
+from dataclasses import replace
+import json
 
 from bench import AveragerBench
 from fault_check import ShaftChecker, WrongAverageError
-from fault_graph import DIRECT, ORDERS
+from fault_correction import check_correction
+from fault_graph import DETECTED, DIRECT, Inbox, KINDS, ORDERS
 from fault_machine import RATE
+from fault_residual import check_report, ResidualChecker, WrongResidualError
 from fault_source import FaultySource, KEYPHASOR
 from machine import Machine
 import numpy as np
 import pytest
 from rclpy.qos import QoSProfile
 from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.closure.online import compare, Published
 from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.residual_analyser import average_of
 
 SHAFTS = ('tach', 'gear')
 JUDGED = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
@@ -153,6 +159,104 @@ def test_the_check_sees_what_is_wrong(ros_context, executor_for):
     assert checker.check(*pairs[0]).first >= 0
     with pytest.raises(WrongAverageError, match='sequence'):  # one of them is missing
         checker.check(*pairs[2])
+
+
+@pytest.fixture
+def corrected(ros_context, executor_for):
+    """Return averages with their corrections, and the places where they were found."""
+    settings = [dict(DETECTED)]
+    options = {name.replace('.', '__'): value for name, value in DETECTED.items()}
+    b = AveragerBench(ros_context, executor_for, result_qos=QoSProfile(depth=1000), **options)
+    inbox = Inbox(b.bench, 'shaft')
+    assert b.spin(lambda: all(b.bench.count_publishers(f'shaft/{kind}') for kind in KINDS))
+    source = FaultySource(np.random.default_rng(3))
+    checker = ShaftChecker('shaft', source.runs, settings, delivered=True)
+    for scene in (source.scene(), source.scene(changes=False, faults=False)):
+        for _, topic, message in scene.events:
+            if topic != 'tach_waveform':
+                b.send(topic, message)
+        b.settle()
+    found = [(item, checker.check(item.amplitude, item.waveform)) for item in inbox.take()]
+    assert inbox.left == 0
+    return [(item, place) for item, place in found
+            if check_correction('shaft', item, place, settings)]
+
+
+def with_value(message, place, change):
+    """Return a message with one element of its values changed by a function."""
+    values = message.values.copy()
+    values[place] = change(values[place])
+    return replace(message, values=values)
+
+
+def test_the_check_of_corrected_averages_sees_what_is_wrong(corrected):
+    assert len(corrected) > 5
+    item, place = corrected[-1]
+    assert np.abs(item.pulse_error.values[:, 1]).max() > 2e-5
+    errors = item.pulse_error.values
+    spoilt = {
+        'not those between': [
+            replace(item, amplitude=with_value(item.amplitude, (0, 2, 3), lambda x: 1.01 * x)),
+            replace(item, amplitude=with_value(item.amplitude, (0, 2, 4), lambda x: x + 0.01)),
+            replace(item, corrected=with_value(item.corrected, (0, 7), lambda x: x + 0.2))],
+        'standard errors apart': [
+            replace(item, pulse_error=with_value(  # without being less sure
+                item.pulse_error, (2, 1), lambda x: x + 8.0 * errors[2, 2])),
+            replace(item, pulse_error=with_value(
+                item.pulse_error, (slice(None), 1), lambda x: x + 1e-6))],
+        'attenuation is': [replace(item, amplitude=with_value(
+            item.amplitude, (0, 2, 5), lambda x: x + 0.05))],
+        'are not those of': [replace(item, pulse_error=with_value(
+            item.pulse_error, (3, 0), lambda x: x + 1e-6))],
+        'are not of': [replace(item, pulse_error=corrected[-2][0].pulse_error),
+                       replace(item, corrected=corrected[-2][0].corrected)]}
+    for what, wrong in spoilt.items():
+        for received in wrong:
+            with pytest.raises(WrongAverageError, match=what):
+                check_correction('shaft', received, place, [DETECTED])
+    with pytest.raises(WrongAverageError, match='without correct_jitter'):
+        check_correction('shaft', item, place, [{**DETECTED, 'correct_jitter': False}])
+
+
+def test_the_check_of_residuals_sees_what_is_wrong(corrected):
+    amplitudes = [item.amplitude for item, _ in corrected]
+    order = amplitudes[0].values[0, :, 0]
+    table = np.stack((order, *np.tile([[0.9], [0.01], [0.1], [0.8], [0.9], [1.0]], 3)), axis=1)
+    prediction = messages.PredictionMessage(table, 25.0, RATE, 6, 1.0, 4.5e-5, 0.0)
+    checker = ResidualChecker()
+    checker.add_prediction(prediction)
+    for amplitude in amplitudes:
+        checker.add_average(amplitude)
+    rows, found = compare([average_of(item) for item in amplitudes[-4:]], Published(
+        order, table[:, 1], table[:, 3], 25.0, RATE, 6, 1.0, 4.5e-5))
+    residual = messages.ResidualMessage(rows, 4, found.chi2_per_dof, found.p_value, found.rms)
+    checker.check(residual)
+    assert checker.checked == 1
+    for change, says in (({'acquisitions': 3}, 'of no averages'), ({'p_value': 1.5}, 'residual'),
+                         ({'rms': 1.1 * found.rms}, 'agree with itself'),
+                         ({'chi2_per_dof': 1.1 * found.chi2_per_dof}, 'of no averages')):
+        with pytest.raises(WrongResidualError, match=says):
+            checker.check(replace(residual, **change))
+    for column in range(6):
+        with pytest.raises(WrongResidualError):
+            checker.check(with_value(residual, (1, column), lambda x: 1.01 * x + 0.001))
+
+
+def test_the_check_of_reports_sees_what_is_wrong():
+    whole = {'declared': {}, 'acquisitions': {'fit': 2, 'held_out': 2}, 'orders': [1.0],
+             'missing_effects': [], 'candidates': [], 'error_before': {}, 'error_after': {},
+             'verdict': 'none'}
+    assert check_report(json.dumps(whole)) == 'none'
+    effect = {'name': 'clock_skew', 'evidence': 'it drifts', 'p_value': 1e-5,
+              'parameters': {'skew': {'value': None}}}
+    for change, says in (({'verdict': 'maybe'}, 'maybe'), ({'verdict': 'traced'}, 'traced'),
+                         ({'orders': [float('nan')]}, 'NaN'),
+                         ({'verdict': 'traced', 'missing_effects': [effect]}, 'clock_skew')):
+        with pytest.raises(WrongResidualError, match=says):
+            check_report(json.dumps({**whole, **change}))
+    del whole['candidates']
+    with pytest.raises(WrongResidualError, match='candidates'):
+        check_report(json.dumps(whole))
 
 
 def test_node_goes_on_after_nonsense_of_every_kind(ros_context, executor_for):

@@ -141,8 +141,22 @@ def test_fault_campaign_finds_nothing_and_writes_its_page(
     found = json.loads((tmp_path / 'faults.json').read_text())
     assert sum(found['faults'].values()) > 30
     assert min(found['averages'].values()) > 10
+    assert found['corrected']['corrected'] > 5
+    assert found['residuals'] > 0
+    assert sum(found['verdicts'].values()) > 0
     assert '**0 things were wrong**' in page.read_text()
     assert (tmp_path / 'reliability-faults.png').exists()
+
+
+def test_soak_tells_which_averages_a_full_queue_lost(benchmark):
+    soak = benchmark('soak')
+    sequence = [k for k in range(40) if k not in (20, 21)]  # of a silence that 12 averages filled
+    latency = [max(0.02, 8.0 - 0.25 * (k + 1)) if 20 <= k < 32 else 0.02 for k in sequence]
+    found = {'sequence': sequence, 'end': [0.25 * (k + 1) for k in sequence], 'latency': latency,
+             'published': 40}
+    assert soak.overwritten(found) == (2, pytest.approx(8.0 - 5.02))
+    every = {key: list(range(40)) for key in ('sequence', 'end', 'latency')}
+    assert soak.overwritten({**every, 'published': 40}) == (0, np.inf)
 
 
 @pytest.mark.slow
@@ -158,6 +172,7 @@ def test_soak_loses_nothing_and_writes_its_page(process_environment, tmp_path):
     found = json.loads((tmp_path / 'soak.json').read_text())
     assert len(found['end']) >= found['expected'] > 30
     assert min(found['latency']) > 0.0
+    assert found['sequence'] == list(range(found['published']))
     assert {'synchronous_averager', 'jitter_predictor', 'source'} == found['rss'].keys()
     assert '| jitter_predictor |' in page.read_text()
     assert (tmp_path / 'soak.png').exists()
