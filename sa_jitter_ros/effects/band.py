@@ -49,18 +49,6 @@ def ripple_of_acceleration(band: tuple[float, float]) -> float:
     return float(np.sqrt(weight @ (_recovered(frequency)[1] / (2.0 * np.pi * frequency)**2)**2))
 
 
-def chord_share(band: tuple[float, float]) -> float:
-    """
-    Return the mean square that an accelerated motion is off its chords between pulses.
-
-    It is in parts of 1/120, that of a constant unit acceleration.
-    """
-    frequency, weight = _even(band)
-    u, turn = _RULE[0][:, None], 2j * np.pi * frequency
-    off = (np.exp(turn * u) - (1.0 - u) - u * np.exp(turn)) / turn**2
-    return float(120.0 * _RULE[1] @ np.abs(off) ** 2 @ weight)
-
-
 def _even(band: tuple[float, float]) -> tuple[Array, Array]:
     u, weight = _RULE
     return band[0] + (band[1] - band[0]) * u, weight

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.band import (
-    ACCELERATION_BAND, chord_share, flat_band_correlation, ripple_of_acceleration)
+from sa_jitter_ros.effects.band import ACCELERATION_BAND, ripple_of_acceleration
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import (
@@ -39,9 +38,8 @@ class SpeedFluctuation(Effect):
         """Return the error of the angle law."""
         size = _cycles(model, self.acceleration_std) * model.trigger_period**2
         variance = (size * model.cycle_length) ** 2
-        covariance = (_of_linear_law(variance) if model.angle_law == 'linear'
-                      else _of_law(variance, model.weights))
-        return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
+        return (GaussianAngleError(_left_by(model.weights, variance),
+                                   min(_MEMORY, model.trigger_cycles)),)
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -82,20 +80,9 @@ class SpeedFluctuation(Effect):
                        float(p_value), text, against)
 
 
-def _of_linear_law(variance: float) -> Covariance:
-    """Return that of the angle for accelerations of `variance`, nearly constant in a cycle."""
-    size = 0.25 * variance * chord_share(ACCELERATION_BAND)
-
-    def covariance(u: Array, v: Array, lag: int) -> Array:
-        keep = float(flat_band_correlation(lag, ACCELERATION_BAND))
-        return np.asarray(size * keep * u * (1.0 - u) * v * (1.0 - v))
-
-    return covariance
-
-
-def _of_law(variance: float, weights: PulseWeights) -> Covariance:
+def _left_by(weights: PulseWeights, variance: float) -> Covariance:
     """
-    Return that of the angle for accelerations of `variance`, by the spectrum of what is left.
+    Return that of the angle which a law leaves of accelerations of `variance`, by its spectrum.
 
     Of a motion of f cycles a trigger cycle a law follows what its weights make of it at the
     pulses; the acceleration is (2 pi f)^2 times the motion.
@@ -111,7 +98,7 @@ def _of_law(variance: float, weights: PulseWeights) -> Covariance:
 
     def covariance(u: Array, v: Array, lag: int) -> Array:
         later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
-        return np.asarray(variance * np.sum(missed(u).conj() * later, axis=-1).real)
+        return np.asarray(variance * np.einsum('...f,...f', missed(u).conj(), later).real)
 
     return covariance
 
