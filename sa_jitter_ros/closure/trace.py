@@ -20,6 +20,7 @@ from sa_jitter_ros.closure.residual import Residual
 from sa_jitter_ros.closure.scoring import Bench
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.evidence import Evidence, Finding
+from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -28,6 +29,7 @@ Progress = Callable[[str], None]
 
 _MOST_EFFECTS = 4
 _FEWEST = 4
+_SAME_CLOCK = 0.01
 
 
 @dataclass(frozen=True)
@@ -142,9 +144,25 @@ def _bench(observation: Observation, observations: Sequence[Observation],
     group = channel_groups(observation)
     known = [gather_pulses(recording, item, group)
              for recording, item in zip(recordings, observations)]
+    clock = _one_clock([found for found, _ in known])
     orders = observation.orders.size
     corrected = np.abs(observation.stacked('corrected')[..., :orders])
     level = lines.of(corrected[list(fit)].mean(axis=0))
     return Bench(observation, lines, level, [row for _, rows in known for row in rows],
-                 known[0][0], group, line_evidence(observation, lines), fit, held_out,
+                 clock, group, line_evidence(observation, lines), fit, held_out,
                  tuple(declared))
+
+
+def _one_clock(clocks: Sequence[Clock]) -> Clock:
+    """Return the clock of all recordings; raise ModelError where they have different ones."""
+    first = clocks[0]
+    for number, other in enumerate(clocks[1:], start=2):
+        if abs(other.rate - first.rate) > _SAME_CLOCK * first.rate:
+            raise ModelError(f'pulse times of recording 1 lie on {_grid(first)}, those of '
+                             f'recording {number} on {_grid(other)}: one declared model holds for '
+                             'one clock; run the loop on each alone')
+    return first
+
+
+def _grid(clock: Clock) -> str:
+    return f'a grid of {clock.rate:.6g} Hz' if clock.rate else 'no coarse grid'
