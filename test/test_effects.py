@@ -134,6 +134,17 @@ def test_geometry_counts_missing_pulses():
     assert late == pytest.approx([1.0, 2.0, 1.0, 2.0])
 
 
+@pytest.mark.parametrize(('before', 'after'), [(2, 1), (0, 0)])
+def test_pulses_without_those_beside_are_the_same_pulses(before, after):
+    missing = np.array([0, 1, 0, 2, 0, 0, 0, 0, 1])
+    pulses = Pulses(0.04 * np.arange(10.0), 3, np.arange(10.0), missing)
+    kept = pulses.without(before, after)
+    own = slice(before, 10 - after)
+    for name in ('times', 'errors', 'index'):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(pulses, name)[own])
+    np.testing.assert_array_equal(np.diff(kept.index), 1 + kept.missing)
+
+
 def test_geometry_counts_pulses_and_not_triggers():
     model = DeclaredModel(**{**vars(MODEL), 'pulses_per_revolution': 6, 'pulses_per_trigger': 2})
     effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))

@@ -83,6 +83,8 @@ def test_parameter_change_is_published_at_once(bench):
     ({'orders': ['a']}, 'orders'),
     ({'trigger_cycles': 0}, 'trigger_cycles'),
     ({'effects.interpolation_loss.enabled': True}, 'declare sample_rate'),
+    ({'angle_law': 'cubic'}, 'one of linear, quadratic, spline'),
+    ({'angle_law': 'spline', 'effects.missing_pulses.enabled': True}, 'no forward model'),
 ])
 def test_inconsistent_parameters_are_refused_with_the_reason(bench, change, reason):
     b = bench()
@@ -93,6 +95,13 @@ def test_inconsistent_parameters_are_refused_with_the_reason(bench, change, reas
     assert b.set_parameters(trigger_cycles=31).successful
     assert b.spin(lambda: len(b.received) == 2)
     np.testing.assert_array_equal(b.received[-1].values, expected(trigger_cycles=31))
+
+
+def test_angle_law_is_that_of_the_averager(bench):
+    b = bench()
+    assert b.set_parameters(angle_law='spline').successful
+    assert b.spin(lambda: len(b.received) == 2)
+    np.testing.assert_array_equal(b.received[-1].values, expected(angle_law='spline'))
 
 
 def test_speed_is_followed_when_asked(bench):

@@ -132,7 +132,8 @@ def test_known_pulse_errors_make_the_angle_error_of_the_law(law, rng):
     beside = np.concatenate((np.full(weights.before, errors[0]), errors,
                              np.full(weights.after, errors[-1])))
     pulses = np.arange(beside.size) + beside
-    path = weights.path(errors, U)
+    path = weights.path(errors, U, 12)
+    np.testing.assert_array_equal(path, weights.path(beside, U, 12))
     assert path.shape == (12, U.size)
     for k, row in enumerate(path):
         at = weights.before + k

@@ -208,9 +208,10 @@ def _angle_errors(evidence: Evidence, u: Array) -> Array:
 
     The ripple is that between lines from pulse to pulse, part of which other laws follow.
     """
-    even = evidence.period * np.arange(evidence.errors.shape[1])
-    late = evidence.times - evidence.times[:, :1] - even
-    read = evidence.model.weights.path(late, u) - LINEAR.path(late - evidence.errors, u)
+    cycles = evidence.errors.shape[1] - 1
+    late = evidence.times - evidence.times[:, :1] - evidence.period * np.arange(cycles + 1)
+    read = (evidence.model.weights.path(late, u, cycles)
+            - LINEAR.path(late - evidence.errors, u, cycles))
     ripple = np.where(np.isfinite(evidence.ripple), evidence.ripple, 0.0)[:, :, None]
     return np.asarray(read + ripple * u * (1.0 - u))
 

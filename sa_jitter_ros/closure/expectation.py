@@ -210,7 +210,7 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
     e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()
     u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
-    offset = model.weights.path(e, u)
+    offset = model.weights.path(e, u, count)
     cycle = np.arange(count)[:, None]
     table = np.zeros((observation.orders.size, sources.size), complex)
     for s, source in enumerate(sources):

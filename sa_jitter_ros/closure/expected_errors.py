@@ -93,7 +93,7 @@ def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect,
     processes = jitter_processes(model, effects)
     first = np.abs(joint_characteristic(processes, [small], [u], [0]))
     variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
-    path = model.weights.path(patterns, u)
+    path = model.weights.path(patterns, u, model.trigger_cycles)
     profile = np.sqrt(np.maximum(variance, 0.0) + np.mean(path**2, axis=(0, 1)))
     return Version(label, colour, _timing(effects), total, float(np.sqrt(total[0])), draws,
                    profile, patterns)

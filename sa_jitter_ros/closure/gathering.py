@@ -75,7 +75,8 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     Return the clock and what is known of the pulses.
 
     On a grid, the errors are those of the smoothest motion that it allows; where other channels
-    recover the motion better than a quarter of a tick, those of that motion.
+    recover the motion better than a quarter of a tick, those of that motion. Pulses that the angle
+    law reads beside those of an acquisition are there, too.
     """
     model, pulses = observation.model, observation.pulses
     found = find_clock(pulses.times)
@@ -93,15 +94,21 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
                  for motion in again]
     known = []
     for a, item in enumerate(observation.acquisitions):
-        grid = None if smooth is None else smooth[item.first:item.first + item.times.size]
-        first = item.first + int(pulses.missing[:item.first].sum())
+        start = item.first - model.weights.before
+        read = slice(start, item.first + item.times.size + model.weights.after)
+        own = slice(model.weights.before, model.weights.before + item.times.size)
+        grid = None if smooth is None else smooth[read]
+        first = start + int(pulses.missing[:start].sum())
         rows = []
         for motion, uncertain in zip(again, error_std):
             errors, std = grid, 0.0
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
-            if motion is not None and precise and np.all(np.isfinite(motion[a])):
-                errors, std = _on_grid(motion[a], clock), uncertain
-            rows.append(Pulses(item.times, first, errors, item.missing, std))
+            if grid is not None and motion is not None and precise and np.all(
+                    np.isfinite(motion[a])):
+                errors, std = grid.copy(), uncertain
+                errors[own] = _on_grid(motion[a], clock)
+            rows.append(Pulses(pulses.times[read], first, errors,
+                               pulses.missing[read.start:read.stop - 1], std))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), known
 
@@ -116,10 +123,13 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
     if len(usable) < 2:
         raise SignalError('the pulse errors cannot be recovered from the vibration: '
                           f'{picked[0].reason}; give reference_pulse_times or stronger orders')
-    errors = []
+    errors, own = [], []
     for a in usable:
-        item = observation.acquisitions[a]
-        known = known_errors(model, effects, pulses[a][0])
+        item, read = observation.acquisitions[a], pulses[a][0]
+        if len(read.times) > item.times.size:
+            read = read.without(model.weights.before, model.weights.after)
+        own.append(read)
+        known = known_errors(model, effects, read)
         left = item.errors if known is None else item.errors - _without_gaps(
             known, item.missing, item.times)
         errors.append(left - left.mean())
@@ -129,7 +139,7 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
         standard_errors = np.zeros_like(standard_errors)
     ripple = np.array([item.ripple for item in items])
     return Evidence(
-        model=model, pulses=tuple(pulses[a][0] for a in usable), errors=np.array(errors),
+        model=model, pulses=tuple(own), errors=np.array(errors),
         standard_errors=standard_errors, ripple=ripple,
         ripple_standard_error=float(np.sqrt(np.nanmean(
             [item.ripple_standard_error**2 for item in items]))) if items else float('nan'),

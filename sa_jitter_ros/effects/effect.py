@@ -7,7 +7,7 @@ independent contribution to the one angle error (THEORY, section 1).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any, ClassVar, TYPE_CHECKING
 
@@ -58,7 +58,7 @@ def parameter(default: Any, description: str, unit: str, **limits: Any) -> Any:
 @dataclass(frozen=True)
 class Pulses:
     """
-    The measured trigger pulses of one average.
+    The measured trigger pulses of one average, or with them those beside that its angle law reads.
 
     `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` counts
     the pulses before them in the recording, missing ones too; `errors` (N_t + 1,) in s holds what
@@ -78,6 +78,15 @@ class Pulses:
         """Return how many pulses went before each (N_t + 1,), missing ones too."""
         lost = 0 if self.missing is None else np.concatenate(([0], np.cumsum(self.missing)))
         return np.asarray(self.first + np.arange(len(self.times)) + lost)
+
+    def without(self, before: int, after: int) -> 'Pulses':
+        """Return all but some pulses at either end."""
+        kept = slice(before, len(self.times) - after)
+        cycles = slice(before, kept.stop - 1)
+        return replace(
+            self, times=self.times[kept], first=int(self.index[before]),
+            errors=None if self.errors is None else self.errors[kept],
+            missing=None if self.missing is None else self.missing[cycles])
 
 
 class Effect:

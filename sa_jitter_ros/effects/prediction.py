@@ -75,7 +75,7 @@ def jitter_processes(model: DeclaredModel, effects: Sequence[Effect]
 
 def known_errors(model: DeclaredModel, effects: Sequence[Effect], pulses: Pulses
                  ) -> Array | None:
-    """Return what effects know of the pulse errors (N_t + 1,) in s, None for nothing."""
+    """Return what effects know of the errors of `pulses` in s, None for nothing."""
     found = [item for item in (effect.pattern(model, pulses) for effect in effects)
              if item is not None]
     return np.asarray(np.sum(found, axis=0)) if found else None
@@ -85,16 +85,16 @@ def scenario_moments(
     model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
 ) -> AverageMoments:
     """
-    Return the moments (scenario, order) of averages with known pulse `errors` (scenario, N_t + 1).
+    Return the moments (scenario, order) of averages with known pulse `errors` (scenario, n).
 
-    `errors` are in s; `processes` are random and independent of them. Exact but for cycles that
-    hold a missing pulse, where the random errors count as if they did not vary inside the cycle,
-    and for what the angle law reads beyond the average: pulses there err as its outermost ones.
+    `errors` are in s, of the N_t + 1 pulses of the average or of all that its angle law reads (see
+    `PulseWeights.path`); `processes` are random and independent of them. Exact but for cycles that
+    hold a missing pulse, where the random errors count as if they did not vary inside the cycle.
     """
     g = np.asarray(model.orders)
     u, w = _RULE
     cycles = np.asarray(errors) * model.fundamental_frequency
-    path = model.weights.path(cycles, u)
+    path = model.weights.path(cycles, u, model.trigger_cycles)
     start, step = cycles[:, :-1, None], np.diff(cycles, axis=1)[:, :, None]
     shape = (g.size, len(cycles))
     mean, variance, pseudo = (np.zeros(shape, complex) for _ in range(3))
@@ -104,7 +104,7 @@ def scenario_moments(
     reach = min(correlation_length(processes) + 1, count) if processes else 0
     for i, order in enumerate(g):
         phasor = np.exp(2j * np.pi * order * path) * w
-        if steep.any():
+        if model.angle_law == 'linear' and steep.any():
             turns = order * step[steep]
             closed = np.exp(2j * np.pi * order * start[steep] + 1j * np.pi * turns)
             phasor[steep] = closed * np.sinc(turns) * w

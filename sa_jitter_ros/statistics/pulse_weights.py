@@ -45,15 +45,17 @@ class PulseWeights:
         """Return how many pulses a cycle depends on."""
         return self.before + 2 + self.after
 
-    def path(self, errors: Array, u: Array) -> Array:
+    def path(self, errors: Array, u: Array, cycles: int) -> Array:
         """
-        Return the angle errors (..., N_t, u) of averages with known pulse `errors` (..., N_t + 1).
+        Return the angle errors (..., cycles, u) of averages with known pulse errors.
 
-        Pulses beyond those of the average are taken to err as its first and its last one do.
+        `errors` (..., n) are those of all pulses that the law reads, n = cycles - 1 + pulses, or
+        of the average's own, n = cycles + 1: then those beside err as the first and the last one.
         """
-        beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
-        windows = np.lib.stride_tricks.sliding_window_view(
-            np.pad(errors, beside, mode='edge'), self.pulses, axis=-1)
+        if errors.shape[-1] == cycles + 1:
+            beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
+            errors = np.pad(errors, beside, mode='edge')
+        windows = np.lib.stride_tricks.sliding_window_view(errors, self.pulses, axis=-1)
         return np.asarray(windows @ self.at(u))
 
     def covariance(self, autocovariance: Callable[[Array], Array]) -> Covariance:
