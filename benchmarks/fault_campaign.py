@@ -38,9 +38,9 @@ SLACK = 24  # teeth behind an average until it is published: a spline reads eigh
 class Campaign:
     """Plays scenes into a graph and keeps account."""
 
-    def __init__(self, seed: int, graph: Graph) -> None:
+    def __init__(self, seed: int, graph: Graph, *, jitter: float) -> None:
         rng = np.random.default_rng(seed)
-        self.graph, self.source = graph, FaultySource(rng)
+        self.graph, self.source = graph, FaultySource(rng, jitter=jitter)
         self.disturber = Disturber(rng, graph, self._killed)
         self.checkers = {
             key: ShaftChecker(key[1], self.source.runs, self.disturber.settings[key[0]],
@@ -120,6 +120,8 @@ class Campaign:
         for key, checker in self.checkers.items():
             settings = self.disturber.settings[key[0]]
             for received in self.graph.inboxes[key].take():
+                if received.pulse_error is not None:
+                    self.residuals.add_average(received.amplitude)
                 try:
                     place = checker.check(received.amplitude, received.waveform)
                     corrected = check_correction(key[1], received, place, settings)
@@ -127,8 +129,6 @@ class Campaign:
                     self.wrong.append(f'{key[0]}: {error}')
                     checker.start_anew(received.amplitude.header.sequence + 1)
                     continue
-                if corrected:
-                    self.residuals.add_average(received.amplitude)
                 if settings[-1].get('correct_jitter'):
                     self.corrected['corrected' if corrected else 'refused'] += 1
                 # the last whole average of the scene: little is left in any queue
@@ -197,12 +197,13 @@ class Campaign:
             self.wrong.append(f'{what}: {counted} counted, {expected} sent')
 
 
-def run(seed: int, scenes: int, report: Callable[[str], None]) -> dict[str, Any]:
+def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float = 1.0
+        ) -> dict[str, Any]:
     """Run a campaign; nodes are killed in the first half, memory is watched in the second."""
     graph, told = Graph(), 0
     try:
         graph.start(list(ROLES))
-        campaign = Campaign(seed, graph)
+        campaign = Campaign(seed, graph, jitter=jitter)
         for number in range(scenes):
             campaign.play(kills=number < scenes // 2)
             if number % 5 == 4:
@@ -234,6 +235,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Inject faults into the running graph.')
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--scenes', type=int, default=300, help='of some fifteen faults each')
+    parser.add_argument('--jitter', type=float, default=1.0,
+                        help='width of the errors of the pulses over the declared one')
     parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'faults.json')
     parser.add_argument('--page', type=Path, default=ROOT / 'docs' / 'reliability.md')
     parser.add_argument('--figures', type=Path, default=ROOT / 'docs' / 'figures')
@@ -241,7 +244,8 @@ def main() -> int:
     options = parser.parse_args()
     if not options.only_write:
         found = run(options.seed, options.scenes,
-                    lambda text: print(text, file=sys.stderr, flush=True))
+                    lambda text: print(text, file=sys.stderr, flush=True),
+                    jitter=options.jitter)
         options.numbers.parent.mkdir(parents=True, exist_ok=True)
         options.numbers.write_text(json.dumps(found) + '\n')
     found = json.loads(options.numbers.read_text())

@@ -165,12 +165,12 @@ class Graph:
         self.predictions: list[PredictionMessage] = []
         self.residuals: list[ResidualMessage] = []
         self.reports: list[str] = []
-        deep = QoSProfile(depth=100, reliability=INPUT_QOS.reliability)
-        for topic, kind, take in (
-                ('prediction', Float64MultiArray, self._on_prediction),
-                ('residual', Float64MultiArray, self._on_residual),
-                ('missing_effect', String, self._on_report)):
-            self.node.create_subscription(kind, topic, take, deep)
+        for topic, kind, take, qos in (
+                ('prediction', Float64MultiArray, self._on_prediction, LATCHED_QOS),
+                ('residual', Float64MultiArray, self._on_residual, INPUT_QOS),
+                ('missing_effect', String, self._on_report, LATCHED_QOS)):
+            self.node.create_subscription(kind, topic, take, QoSProfile(
+                depth=100, reliability=qos.reliability, durability=qos.durability))
         self.node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 100)
         self._clients = {role: AsyncParameterClient(self.node, f'/{item.name}')
                          for role, item in ROLES.items()}

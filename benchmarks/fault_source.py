@@ -25,7 +25,7 @@ BLOCKS = {'lost': 3, 'repeated': 2, 'swapped': 2, 'late': 2, 'not finite': 2, 'l
 TEETH_FAULTS = ('missing', 'double', 'stray', 'displaced', 'far displaced')
 PULSES = ('lost', 'repeated', 'swapped', 'late', 'foreign', 'wild')
 SPACING = 8  # teeth between two faults of teeth or pulses
-JITTER = 1.0 / RATE  # s, width of the errors that all teeth have: those of a keyphasor at `RATE`
+JITTER = 1.0 / RATE  # s, declared width of the errors that all teeth have
 STEADY = 24  # teeth at the end of a scene without them: the next law may read eight cycles back
 REJECTED = ('layout', 'header', 'channels', 'rate')  # messages that are refused as such
 
@@ -48,10 +48,14 @@ class Scene:
 
 
 class FaultySource:
-    """Sends scene after scene; `runs` is the truth, `displace` allows errors of pulses."""
+    """
+    Sends scene after scene; `runs` is the truth, `displace` allows errors of pulses.
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        self.rng = rng
+    `jitter` is the width of the errors that all teeth have, in declared ones.
+    """
+
+    def __init__(self, rng: np.random.Generator, *, jitter: float = 1.0) -> None:
+        self.rng, self._jitter = rng, jitter * JITTER
         self.runs: list[Run] = []
         self.displace = True
         self._sample = 0  # of the run, that comes next
@@ -134,7 +138,7 @@ class FaultySource:
         span = first / RATE, end / RATE
         if self.displace:
             teeth = run.teeth(*span).tolist()[:None if faults else -STEADY]
-            errors = self.rng.uniform(-0.5, 0.5, len(teeth)) * JITTER
+            errors = self.rng.uniform(-0.5, 0.5, len(teeth)) * self._jitter
             run.jitter.update(zip(teeth, errors.tolist()))
         if faults:
             self._spoil_teeth(scene, run, span)
