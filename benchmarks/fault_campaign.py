@@ -30,6 +30,7 @@ from reliability_page import draw_faults, fault_sections
 
 ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
+ENOUGH = 50  # scenes that have to give a residual
 EXTRA = 5  # faultless scenes within which every average must have come back
 HELD = 4  # pulses that may be waiting to be judged
 SLACK = 24  # teeth behind an average until it is published: a spline reads eight cycles ahead
@@ -216,6 +217,8 @@ def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float 
             told = len(campaign.wrong)
             if told > 20 or graph.died:
                 break
+        if scenes >= ENOUGH and not campaign.residuals.checked:
+            campaign.wrong.append('analyser: no residual')
     finally:
         statuses = graph.close()
     lives = [*graph.past, *graph.lives.items()]

@@ -137,7 +137,8 @@ class FaultySource:
         end = first + round(seconds * RATE)
         span = first / RATE, end / RATE
         if self.displace:
-            teeth = run.teeth(*span).tolist()[:None if faults else -STEADY]
+            # none whose edge the waveform shows before or behind, too
+            teeth = run.teeth(*span).tolist()[2:-2 if faults else -STEADY]
             errors = self.rng.uniform(-0.5, 0.5, len(teeth)) * self._jitter
             run.jitter.update(zip(teeth, errors.tolist()))
         if faults:

@@ -142,8 +142,6 @@ def test_fault_campaign_finds_nothing_and_writes_its_page(
     assert sum(found['faults'].values()) > 30
     assert min(found['averages'].values()) > 10
     assert found['corrected']['corrected'] > 5
-    assert found['residuals'] > 0
-    assert sum(found['verdicts'].values()) > 0
     assert '**0 things were wrong**' in page.read_text()
     assert (tmp_path / 'reliability-faults.png').exists()
 
