@@ -174,9 +174,14 @@ class Campaign:
     def account(self) -> None:
         """Compare what `direct` and the others have counted with what was sent."""
         status = self.graph.quiet_status('direct')
-        self._check(self._scene)
-        self.wrong += [f'{key}: {inbox.left} messages of no average'
-                       for key, inbox in self.graph.inboxes.items() if inbox.left]
+        inboxes = self.graph.inboxes
+
+        def complete() -> bool:
+            self._check(self._scene)
+            return not any(inbox.left for inbox in inboxes.values())
+        if not self.graph.spin(complete, 2.0):
+            self.wrong += [f'{key[0]}: {inbox.left} messages of no average of {key[1]}'
+                           for key, inbox in inboxes.items() if inbox.left]
         if self._base:
             grown = {key: int(value) - int(self._base[key]) for key, value in status.items()
                      if value.isdecimal() and self._base.get(key, '').isdecimal()}

@@ -74,7 +74,7 @@ class Run:
     def waveform(self, first: int, count: int) -> SampleBlock:
         """Return samples of the tach waveform, whose rising edges are at the pulses."""
         tau = (first + np.arange(count)) / RATE
-        reach = WIDTH + 2.0 * EDGE
+        reach = WIDTH + 2.0 * EDGE + 0.5 / (TEETH * self.speed)  # of a displaced tooth
         teeth = self.teeth(tau[0] - reach, tau[-1] + reach)
         pulses = np.concatenate([self.times(teeth), [
             item for item in self.strays if tau[0] - reach < item < tau[-1] + reach]])
