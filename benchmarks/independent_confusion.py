@@ -37,8 +37,9 @@ class Run:
     """
     What the loop said of one machine.
 
-    `before` and `after` are RMS residuals less their standard errors, in quadrature; `errors` are
-    those of the parameters in stated standard errors.
+    `noisy` machines have coloured noise, which no declared model holds, so that naming it is
+    right. `before` and `after` are RMS residuals less their standard errors, in quadrature;
+    `errors` are those of the parameters in stated standard errors.
     """
 
     effects: tuple[str, ...]
@@ -48,6 +49,7 @@ class Run:
     status: int
     message: str
     verdict: str
+    noisy: bool
     found: tuple[str, ...]
     rivals: tuple[str, ...]
     before: float
@@ -61,8 +63,9 @@ class Run:
         """Tell whether the loop named what happened, or said that it knows none of it."""
         if set(self.effects) & set(UNKNOWN):
             return self.verdict == 'unexplained' and not self.found
-        return self.status == 0 and set(self.found) == set(self.effects) and (
-            self.verdict == ('traced' if self.effects else 'none'))
+        found = set(self.found) - ({'additive_noise'} if self.noisy else set())
+        return self.status == 0 and found == set(self.effects) and (
+            self.verdict == ('traced' if self.found else 'none'))
 
 
 def judge(effects: tuple[str, ...], seed: int, folder: Path, *, plain: bool = False,
@@ -97,12 +100,12 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, plain: bool = Fa
             f'{", reference" * item.reference}{", waveform" * item.waveform}')
     if status:
         nan = float('nan')
-        return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', (), (),
-                   nan, nan, nan, nan, {})
+        return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', False, (),
+                   (), nan, nan, nan, nan, {})
     found = report['missing_effects']
     return Run(
         effects, seed, text, seconds, status, error.getvalue().strip(), report['verdict'],
-        tuple(one['name'] for one in found),
+        item.noise_colour > 0.0, tuple(one['name'] for one in found),
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
         _rms(report['error_before']), _rms(report['error_after']),
         report['error_before']['chi2_per_dof'], report['error_after']['chi2_per_dof'],

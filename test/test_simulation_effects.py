@@ -231,6 +231,7 @@ def test_effects_of_size_zero_change_nothing():
     ({'missing_pulses': {'probability': 1.0}}, 'probability 1.0'),
     ({'speed_fluctuation': {'acceleration_std': np.inf}}, 'acceleration_std inf'),
     ({'phase_wander': {'std': np.nan}}, 'std nan'),
+    ({'phase_wander': {'std': 0.1, 'bandwidth': 0.5}}, 'bandwidth 0.5'),
     ({'amplitude_modulation': {'std': -0.1}}, 'std -0.1'),
     ({'interpolation_loss': {'method': 'magic'}}, "'magic': must be one of linear, cubic, spline"),
     ({'additive_noise': {'std': -0.1}}, 'additive_noise.std -0.1'),

@@ -76,9 +76,9 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
     times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
     pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
-    pulse error. `orders` restricts the recovery to these; without it, the at most `most_orders`
-    orders are taken that stand out most: integer ones and those in `also`. `with_ripple` fits a
-    speed ripple u (1 - u) of every cycle jointly.
+    pulse error. `orders` restricts the recovery to these; without it, those integer orders and
+    orders in `also` are taken that stand out most, at most `most_orders` and as many as are in
+    `also`. `with_ripple` fits a speed ripple u (1 - u) of every cycle jointly.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     ratio or standard deviation that is not positive.
@@ -155,7 +155,7 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
         candidates = (given[given <= reach] if search is None
-                      else search.strongest(errors, most_orders, below=reach))
+                      else search.strongest(errors, most_orders + len(also), below=reach))
         # no more unknowns than half of what a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])

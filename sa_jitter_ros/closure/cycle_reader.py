@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.angle.laws import angle_law, AngleLaw, cycle_times
 from sa_jitter_ros.angle.resampling import interpolate, margin
 from sa_jitter_ros.averaging.cycle import grid_points, project
@@ -18,8 +18,13 @@ ComplexArray = NDArray[np.complex128]
 _SUSPICIOUS, _WIDER = 1.3, 4.0
 _WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
 _LEAST = 1e-9
+# A ripple of this many times its noise in power is taken out of the corrected average.
+_RIPPLE = 3.0
 _WHOLE = 1e-9
 _SEPARATIONS = 6
+# Lines of the average beside an order that tell the noise: beyond the window's main lobe.
+_LOBE, _AROUND = 3, 150
+_OUTLIER = 3.0  # times the noise
 _LINEAR = angle_law('linear')
 
 
@@ -66,15 +71,19 @@ def repaired(times: FloatArray, missing: NDArray[np.int64]
 
 
 def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...],
-            *, with_ripple: bool) -> PulseErrorRecovery:
-    """Recover pulse errors from the channels `rows`, of the declared size or larger."""
+            *, with_ripple: bool, also: ArrayLike = ()) -> PulseErrorRecovery:
+    """
+    Recover pulse errors from the channels `rows`, of the declared size or larger.
+
+    Of declared and integer orders, and those in `also`.
+    """
     periods = np.diff(pulses)
     grid = reader.cycles(pulses, grid_points(float(periods.max()), reader.rate))[:, :, list(rows)]
     declared = max(float(np.sqrt(model.distribution.variance)), _LEAST)
 
     def attempt(expected: float) -> PulseErrorRecovery:
         return recover_pulse_errors(
-            grid, periods=periods, ratio=model.cycle_length, also=model.orders,
+            grid, periods=periods, ratio=model.cycle_length, also=(*model.orders, *np.ravel(also)),
             declared_standard_deviation=expected * declared, with_ripple=with_ripple)
 
     found = attempt(1.0)
@@ -108,6 +117,38 @@ def amplitudes(grid: FloatArray, cycles: float, orders: tuple[float, ...]) -> Co
     return np.asarray(parts * turn[:, None, :])
 
 
+def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float) -> FloatArray:
+    """
+    Return the noise (channel, order) of the mean of trigger cycles along the radius.
+
+    `grid` (cycle, point, channel) are successive cycles of `cycles` fundamental cycles without
+    their ends, of a band that ends at order `top`. It is what the spectrum holds in phase with the
+    order (errors of the pulses only turn it) apart from lines: other orders and tones.
+    """
+    flat = grid.reshape(-1, grid.shape[2]).T
+    window = np.hanning(flat.shape[1] + 1)[:-1]
+    turns = cycles / grid.shape[1] * np.arange(flat.shape[1])
+    lines = len(grid) * cycles
+    floors = []
+    for order in orders:
+        turned = flat * np.exp(-2j * np.pi * order * turns)
+        turned = turned * np.exp(-1j * np.angle(turned.mean(axis=1, keepdims=True)))
+        reach = int(np.clip((top - order) * lines, 4 * _LOBE, max(_AROUND, 100.0 * lines)))
+        spectrum = np.fft.rfft(2.0 * turned.real * window, axis=1)[:, _LOBE:reach]
+        floors.append(_without_lines(np.abs(spectrum) ** 2))
+    return np.sqrt(np.array(floors).T / (flat.shape[1] * np.sum(window**2)))
+
+
+def _without_lines(power: FloatArray) -> FloatArray:
+    """Return the mean of exponential values (row, value), of which outliers do not count."""
+    floor = np.median(power, axis=1) / np.log(2.0)
+    kept = 1.0 - _OUTLIER * np.exp(-_OUTLIER) / (1.0 - np.exp(-_OUTLIER))
+    for _ in range(10):
+        low = power < _OUTLIER * floor[:, None]
+        floor = np.sum(power, axis=1, where=low) / np.maximum(low.sum(axis=1), 1) / kept
+    return np.asarray(floor)
+
+
 def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
     """
     Return the standard error of the ripple (s) that the noise of the recovered orders leaves.
@@ -119,6 +160,12 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
         information = np.nansum(2.0 * signal / recovery.noise**2) / 180.0
     cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
     return float(cycles / model.fundamental_frequency)
+
+
+def clear_ripple(recovery: PulseErrorRecovery, model: DeclaredModel) -> FloatArray | None:
+    """Return the ripple (cycle,) in s where it stands above its noise, else None."""
+    clear = np.mean(recovery.ripple**2) > _RIPPLE * ripple_error(recovery, model) ** 2
+    return recovery.ripple if recovery.accepted and clear else None
 
 
 def kept_apart(ratio: float, orders: FloatArray) -> bool:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.closure.cycle_reader import kept_apart
 from sa_jitter_ros.closure.observation import Acquisition, Observation
+from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
 from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
@@ -116,11 +117,14 @@ class _Setting:
         errors = known_errors(model, self.effects, pulses)
         if errors is None:
             return self._of_unknown_pulses
-        blur = 0.0
+        blur, unsure = 0.0, self.processes
         if any(effect.replaces_jitter(model) for effect in self.effects):
             blur = pulses.error_std * model.fundamental_frequency
+            if pulses.unknown_std:
+                unsure = (*unsure, *CorrelatedJitter(
+                    pulses.unknown_std, pulses.unknown_correlation).processes(model))
         doubt = IndependentPulseJitter(Normal(blur), weights=model.weights)
-        unsure = (*self.processes, doubt) if blur else self.processes
+        unsure = (*unsure, doubt) if blur else unsure
         found = _known(self.observation, unsure, errors)
         leakage = _leakage(self.observation, unsure, errors)
         if blur:

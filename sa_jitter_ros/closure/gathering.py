@@ -12,7 +12,7 @@ from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Observation, recovered_again
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
-from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
+from sa_jitter_ros.effects.lattice import Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording
@@ -25,7 +25,6 @@ _PRECISE = 0.25
 _TWIN = 4.0
 _CERTAIN = 1e-4
 _GROUPS = 3
-_RARE = 0.01
 # A clock this much faster than the declared one is no cause of anything.
 _FINE = 50.0
 
@@ -92,6 +91,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     spread = [motion for motion in again if motion is not None]
     error_std = [0.0 if motion is None else _uncertainty(observation, motion, spread)
                  for motion in again]
+    missed = (0.0, 0.0) if smooth is None else _missed(observation, smooth, clock)
     known = []
     for a, item in enumerate(observation.acquisitions):
         start = item.first - model.weights.before
@@ -101,14 +101,14 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
         first = start + int(pulses.missing[:start].sum())
         rows = []
         for motion, uncertain in zip(again, error_std):
-            errors, std = grid, 0.0
+            errors, std, unknown = grid, 0.0, missed
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
             if grid is not None and motion is not None and precise and np.all(
                     np.isfinite(motion[a])):
-                errors, std = grid.copy(), uncertain
-                errors[own] = _on_grid(motion[a], clock)
+                errors, std, unknown = grid.copy(), uncertain, (0.0, 0.0)
+                errors[own] = on_grid(motion[a], clock)
             rows.append(Pulses(pulses.times[read], first, errors,
-                               pulses.missing[read.start:read.stop - 1], std))
+                               pulses.missing[read.start:read.stop - 1], std, *unknown))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), known
 
@@ -160,13 +160,8 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
     noises = np.array([radial_noise(row) for row in cycles])
     noise = np.sqrt(np.mean(noises**2, axis=0))
-    # Other shafts' orders leak into single cycles, less into averages, which then scatter too
-    # little for the noise of their cycles.
-    count = len(cycles)
-    apart = np.abs(np.abs(mean[:, 0]) - level) * np.sqrt(count / (count - 1))
-    least = stats.chi2.ppf(_RARE, count - 1) / (count - 1)
-    noises = np.where(np.mean(apart**2, axis=0) < least * noise**2, apart, noises)
-    density = noises * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
+    floor = lines.of(observation.stacked('noise_floor'))
+    density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     evidence = LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
         noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
@@ -245,6 +240,30 @@ def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array
     return float(np.sqrt(variance.mean())) if variance.size else 0.0
 
 
+def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[float, float]:
+    """
+    Return what the smoothest motion on a grid misses: size in s and correlation of neighbours.
+
+    It is 0 where more than the ticks errs.
+    """
+    usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
+    if not usable:
+        return 0.0, 0.0
+    errors = np.array([item.errors for item in usable])
+    error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
+        [item.standard_errors**2 for item in usable])))
+    if not ticks_leave_room(errors, np.array(error), clock):
+        return 0.0, 0.0
+    missed = errors - np.array([smooth[item.first:item.first + item.times.size]
+                                for item in usable])
+    missed -= missed.mean(axis=1, keepdims=True)
+    variance = float(np.mean(missed.var(axis=1, ddof=1))) - error**2
+    if variance <= 0.0:
+        return 0.0, 0.0
+    together = float(np.mean(missed[:, 1:] * missed[:, :-1])) / variance
+    return float(np.sqrt(variance)), float(np.clip(together, 0.0, 0.95))
+
+
 def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
     """Return recovered errors (acquisition, pulse) less a slope over time that no grid makes."""
     items = observation.acquisitions
@@ -257,18 +276,6 @@ def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
     if slopes.size < 4 or stats.ttest_1samp(slopes, 0.0).pvalue > _CERTAIN:
         return motion
     return np.asarray(motion - float(np.median(slopes)) * times)
-
-
-def _on_grid(errors: Array, clock: float) -> Array:
-    """Return errors that a clock of this rate can make: beyond half a tick, whole ticks go."""
-    tick = 1.0 / clock
-    offsets = np.linspace(-tick, tick, 201)
-    excess = np.maximum(np.abs(errors[None, :] + offsets[:, None]) - 0.5 * tick, 0.0)
-    cost = np.sum(excess**2, axis=1)
-    best = offsets[cost <= cost.min() + 1e-30].mean()
-    placed = errors + best
-    far = np.abs(placed) > 0.75 * tick
-    return np.asarray(np.where(far, placed - tick * np.rint(placed / tick), placed))
 
 
 def _without_gaps(known: Array, missing: Array, times: Array) -> Array:

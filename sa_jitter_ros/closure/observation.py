@@ -17,7 +17,9 @@ from sa_jitter_ros.angle.laws import angle_law, AngleLaw
 from sa_jitter_ros.averaging.cycle import grid_points
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.cycle_reader import (
-    amplitudes, CycleReader, recover, repaired, ripple_error, separated)
+    amplitudes, clear_ripple, CycleReader, noise_floor, recover, repaired, ripple_error,
+    separated)
+from sa_jitter_ros.closure.other_sources import other_sources
 from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, TriggerPulses
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
@@ -31,12 +33,7 @@ MOST_SAMPLES = 200_000_000
 _OTHER_MACHINE = 5.0
 # Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
-# Strongest orders beside the declared ones that may leak into them.
-_MOST_OTHERS = 16
-# Lines of a trigger cycle that an order between two of them takes for itself.
-_BESIDE = 1.5
-# A ripple of this many times its noise in power is taken out of the corrected average.
-_RIPPLE = 3.0
+_FULL_BAND = 0.45  # of the sample rate
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,8 @@ class Acquisition:
     minus true with mean 0 (NaN where nothing was recovered), `reference` their times on a better
     keyphasor. `missing` (N_t,) pulses lack in each cycle. `raw` and `corrected` (channel, order)
     are complex peak amplitudes; `cycles` (cycle, channel, order) the corrected ones of each cycle
-    at hand; `noise` (channel, order) the standard deviation of an amplitude along its radius.
+    at hand; `noise` (channel, order) the standard deviation of an amplitude along its radius,
+    `noise_floor` what of it the spectrum around the order makes.
     `ripple` (cycle,) is the factor of u (1 - u) in the error inside a cycle (s).
     """
 
@@ -62,6 +60,7 @@ class Acquisition:
     corrected: ComplexArray
     cycles: ComplexArray
     noise: FloatArray
+    noise_floor: FloatArray
     ripple: FloatArray
     ripple_standard_error: float
     recovered: bool
@@ -138,7 +137,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     rows = tuple(range(samples.shape[1]))
     declared = tuple(float(g) for g in model.orders)
     orders = np.array(sources if len(sources) else [
-        *declared, *_other_sources(reader, pulses, model, starts, rows, declared)])
+        *declared, *other_sources(reader, pulses, model, starts, rows)])
     if pulses.reference is not None and not _reference_serves(
             reader, pulses, model, starts, np.array(declared), rows):
         pulses = replace(pulses, reference=None)
@@ -197,7 +196,8 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
     errors = []
     for item in observation.acquisitions:
         fixed, keep = repaired(item.times, item.missing)
-        recovery = recover(reader, fixed, observation.model, rows, with_ripple=False)
+        recovery = recover(reader, fixed, observation.model, rows, with_ripple=False,
+                           also=observation.sources)
         errors.append(recovery.errors[keep] if recovery.accepted
                       else np.full(item.times.size, np.nan))
     return np.array(errors)
@@ -252,10 +252,10 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
     missing = pulses.missing[first:first + count]
     fixed, keep = repaired(times, missing)
     points = grid_points(float(np.diff(fixed).max()), reader.rate)
-    recovery = recover(reader, fixed, model, rows, with_ripple=True)
+    recovery = recover(reader, fixed, model, rows, with_ripple=True, also=sources)
     with_ripple = recovery.accepted and not missing.any()
     if not recovery.accepted:
-        recovery = recover(reader, fixed, model, rows, with_ripple=False)
+        recovery = recover(reader, fixed, model, rows, with_ripple=False, also=sources)
     errors = np.full(times.size, np.nan)
     standard_errors, ripple = errors.copy(), np.full(count, np.nan)
     bend_error = float('nan')
@@ -276,49 +276,14 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
         errors = times - reference
     errors = errors - errors.mean()
     orders = tuple(sources.tolist())
-    bend = None
-    if reference is None and with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2:
-        bend = ripple
+    bend = clear_ripple(recovery, model) if reference is None and with_ripple else None
     raw = amplitudes(reader.cycles(pulses.times[near], points, ends=True, law=law),
                      model.cycle_length, orders)
-    clean = amplitudes(reader.cycles(better, points, ends=True, ripple=bend, law=clean_law),
-                       model.cycle_length, orders)
-    clean = separated(clean, model.cycle_length, sources)
+    grid = reader.cycles(better, points, ends=True, ripple=bend, law=clean_law)
+    clean = separated(amplitudes(grid, model.cycle_length, orders), model.cycle_length, sources)
+    floor = noise_floor(grid[:, :-1], model.cycle_length, sources[:len(model.orders)],
+                        _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, errors, standard_errors, reference, raw.mean(axis=0),
-        clean.mean(axis=0), clean, radial_noise(clean), ripple, bend_error, recovery.accepted,
-        recovery.reason)
-
-
-def _other_sources(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel,
-                   starts: Sequence[int], rows: tuple[int, ...], declared: tuple[float, ...]
-                   ) -> Sequence[float]:
-    """Return strong orders beside the declared ones that may leak into them (integer r)."""
-    if abs(model.cycle_length - round(model.cycle_length)) > 1e-9:
-        return ()
-    for first in starts[:3]:
-        part = slice(first, first + model.trigger_cycles + 1)
-        times = pulses.times[part] if pulses.reference is None else pulses.reference[part]
-        if pulses.missing[first:first + model.trigger_cycles].any():
-            continue
-        recovery = recover(reader, times, model, rows, with_ripple=False)
-        if not recovery.accepted:
-            continue
-        points = grid_points(float(np.diff(times).max()), reader.rate)
-        mean = reader.cycles(times - recovery.errors, points).mean(axis=0)
-        spectrum = np.abs(np.fft.rfft(mean, axis=0)).max(axis=1)
-        order = np.arange(spectrum.size) / model.cycle_length
-        top = np.array([spectrum[round(g * model.cycle_length)] for g in declared
-                        if round(g * model.cycle_length) < spectrum.size])
-        if not top.size:
-            raise SignalError(f'orders {list(declared)} lie beyond half the sampling rate: '
-                              'declare lower ones')
-        strong = (spectrum > 0.3 * float(np.min(top))) & (order > 0.0) & (
-            order < 0.45 * points / model.cycle_length)
-        # a declared order that is no line of the trigger cycle shows on the lines beside it
-        turns = model.cycle_length * np.array(declared)
-        reach = np.where(np.abs(turns - np.rint(turns)) < 1e-6, 0.5, _BESIDE)
-        strong &= np.all(np.abs(np.arange(spectrum.size)[:, None] - turns) > reach, axis=1)
-        best = np.argsort(np.where(strong, spectrum, 0.0))[::-1][:_MOST_OTHERS]
-        return [float(order[k]) for k in best if strong[k]]
-    return ()
+        clean.mean(axis=0), clean, radial_noise(clean), floor, ripple, bend_error,
+        recovery.accepted, recovery.reason)

@@ -22,6 +22,20 @@ _DRAWS, _SEED = 4000, 17
 
 
 @dataclass(frozen=True)
+class Sensitivity:
+    """
+    What one standard error of a fitted parameter changes in the prediction.
+
+    `mean` (line,) of the attenuation, and in parts of itself the variance of attenuation and
+    amplitude.
+    """
+
+    mean: Array
+    variance: float
+    amplitude_variance: float
+
+
+@dataclass(frozen=True)
 class Residual:
     """
     Summary of a residual; `mean` and `standard_error` are per line.
@@ -61,13 +75,12 @@ class Residual:
 
 def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Array,
              amplitude_expected: Array, amplitude_variance: Array, probability: Array, *,
-             sensitivities: Sequence[Array] = ()) -> Residual:
+             sensitivities: Sequence[Sensitivity] = ()) -> Residual:
     """
     Compare observed with predicted, all arrays (acquisition, line).
 
     The variances hold those of the observation itself; `probability` is the predicted distribution
-    function at the amplitudes; `sensitivities` (line,) are the changes of the prediction by one
-    standard error of each fitted parameter.
+    function at the amplitudes; `sensitivities` are those to each fitted parameter.
     """
     difference = attenuation - expected
     count = len(difference)
@@ -86,9 +99,11 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         ks=float(stats.kstest(inside, 'uniform').statistic),
         cramer_von_mises=float(uniform.statistic) if uniform is not None else float('nan'),
         coverage=float(np.mean((inside > 0.025) & (inside < 0.975))),
-        p_mean=_mean_p_value(difference / scale, scale, sensitivities),
-        p_scatter=_scatter_p_value(difference - mean, scale, ACCURACY),
-        p_amplitude=_scatter_p_value(shift - shift.mean(axis=0), width, ACCURACY),
+        p_mean=_mean_p_value(difference / scale, scale, [item.mean for item in sensitivities]),
+        p_scatter=_scatter_p_value(difference - mean, scale,
+                                   [item.variance for item in sensitivities]),
+        p_amplitude=_scatter_p_value(shift - shift.mean(axis=0), width,
+                                     [item.amplitude_variance for item in sensitivities]),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)
 
@@ -136,16 +151,21 @@ def _mean_p_value(z: Array, scale: Array, sensitivities: Sequence[Array]) -> flo
                      stats.chi2.sf(statistic * freedom / null.mean(), freedom)))
 
 
-def _scatter_p_value(difference: Array, scale: Array, tolerance: float) -> float:
-    """Test whether the lines scatter more than predicted, block by block."""
+def _scatter_p_value(difference: Array, scale: Array, unsure: Sequence[float]) -> float:
+    """
+    Test whether the lines scatter more than predicted, block by block.
+
+    `unsure` are parts of the predicted variance that it may be wrong by.
+    """
     count = len(difference)
     if count < 3:
         return 1.0
-    power = np.mean(difference**2 / (scale**2 + tolerance**2), axis=1) * count / (count - 1)
+    power = np.mean(difference**2 / (scale**2 + ACCURACY**2), axis=1) * count / (count - 1)
     mean = float(power.mean())
     if mean <= 1.0:
         return 1.0
     # The log of a mean of squares is nearly normal; its spread comes from the acquisitions and is
     # never less than that of as many squares of one normal variable.
     spread = max(float(power.std(ddof=1)) / mean / np.sqrt(count), np.sqrt(1.0 / count))
-    return float(stats.t.sf(np.log(mean) / spread, count - 1))
+    total = np.sqrt(spread**2 + np.sum(np.square(unsure)))
+    return float(stats.t.sf(np.log(mean) / total, count - 1))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.closure.expectation import expect, Expectation, Lines
 from sa_jitter_ros.closure.gathering import gather
 from sa_jitter_ros.closure.observation import Observation
-from sa_jitter_ros.closure.residual import Residual, residual
+from sa_jitter_ros.closure.residual import Residual, residual, Sensitivity
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import Evidence, Finding, LineEvidence
@@ -92,12 +92,16 @@ class Bench:
         attenuation, variance, amplitude = self.observed(self.held_out)
         expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
         probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
-        base = expected.attenuation.mean(axis=0)
         moved = []
         for i, finding in enumerate(findings):
             for shifted in _shifted(finding):
                 others = [*effects[:i], shifted, *effects[i + 1:]]
-                moved.append(self.expect(others, self.held_out).attenuation.mean(axis=0) - base)
+                other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
+                moved.append(Sensitivity(
+                    (other.attenuation - expected.attenuation).mean(axis=0),
+                    float(np.mean((other.attenuation_variance - expected.attenuation_variance)
+                                  / (expected.attenuation_variance + variance))),
+                    float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, probability, sensitivities=moved)
@@ -110,9 +114,13 @@ def _shifted(finding: Finding) -> list[Effect]:
         return found
     for name, error in finding.standard_errors.items():
         value = finding.effect.values[name]
-        if isinstance(value, float) and isinstance(error, float) and np.isfinite(error):
+        if isinstance(value, str):
+            continue
+        for step in np.diag(np.where(np.isfinite(error), error, 0.0).reshape(-1)):
+            shifted = tuple((np.ravel(value) + step).tolist())
             try:
-                found.append(replace(finding.effect, **{name: value + error}))  # type: ignore
+                found.append(replace(  # type: ignore[type-var]
+                    finding.effect, **{name: shifted if np.ndim(value) else shifted[0]}))
             except ValueError:
                 continue
     return found

@@ -100,7 +100,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         significant = after.p_value < SIGNIFICANT
         effects = [finding.effect for finding in chosen if finding.effect is not None]
         try:
-            evidence = bench.gather(effects, bench.fit)
+            evidence = replace(bench.gather(effects, bench.fit),
+                               whole=bench.gather(effects, range(count)))
         except SignalError as error:
             reason = str(error)
             break

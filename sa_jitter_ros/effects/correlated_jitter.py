@@ -9,13 +9,13 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, fit_memory, goodness_of_fit, white)
+    fit_memory, goodness_of_fit, memory_p_value)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _FORGOTTEN = 1e-3
-_SIGNIFICANT = 1e-3  # where excess jitter is refused for a memory
+_SIGNIFICANT = 0.01  # the better of two explanations, not the existence of one
 
 
 @dataclass(frozen=True)
@@ -24,6 +24,7 @@ class CorrelatedJitter(Effect):
 
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'
+    of_pulses: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
                                    minimum=-0.999, maximum=0.999)
@@ -45,12 +46,11 @@ class CorrelatedJitter(Effect):
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit variance and memory of the pulse errors; white ones are another effect's."""
-        plain = fit_covariance(evidence, white)
         fit = fit_memory(evidence)
         std, error = root(fit.variance, fit.variance_error)
         if std == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
-        p_value = fit.p_value_over(plain)
+        p_value = memory_p_value(evidence.of_all)
         text = (f'pulse errors of {std:.3g} s correlated by {fit.shape:.2f} from pulse to pulse, '
                 f'p = {p_value:.2g} against independent ones')
         if p_value > _SIGNIFICANT:

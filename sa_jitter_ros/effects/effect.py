@@ -64,7 +64,8 @@ class Pulses:
     the pulses before them in the recording, missing ones too; `errors` (N_t + 1,) in s holds what
     the grid of a clock says about each (`keyphasor_quantisation`), None where it says nothing;
     `missing` (N_t,) is how many pulses lack within each cycle; `error_std` in s is how uncertain
-    `errors` are.
+    `errors` are that were measured otherwise, `unknown_std` what they do not hold of the true
+    ones, correlated from pulse to pulse by `unknown_correlation`.
     """
 
     times: Array
@@ -72,6 +73,8 @@ class Pulses:
     errors: Array | None = None
     missing: Array | None = None
     error_std: float = 0.0
+    unknown_std: float = 0.0
+    unknown_correlation: float = 0.0
 
     @property
     def index(self) -> Array:
@@ -102,6 +105,8 @@ class Effect:
     scatters: ClassVar[bool] = False
     #: Whether it is seen in the pulses themselves, so that it is reported whatever it does.
     seen: ClassVar[bool] = False
+    #: Whether recovered pulse errors are what tells it.
+    of_pulses: ClassVar[bool] = False
     #: Whether the vibration moves and the pulses are right, however its motion is recovered.
     moves_vibration: ClassVar[bool] = False
 

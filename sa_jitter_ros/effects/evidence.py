@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect, Pulses
-from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -62,7 +62,7 @@ class Evidence:
     (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
     `record_times` are all pulses of the record and `record_missing` (interval,) is how many pulses
     lack in each interval of the record; `clock` is the one on whose ticks all pulse times lie, if
-    any.
+    any. `whole` holds the acquisitions that no fit may use, too.
     """
 
     model: DeclaredModel
@@ -77,6 +77,12 @@ class Evidence:
     clock: Clock
     lines: LineEvidence
     explained: tuple[Effect, ...] = ()
+    whole: 'Evidence | None' = None
+
+    @property
+    def of_all(self) -> 'Evidence':
+        """Return the evidence of all acquisitions: it tells effects apart, no fit uses it."""
+        return self.whole or self
 
     @property
     def period(self) -> float:
@@ -97,6 +103,12 @@ class Evidence:
         known = [known_errors(self.model, self.explained, pulses) for pulses in self.pulses]
         return np.array([times if errors is None else times - errors
                          for times, errors in zip(self.times, known)])
+
+    @property
+    def hidden_by_ticks(self) -> bool:
+        """Tell whether the ticks of the clock leave room for all that the pulses err."""
+        whole = self.errors + self.times - self.times_left
+        return ticks_leave_room(whole, self.standard_errors, self.clock.rate)
 
     def expected_autocovariance(self, lags: Array) -> Array:
         """Return what declared jitter and added effects explain at `lags`, in s^2."""

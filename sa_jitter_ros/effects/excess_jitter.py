@@ -8,7 +8,7 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, fit_memory, goodness_of_fit, white)
+    fit_covariance, goodness_of_fit, memory_p_value, white)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.statistics.distributions import Normal
@@ -24,6 +24,7 @@ class ExcessJitter(Effect):
 
     name: ClassVar[str] = 'excess_jitter'
     summary: ClassVar[str] = 'independent normal pulse errors'
+    of_pulses: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)
 
@@ -46,7 +47,7 @@ class ExcessJitter(Effect):
         text = (f'the pulse errors have {fit.observed_std:.3g} s where '
                 f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
         against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
-        unsure = fit_memory(evidence).p_value_over(fit) < _HINT
+        unsure = memory_p_value(evidence.of_all) < _HINT
         return Finding(
             cls.name, cls(std), {'std': error}, fit.p_value, text, against,
             rivals=('correlated_jitter',) if unsure else (), decider=_DECIDER if unsure else '')

@@ -10,6 +10,7 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 Array = NDArray[Any]
 
 _TOLERANCE = 0.02  # of a tick
+_ROOM = 0.02  # of a tick
 _STEPS = 3000
 _FEWEST = 8
 # Ticks that an interval holds at least: with fewer, pulses are no time measurement.
@@ -105,6 +106,30 @@ def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Ar
             mass, y = mass * factor, y / factor
     true = np.clip(x, middle - half, middle + half)
     return np.asarray((middle - true) / clock_rate)
+
+
+def placed_on_grid(errors: Array, clock_rate: float) -> tuple[Array, float]:
+    """Return errors (n,) in s moved within half a tick where possible, and the RMS beyond it."""
+    tick = 1.0 / clock_rate
+    offsets = np.linspace(-tick, tick, 201)
+    excess = np.maximum(np.abs(errors[None, :] + offsets[:, None]) - 0.5 * tick, 0.0)
+    cost = np.mean(excess**2, axis=1)
+    best = offsets[cost <= cost.min() + 1e-30].mean()
+    return np.asarray(errors + best), float(np.sqrt(cost.min()))
+
+
+def ticks_leave_room(errors: Array, standard_errors: Array, clock_rate: float) -> bool:
+    """Tell whether pulse errors (acquisition, pulse) in s are such as a clock alone can make."""
+    beyond = np.mean([placed_on_grid(row, clock_rate)[1] ** 2 for row in errors])
+    return bool(beyond < max(np.nanmean(standard_errors**2), (_ROOM / clock_rate) ** 2))
+
+
+def on_grid(errors: Array, clock_rate: float) -> Array:
+    """Return errors (n,) in s that a clock can make: beyond half a tick, whole ticks go."""
+    tick = 1.0 / clock_rate
+    placed, _ = placed_on_grid(errors, clock_rate)
+    far = np.abs(placed) > 0.75 * tick
+    return np.asarray(np.where(far, placed - tick * np.rint(placed / tick), placed))
 
 
 def _squared_second_difference(n: int) -> Array:

@@ -14,6 +14,7 @@ from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngl
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _MEMORY = 40
+_NARROW = 0.05
 _SIGNIFICANT = 1e-3
 _MOST_BESIDE = 4.0  # variance of independent errors beside that of the wander
 _FREEDOM = 2.0  # what one more parameter gains by chance, Akaike's criterion
@@ -21,61 +22,79 @@ _FREEDOM = 2.0  # what one more parameter gains by chance, Akaike's criterion
 
 @dataclass(frozen=True)
 class PhaseWander(Effect):
-    """Slow random angle of `std` rad between the shaft of interest and its vibration."""
+    """
+    Slow random angle of `std` rad between the shaft of interest and its vibration.
+
+    Its spectrum is flat from a fiftieth of the trigger rate to `bandwidth` times that rate.
+    """
 
     name: ClassVar[str] = 'phase_wander'
     summary: ClassVar[str] = 'slow motion of the source against the tach shaft'
     moves_vibration: ClassVar[bool] = True
+    of_pulses: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
+    bandwidth: float = parameter(SLOW_BAND[1], 'highest frequency of the motion over the trigger '
+                                 'rate', '1', minimum=_NARROW, maximum=0.5)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the wander, band-limited below half the trigger rate."""
         variance = (self.std / (2.0 * np.pi)) ** 2
 
         def covariance(u: Array, v: Array, lag: int) -> Array:
-            return np.asarray(variance * flat_band_correlation(lag + v - u, SLOW_BAND))
+            return np.asarray(variance * flat_band_correlation(lag + v - u, _band(self.bandwidth)))
 
         return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return what the wander looks like when it is taken for pulse errors."""
         seconds = self.std / (2.0 * np.pi * model.fundamental_frequency)
-        return np.asarray(seconds**2 * recovered_correlation(lags, SLOW_BAND))
+        return np.asarray(seconds**2 * recovered_correlation(lags, _band(self.bandwidth)))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit slow errors that the measured pulse times do not have."""
         if evidence.against_reference:
             return absent(cls.name, 'against a better keyphasor the source cannot move')
-        slope = slope_test(evidence)
+        slope = slope_test(evidence.of_all)
         if slope.tach_side:
-            return absent(cls.name, 'the pulse times move as the recovered errors do: slope '
-                          f'{slope.slope:.2f} +- {slope.standard_error:.2f}',
-                          p_value=slope.p_value)
-        fit = fit_covariance(evidence, lambda lags, _: recovered_correlation(lags, SLOW_BAND))
+            return absent(cls.name, 'the pulse times move as the recovered errors do: the '
+                          f'vibration makes {slope.share:.2f} +- {slope.standard_error:.2f} of '
+                          'the motion', p_value=slope.p_value)
+        fit = fit_covariance(evidence, _correlation, bounds=(_NARROW, 0.5))
+        bandwidth, bandwidth_error = fit.shape, fit.shape_error
         # Independent errors beside a wander must not swell it.
         beside = fit_covariance(
-            evidence, lambda lags, share: recovered_correlation(lags, SLOW_BAND) + share * white(
+            evidence, lambda lags, share: _correlation(lags, SLOW_BAND[1]) + share * white(
                 lags, 0.0), bounds=(0.0, _MOST_BESIDE))
         if beside.p_value_over(fit) < _SIGNIFICANT:
-            fit = beside
+            fit, bandwidth, bandwidth_error = beside, SLOW_BAND[1], float('nan')
         if fit.variance == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
         seconds, error = root(fit.variance, fit.variance_error)
         rad = 2.0 * np.pi * evidence.model.fundamental_frequency
-        text = (f'the vibration moves by {seconds:.3g} s against the pulses and the pulse times '
-                f'follow with slope {slope.slope:.2f} +- {slope.standard_error:.2f} only, '
+        text = (f'the vibration moves by {seconds:.3g} s against the pulses, whose times do not '
+                f'show {slope.share:.2f} +- {slope.standard_error:.2f} of the motion, '
                 f'p = {slope.p_value:.2g}')
         rivals = () if slope.decided else ('correlated_jitter',)
         against = ''
         if rivals:
-            better = max(fit_covariance(evidence, white).gain,
-                         fit_memory(evidence).gain - _FREEDOM)
-            if better > fit.gain:
+            whole = evidence.of_all
+            better = max(fit_covariance(whole, white).gain, fit_memory(whole).gain - _FREEDOM)
+            own = fit_covariance(whole, _correlation, bounds=(_NARROW, 0.5)).gain - _FREEDOM
+            if better > own:
                 against = ('independent or autoregressive pulse errors explain them better: twice '
-                           f'the log-likelihood gains {better:.1f} with them, {fit.gain:.1f} with '
+                           f'the log-likelihood gains {better:.1f} with them, {own:.1f} with '
                            'a wander')
-        return Finding(cls.name, cls(rad * seconds), {'std': rad * error},
+        return Finding(cls.name, cls(rad * seconds, bandwidth),
+                       {'std': rad * error, 'bandwidth': bandwidth_error},
                        max(fit.p_value, 1e-300), text, against, rivals=rivals,
                        decider='a second keyphasor, or a steadier speed' if rivals else '')
+
+
+def _band(bandwidth: float) -> tuple[float, float]:
+    return SLOW_BAND[0], bandwidth
+
+
+def _correlation(lags: Array, bandwidth: float) -> Array:
+    return recovered_correlation(lags, _band(bandwidth))

@@ -123,6 +123,11 @@ def fit_memory(evidence: Evidence) -> CovarianceFit:
     return fit_covariance(evidence, autoregressive, bounds=(-0.98, 0.98))
 
 
+def memory_p_value(evidence: Evidence) -> float:
+    """Return the p value of correlated errors where independent ones are there anyway."""
+    return fit_memory(evidence).p_value_over(fit_covariance(evidence, white))
+
+
 def log_likelihood(evidence: Evidence) -> float:
     """Return that of the pulse errors if they are what declared jitter and `explained` make."""
     errors = np.diff(evidence.errors[:, :_MOST_PULSES], axis=1)

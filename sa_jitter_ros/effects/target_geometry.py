@@ -22,6 +22,7 @@ class TargetGeometry(Effect):
 
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'
+    of_pulses: ClassVar[bool] = True
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')
 
@@ -56,7 +57,8 @@ class TargetGeometry(Effect):
         folds = {p: _folded(evidence, p) for p in sorted(periods)}
         best = min(folds, key=lambda p: folds[p][3] - (_KNOWN if p == own else 0.0))
         mean, log_p_value, error, _ = folds[best]
-        p_value = min(1.0, math.exp(max(log_p_value, -690.0)) * len(folds))
+        choices = 1 if best == own else len(folds)
+        p_value = min(1.0, math.exp(max(log_p_value, -690.0)) * choices)
         size = float(np.sqrt(np.mean(mean**2)))
         text = (f'the pulse errors repeat every {best} trigger pulses with {size:.3g} s, '
                 f'p = {p_value:.2g}')

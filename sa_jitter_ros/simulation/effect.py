@@ -69,10 +69,12 @@ class Effect:
         return np.ones(index.shape, dtype=np.bool_)
 
 
-def slow_process(setting: Setting, std: float, name: str) -> SinusoidSum:
+def slow_process(setting: Setting, std: float, name: str, *, bandwidth: float = 0.4
+                 ) -> SinusoidSum:
     """Return a random function of time, band-limited well below half the trigger rate."""
     rate = setting.trigger_rate
-    return band_limited(std=std, band=(0.02 * rate, 0.4 * rate), seed=setting.seed, name=name)
+    return band_limited(std=std, band=(0.02 * rate, bandwidth * rate), seed=setting.seed,
+                        name=name)
 
 
 def require_number(name: str, value: float, *, minimum: float = -math.inf,

@@ -39,18 +39,21 @@ class PhaseWander(Effect):
     """
     Slow random angle of `std` rad between a shaft and its vibration, of each shaft its own.
 
-    It is band-limited below half the trigger rate.
+    It has frequencies up to `bandwidth` times the trigger rate.
     """
 
     std: float
+    bandwidth: float = 0.4
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('phase_wander.std', self.std, minimum=0)
+        require_number('phase_wander.bandwidth', self.bandwidth, minimum=0.05, below=0.5)
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
         """Return the angle in rad of the shaft."""
-        return slow_process(setting, self.std, f'phase_wander {shaft}').value(times)
+        return slow_process(setting, self.std, f'phase_wander {shaft}',
+                            bandwidth=self.bandwidth).value(times)
 
 
 @dataclass(frozen=True)
