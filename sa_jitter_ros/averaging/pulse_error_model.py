@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from math import factorial, pi
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy.interpolate import BarycentricInterpolator
 from scipy.linalg import qr
 
 FloatArray = NDArray[np.float64]
@@ -117,9 +117,8 @@ def compress(samples: FloatArray, *, ratio: float, first_angle: float, orders: F
     u = np.arange(len(samples)) / len(samples)
     nodes, columns = [], [np.ones((len(u), 1))]
     for g in orders:
-        x = 0.5 + 0.5 * np.polynomial.legendre.leggauss(nodes_for(g * spread))[0]
-        wave = np.exp(2j * pi * g * ratio * u)[:, None] * BarycentricInterpolator(
-            x, np.eye(len(x)))(u)
+        x, through_nodes = _through_nodes(nodes_for(g * spread), u)
+        wave = np.exp(2j * pi * g * ratio * u)[:, None] * through_nodes
         nodes.append(x)
         columns += [wave.real, -wave.imag]
     basis, triangle = qr(np.concatenate(columns, axis=1), mode='economic', overwrite_a=True,
@@ -133,3 +132,15 @@ def compress(samples: FloatArray, *, ratio: float, first_angle: float, orders: F
     start = np.multiply.outer(first_angle + ratio * np.arange(count), orders) % 1.0
     return CompressedCycles(np.ascontiguousarray(coefficients.transpose(1, 0, 2)), orders,
                             ends - 2 * widths, tuple(nodes), mixing, start)
+
+
+def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """
+    Return Gauss nodes in [0, 1] and the polynomials (u, node) that are 1 at one of them each.
+
+    Gauss quadrature is exact for what these are made of: products of Legendre polynomials.
+    """
+    x, weight = legendre.leggauss(count)
+    sizes = np.arange(count) + 0.5
+    at_nodes = legendre.legvander(x, count - 1) * weight[:, None]
+    return 0.5 + 0.5 * x, (legendre.legvander(2.0 * u - 1.0, count - 1) * sizes) @ at_nodes.T

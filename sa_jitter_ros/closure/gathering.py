@@ -12,7 +12,8 @@ from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Observation, recovered_again
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
-from sa_jitter_ros.effects.lattice import Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room
+from sa_jitter_ros.effects.lattice import (
+    Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording

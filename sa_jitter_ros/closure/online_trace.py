@@ -118,8 +118,8 @@ def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observati
             errors=errors - errors.mean(), standard_errors=error, reference=None,
             raw=item.raw[:, kept], corrected=item.corrected[:, kept],
             cycles=item.corrected[None][:, :, kept], noise=item.noise[:, kept],
-            ripple=np.full(count, np.nan), ripple_standard_error=math.inf, recovered=True,
-            reason=''))
+            noise_floor=item.noise[:, kept], ripple=np.full(count, np.nan),
+            ripple_standard_error=math.inf, recovered=True, reason=''))
     speed = float(np.mean([item.trigger_speed for item in averages]))
     orders = measured[kept]
     record = np.concatenate(times)
