@@ -107,8 +107,7 @@ def keyphasor_quantisation(rng: Generator, machine: Machine) -> Sized:
 def missing_pulses(rng: Generator, machine: Machine) -> Sized:
     """Return a keyphasor that now and then gives no pulse."""
     lost = float(rng.uniform(0.004, 0.04))
-    return lambda size: (Disturbance(lost=lost), {
-        'probability': 1.0 - (1.0 - lost) ** machine.pulses_per_trigger})
+    return lambda size: (Disturbance(lost=lost), {'probability': lost})
 
 
 def interpolation_loss(rng: Generator, machine: Machine) -> Sized:

@@ -8,13 +8,13 @@ the beat tells the mean loss, which raw and corrected amplitudes share and their
 show.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.angle.resampling import interpolate
-from scipy import stats
+from scipy.ndimage import median_filter
 
 Array = NDArray[Any]
 
@@ -22,6 +22,8 @@ METHODS = ('linear', 'cubic', 'spline')
 _PLACES = 32
 _CERTAIN = 1e-9
 _DEEPEST = 1.15
+_KNOWN = 0.05  # error of the shape
+_AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 _POOR = 6.0  # mean square misfit of the depths, in their errors, that is no interpolator's
 
 
@@ -35,6 +37,7 @@ class Beat:
 
     method: str
     p_value: float
+    log_p_value: float
     gain: Array
     depth: Array
 
@@ -46,40 +49,50 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     `frequency` (line,) is in units of the sampling rate.
     """
     count, lines = radial.shape
-    nothing = Beat('', 1.0, np.ones(lines), np.zeros(lines))
+    nothing = Beat('', 1.0, 0.0, np.ones(lines), np.zeros(lines))
     if count < 32 or np.unique(frequency).size < 3:
         return nothing
     window = np.hanning(count + 2)[1:-1]
     spectrum = np.fft.rfft((radial - radial.mean(axis=0)) * window[:, None], 4 * count, axis=0)[8:]
+    swings = 2.0 * spectrum / window.sum()
     power = np.abs(spectrum) ** 2
-    floor = np.median(power, axis=0) / np.log(2.0)
-    total = np.sum(power / floor, axis=1)
-    peak = int(np.argmax(total))
-    p_value = float(min(1.0, count * stats.gamma.sf(total[peak], lines)))
-    swings = 2.0 * spectrum[peak] / window.sum()
-    depth = np.abs(swings)
-    error = 2.0 * np.sqrt(floor) / window.sum()
-    if p_value > _CERTAIN:
-        return Beat('', p_value, np.ones(lines), depth)
-    best, method, gain = _misfit(swings, np.ones(lines), error)[0], '', np.ones(lines)
+    floor = np.maximum(np.median(power, axis=0), median_filter(power, (_AROUND, 1)))
+    error = 2.0 * np.sqrt(floor / np.log(2.0)) / window.sum()
+    alike = _fits(swings, np.ones(lines), error)[1]  # a modulation of all lines is no beat
+    best, least = nothing, 1.0
     for name in METHODS:
         mean, swing = _interpolated(name, frequency)
-        misfit, size = _misfit(swings, swing / mean, error)
-        if misfit < min(best, _POOR * lines) and 0.0 < size <= _DEEPEST:
-            best, method = misfit, name
-            gain = 1.0 - (1.0 - mean) * np.clip(depth / (size * swing / mean), 0.5, 1.5)
-    return Beat(method, p_value, gain, depth)
+        log_p_value, misfit, size = _fits(swings, swing / mean, error)
+        chance = np.log(len(METHODS) * count) + log_p_value
+        fitting = (misfit < np.minimum(alike, _POOR * lines)) & (size <= _DEEPEST)
+        least = min(least, float(np.exp(np.min(chance))))
+        if not np.any(fitting & (chance < np.log(_CERTAIN))):
+            continue
+        peak = int(np.argmin(np.where(fitting, chance, 0.0)))
+        p_value = float(np.exp(chance[peak]))
+        if best.method and not chance[peak] < best.log_p_value:
+            continue
+        depth = np.abs(swings[peak])
+        wanted = size[peak] * swing / mean
+        # The shape is known to so much, what a line shows by its own noise.
+        share = _KNOWN**2 / (_KNOWN**2 + (error[peak] / wanted) ** 2)
+        gain = 1.0 - (1.0 - mean) * (1.0 + share * np.clip(depth / wanted - 1.0, -0.5, 0.5))
+        best = Beat(name, p_value, float(chance[peak]), gain, depth)
+    return best if best.method else replace(nothing, p_value=least)
 
 
-def _misfit(swings: Array, shape: Array, error: Array) -> tuple[float, float]:
+def _fits(swings: Array, shape: Array, error: Array) -> tuple[Array, Array, Array]:
     """
-    Return the sum of squares that a shape of any size and phase leaves, and its best size.
+    Fit a shape (line,) of any size and phase to `swings` of some `error` (frequency, line).
 
-    `swings` (line,) are complex; lines that swing out of step fit no shape.
+    Returns, by frequency, the logarithm of the chance of as large a swing, the sum of squares that
+    is left (lines that swing out of step, or for themselves, fit no shape) and the size.
     """
-    weight = 1.0 / (error**2 + (0.05 * np.abs(swings)) ** 2)
-    size = np.sum(weight * swings * shape) / np.sum(weight * shape**2)
-    return float(np.sum(weight * np.abs(swings - size * shape) ** 2)), float(np.abs(size))
+    alone = np.sum(swings * shape / error**2, axis=1)
+    weight = 1.0 / (error**2 + (_KNOWN * np.abs(swings)) ** 2)
+    size = np.sum(weight * swings * shape, axis=1) / np.sum(weight * shape**2, axis=1)
+    left = np.sum(weight * np.abs(swings - size[:, None] * shape) ** 2, axis=1)
+    return -np.abs(alone) ** 2 / np.sum((shape / error) ** 2, axis=1), left, np.abs(size)
 
 
 def _interpolated(method: str, frequency: Array) -> tuple[Array, Array]:

@@ -166,7 +166,9 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     evidence = LineEvidence(
         order=observation.orders[lines.order], channel=lines.channel, level=level,
         noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
-    beat = find_beat(along.reshape(-1, along.shape[2]), evidence.order
+    # What changes from acquisition to acquisition is the machine's own.
+    steady = along - along.mean(axis=1, keepdims=True)
+    beat = find_beat(steady.reshape(-1, along.shape[2]), evidence.order
                      * model.fundamental_frequency / observation.sample_rate)
     evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
                        beat_gain=beat.gain)

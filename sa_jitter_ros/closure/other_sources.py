@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import grid_points
-from sa_jitter_ros.closure.cycle_reader import clear_ripple, CycleReader, recover
+from sa_jitter_ros.closure.cycle_reader import CycleReader, recover
 from sa_jitter_ros.closure.trigger_pulses import TriggerPulses
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -45,7 +45,7 @@ def other_sources(reader: CycleReader, pulses: TriggerPulses, model: DeclaredMod
         if recovery.accepted:
             better = times - recovery.errors
             points = grid_points(1.02 * model.trigger_period, reader.rate)
-            cycles = reader.cycles(better, points, ripple=clear_ripple(recovery, model))
+            cycles = reader.cycles(better, points)
             flat = cycles.reshape(-1, cycles.shape[2])
             window = np.hanning(len(flat) + 1)[:-1, None]
             spectra.append(np.fft.rfft(flat * window, _PADDED * len(flat), axis=0)

@@ -48,8 +48,15 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
     step = model.pulses_per_trigger or model.pulses_per_revolution
     times = _pulse_times(recording)
     missing = missing_pulses(times)
-    if step > 1:
-        times, missing = _every(times, missing, step)
+    better = recording.reference_pulse_times
+    reference = None if better is None or better.size < 0.6 * times.size else _matched(
+        times, missing, better)
+    chosen, missing = _every(missing, step)
+    times = times[chosen]
+    if reference is not None:
+        reference = reference[chosen]
+    elif better is not None:  # one pulse a trigger cycle
+        reference = _matched(times, missing, better)
     if times.size < 3:
         raise RecordingError(f'{times.size} trigger pulses: a trigger cycle needs two, the loop '
                              'several acquisitions')
@@ -58,12 +65,6 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {speed:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
-    reference = None
-    if recording.reference_pulse_times is not None:
-        better = recording.reference_pulse_times
-        if step > 1 and better.size > 0.6 * step * times.size:
-            better = _every(better, missing_pulses(better), step)[0] if step > 1 else better
-        reference = _matched(times, missing, better)
     return TriggerPulses(times, missing, reference)
 
 
@@ -124,11 +125,11 @@ def _pulse_times(recording: Recording) -> FloatArray:
     return np.concatenate(found)
 
 
-def _every(times: FloatArray, missing: IntArray, step: int) -> tuple[FloatArray, IntArray]:
-    """Return every `step`-th pulse as they come, and how many triggers lack between them."""
-    chosen = times[::step]
-    gaps = np.add.reduceat(missing, np.arange(0, missing.size, step))[:chosen.size - 1]
-    return chosen, np.asarray(np.rint(gaps / step), np.int64)
+def _every(missing: IntArray, step: int) -> tuple[IntArray, IntArray]:
+    """Return which pulses are every `step`-th, missing ones counted, and how many of these lack."""
+    count = np.concatenate(([0], np.cumsum(1 + missing)))
+    chosen = np.flatnonzero(count % step == 0)
+    return chosen, np.diff(count[chosen]) // step - 1
 
 
 def _matched(times: FloatArray, missing: IntArray, better: FloatArray) -> FloatArray:
