@@ -147,13 +147,49 @@ def test_recovery_sees_a_motion_as_least_squares_does(rng):
     assert size == pytest.approx(ripple_of_acceleration(narrow), rel=4.0 / np.sqrt(1200.0))
 
 
-def test_wander_is_fitted_within_its_error(rng):
+@pytest.mark.parametrize('bandwidth', [0.2, SLOW_BAND[1]])
+def test_wander_is_fitted_within_its_error(rng, bandwidth):
     found = []
     for _ in range(30):
-        moving = 1e-4 * recovered(sines(rng, SLOW_BAND))[0]
+        moving = 1e-4 * recovered(sines(rng, (SLOW_BAND[0], bandwidth)))[0]
         found.append(EFFECTS['phase_wander'].fit(evidence_of(
             rng, declared(rng) + moving, moving=moving)))
-    check(z_scores(found, std=1e-4 * 2.0 * np.pi * 25.0)['std'])
+    off = z_scores(found, std=1e-4 * 2.0 * np.pi * 25.0, bandwidth=bandwidth)
+    check(off['std'])
+    assert abs(np.mean(off['bandwidth'])) < 3.5 / np.sqrt(30)
+
+
+@pytest.mark.parametrize(('top', 'memory'), [
+    (0.15, 0.0), (SLOW_BAND[1], 0.0), (0.0, 0.0), (0.0, 0.8)])
+def test_whose_error_it_is_is_told_by_its_standard_error(rng, top, memory):
+    """Motions of the source up to `top`, or pulse errors of a memory: shares of 1 and 0."""
+    off = []
+    for _ in range(40):
+        moving = (1e-4 * recovered(sines(rng, (0.0, top)))[0] if top
+                  else np.zeros((ACQUISITIONS, PULSES)))
+        late = 0.0 if top else stationary(rng, (8e-5) ** 2 * memory**LAGS)
+        test = slope_test(evidence_of(rng, declared(rng) + moving + late, moving=moving))
+        assert test.decided
+        assert test.tach_side == (top == 0.0)
+        off.append((test.share - (top > 0.0)) / test.standard_error)
+    # What is declared is told from what is not by the spectrum of a few acquisitions, which
+    # errs by some standard errors on the side of the tach.
+    assert abs(np.mean(off)) < 1.5
+    assert np.std(off) < 1.5
+
+
+def test_all_acquisitions_tell_the_effect_and_half_of_them_its_size(rng):
+    """A memory is told by all acquisitions; what is fitted is that of the first."""
+    told = []
+    for _ in range(15):
+        errors = declared(rng) + stationary(rng, 1e-8 * 0.5**LAGS)
+        few = evidence_of(rng, errors[:4])
+        found = EFFECTS['correlated_jitter'].fit(replace(few, whole=evidence_of(rng, errors)))
+        told.append(found.effect is not None)
+        if found.effect is not None:
+            own = EFFECTS['correlated_jitter'].fit(replace(few, errors=few.errors))
+            assert own.effect is None or own.effect == found.effect
+    assert sum(told) >= 13
 
 
 def test_acceleration_is_fitted_within_its_error(rng):

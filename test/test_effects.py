@@ -182,6 +182,10 @@ def test_phase_wander_turns_by_its_standard_deviation():
     prediction = predict_with(quiet, [make_effect('phase_wander', std=0.01)])
     assert np.abs(prediction.moments.mean) == pytest.approx(
         np.exp(-0.5 * (0.01 * np.array(MODEL.orders)) ** 2), rel=1e-9)
+    # What is slower is more alike over the cycles of an average, and scatters it more.
+    slow = predict_with(quiet, [make_effect('phase_wander', std=0.01, bandwidth=0.1)])
+    assert np.abs(slow.moments.mean) == pytest.approx(np.abs(prediction.moments.mean), rel=1e-9)
+    assert (slow.moments.variance > 2.0 * prediction.moments.variance).all()
 
 
 def test_missing_pulses_are_counted_angle_that_lacks(rng):

@@ -24,7 +24,8 @@ _TOLD, _MOVED = 7.0, 0.01
 _DECISIVE, _MATERIAL = 1e-6, 2.0 * ACCURACY
 # Scatter of an amplitude, in parts of it, that nobody asks the cause of.
 _FAINT = 1e-3
-_HIDDEN = 'the ticks of the clock leave room for all pulse errors that there are'
+_NEARLY_ALL = 0.8
+_HIDDEN = 'the ticks of the clock leave room for the errors of all pulses'
 # Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
 _SAME = 0.01
 # Most specific evidence first: what one sees in the pulse times themselves, then in the order of
@@ -87,6 +88,8 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         if not rejected and not (new > old or told or (kind.seen and new > old - _SAME)):
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
+        if not rejected and not (told or kind.seen):
+            rejected = _leaves(kind.scatters, current, score)
         found.append(Candidate(name, number, finding, new, rejected))
     return found
 
@@ -108,6 +111,19 @@ def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
     square = (np.maximum(with_it.amplitude_variance - without.amplitude_variance, 0.0)
               if more.scatters else (with_it.attenuation - without.attenuation) ** 2)
     return float(np.sqrt(np.mean(square, axis=0).max()))
+
+
+def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
+    """Say that an effect leaves nearly all of a significant residual; '' where it does not."""
+    if scatters:
+        old, new = before.chi2_per_dof - 1.0, after.chi2_per_dof - 1.0
+        if after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
+            return (f'it leaves nearly all of the scatter: chi2 per degree of freedom '
+                    f'{new + 1.0:.3g} after {old + 1.0:.3g}')
+    elif after.p_attenuation < SIGNIFICANT and after.rms > _NEARLY_ALL * before.rms:
+        return (f'it leaves nearly all of the residual: RMS {after.rms:.4f} after '
+                f'{before.rms:.4f}')
+    return ''
 
 
 def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:

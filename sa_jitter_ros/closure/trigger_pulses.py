@@ -126,7 +126,7 @@ def _pulse_times(recording: Recording) -> FloatArray:
 
 
 def _every(missing: IntArray, step: int) -> tuple[IntArray, IntArray]:
-    """Return which pulses are every `step`-th, missing ones counted, and how many of these lack."""
+    """Return which pulses are every `step`-th, lacking ones counted, and how many of it lack."""
     count = np.concatenate(([0], np.cumsum(1 + missing)))
     chosen = np.flatnonzero(count % step == 0)
     return chosen, np.diff(count[chosen]) // step - 1

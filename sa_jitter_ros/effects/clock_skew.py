@@ -18,7 +18,6 @@ class ClockSkew(Effect):
 
     name: ClassVar[str] = 'clock_skew'
     summary: ClassVar[str] = 'clock of the keyphasor against that of the vibration'
-    of_pulses: ClassVar[bool] = True
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
 

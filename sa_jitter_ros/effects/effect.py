@@ -105,7 +105,7 @@ class Effect:
     scatters: ClassVar[bool] = False
     #: Whether it is seen in the pulses themselves, so that it is reported whatever it does.
     seen: ClassVar[bool] = False
-    #: Whether recovered pulse errors are what tells it.
+    #: Whether the recovered errors of single pulses are what tells it.
     of_pulses: ClassVar[bool] = False
     #: Whether the vibration moves and the pulses are right, however its motion is recovered.
     moves_vibration: ClassVar[bool] = False
