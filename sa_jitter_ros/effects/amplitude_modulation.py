@@ -95,6 +95,8 @@ def _band_of(slow: float, cycles: int) -> tuple[float, float]:
     """Return the band that leaves a share `slow` of the variance in averages of some cycles."""
     if _variance_of_mean(cycles, SLOW_BAND) >= slow:
         return SLOW_BAND
-    tops = np.geomspace(SLOW_BAND[1], 1e-4, 40)
-    shares = np.array([_variance_of_mean(cycles, (0.0, top)) for top in tops])
-    return 0.0, float(tops[np.argmin(np.abs(shares - slow))])
+    bands = [*((low, SLOW_BAND[1]) for low in np.linspace(SLOW_BAND[0], 0.0, 20)),
+             *((0.0, top) for top in np.geomspace(SLOW_BAND[1], 1e-4, 40))]
+    shares = np.array([_variance_of_mean(cycles, band) for band in bands])
+    low, top = bands[int(np.argmin(np.abs(shares - slow)))]
+    return float(low), float(top)
