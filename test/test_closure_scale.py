@@ -166,3 +166,26 @@ def test_lines_that_beat_out_of_step_were_not_interpolated(rng):
 
     assert method(np.zeros(4)) != ''
     assert method(np.array([0.0, 2.0, 4.0, 1.0])) == ''
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.7, 0.95])
+def test_slow_errors_turn_averages_and_do_not_scatter_their_amplitude(observation, correlation):
+    effect = make_effect('correlated_jitter', std=1e-4, correlation=correlation)
+    lines, level, group = lines_of(observation)
+    pulses = [[Pulses(item.times, item.first)] for item in observation.acquisitions]
+    found = expect(observation, lines, level, [effect], pulses, group, [0])
+    rng, draws = np.random.default_rng(2), 20_000
+    slow = np.empty((draws, CYCLES + 1))
+    slow[:, 0] = rng.standard_normal(draws)
+    for k in range(CYCLES):
+        slow[:, k + 1] = correlation * slow[:, k] + np.sqrt(
+            1.0 - correlation**2) * rng.standard_normal(draws)
+    errors = 1e-4 * slow + rng.uniform(-0.5, 0.5, slow.shape) / MODEL.keyphasor_rate
+    turns = np.multiply.outer(MODEL.orders, SPEED * errors)
+    amplitude = np.abs(np.mean(np.exp(1j * np.pi * (turns[..., 1:] + turns[..., :-1]))
+                               * np.sinc(np.diff(turns)), axis=2))
+    mean, std = amplitude.mean(axis=1), amplitude.std(axis=1)
+    order = np.searchsorted(MODEL.orders, observation.orders[lines.order])
+    # The normal law leaves out the skewness of an average of 20 cycles.
+    assert found.attenuation[0] == pytest.approx(mean[order], abs=3e-3)
+    assert np.sqrt(found.attenuation_variance[0]) == pytest.approx(std[order], rel=0.25, abs=1e-3)

@@ -20,7 +20,8 @@ from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
 from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
 from sa_jitter_ros.statistics.angle_error import (
-    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
+    AngleErrorProcess, GaussianAngleError, IndependentPulseJitter, joint_characteristic,
+    unit_nodes)
 from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.moments import (
     AverageMoments, cycle_moments, noise_line_variance)
@@ -34,6 +35,7 @@ _NODES, _MOST_NODES = 32, 800
 # Speeds closer than this are the same.
 _SPEED_STEP = 1e-3
 _SHARPEST = 2.0
+_LEAST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -190,14 +192,43 @@ def _unknown(observation: Observation, effects: Sequence[Effect],
         variance = np.mean(each.variance + np.abs(spread) ** 2, axis=0) + np.abs(mean)**2 - size**2
         return AverageMoments(size.astype(complex), np.maximum(variance, 0.0),
                               np.mean(each.pseudo_variance, axis=0))
-    return cycle_moments(model.orders, processes, nodes=_NODES).averaged(model.trigger_cycles)
+    moments = cycle_moments(model.orders, processes, nodes=_NODES)
+    return _aligned(moments.averaged(model.trigger_cycles), model, processes)
 
 
 def _known(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
            ) -> AverageMoments:
     """Return the moments (order,) with known pulse errors (s)."""
     each = scenario_moments(observation.model, processes, errors[None])
-    return AverageMoments(each.mean[0], each.variance[0], each.pseudo_variance[0])
+    return _aligned(AverageMoments(each.mean[0], each.variance[0], each.pseudo_variance[0]),
+                    observation.model, processes)
+
+
+def _aligned(moments: AverageMoments, model: DeclaredModel,
+             processes: Sequence[AngleErrorProcess]) -> AverageMoments:
+    """
+    Return the moments (order,) of averages that are turned back by their mean angle error.
+
+    The amplitude does not know that angle, which slow errors turn a whole average by; the law of
+    the amplitude is near the normal one only without it. E|X|^2 stays as it is.
+    """
+    count, (u, w) = model.trigger_cycles, _nodes(_NODES)
+    common = 0.0
+    for process in processes:
+        if isinstance(process, GaussianAngleError):
+            within = [w @ process.covariance(u[:, None], u, lag) @ w
+                      for lag in range(min(process.correlation_length, count - 1) + 1)]
+            share = (1.0 - np.arange(len(within)) / count) * np.where(
+                np.arange(len(within)) > 0, 2.0, 1.0)
+            common += float(share @ within) / count
+    turn = np.exp((2.0 * np.pi * np.asarray(model.orders)) ** 2 * common)
+    square = (moments.pseudo_variance + moments.mean**2) * turn**2
+    mean = moments.mean * np.minimum(np.sqrt(turn), np.sqrt(moments.mean_square) / np.maximum(
+        np.abs(moments.mean), _LEAST))
+    variance = np.maximum(moments.mean_square - np.abs(mean) ** 2, 0.0)
+    pseudo = square - mean**2
+    most = variance / np.maximum(np.abs(pseudo), _LEAST)
+    return AverageMoments(mean, variance, pseudo * np.minimum(most, 1.0))
 
 
 def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
