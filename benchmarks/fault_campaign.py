@@ -195,8 +195,10 @@ class Campaign:
             sent = self.disturber.rejected[role]
             if role in self._refused:
                 self._compare(f'{role}: messages_rejected', counted - self._refused[role][0],
-                              sent - self._refused[role][1], 0)
+                              sent - self._refused[role][1],
+                              self.disturber.replaced if role == 'analyser' else 0)
             self._refused[role] = counted, sent
+        self.disturber.replaced = 0
 
     def _compare(self, what: str, counted: int, expected: int, slack: int) -> None:
         if abs(counted - expected) > slack:

@@ -59,6 +59,7 @@ class Disturber:
         self.faults: list[str] = []
         self.wrong: list[str] = []
         self.rejected = dict.fromkeys(('predictor', 'analyser'), 0)
+        self.replaced = 0  # of these at most: a latched topic keeps the newest message only
         self._asked: list[tuple[str, str, Any, bool, Future]] = []
 
     def plan(self, *, kills: bool) -> list[Callable[[], None]]:
@@ -130,6 +131,7 @@ class Disturber:
                                tuple(self.rng.standard_normal(int(self.rng.integers(7)))))
         self._graph.send(topic, message)
         self.rejected['analyser'] += 1
+        self.replaced += topic == 'prediction'
 
     def _stall(self) -> None:
         role = str(self.rng.choice(list(ROLES)))
