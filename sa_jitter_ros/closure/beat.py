@@ -4,8 +4,8 @@ The beat that an interpolator leaves: how much amplitude it cost, from the sampl
 Samples that were read between the samples of another clock lose amplitude most half-way between
 two of them and nothing on one of them. As the two clocks drift through each other, every line
 beats at one common frequency and in step, the more the higher its own frequency is. The depth of
-the beat tells the mean loss, which raw and corrected amplitudes share and their ratio does not
-show.
+the beat is known and tells the mean loss, which raw and corrected amplitudes share and their ratio
+does not show. Found are beats slower than half the trigger rate.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ Array = NDArray[Any]
 METHODS = ('linear', 'cubic', 'spline')
 _PLACES = 32
 _CERTAIN = 1e-9
-_DEEPEST = 1.15
+_OFF = 0.15  # depth beside that of samples at even places between the others
 _KNOWN = 0.05  # error of the shape
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 _POOR = 6.0  # mean square misfit of the depths, in their errors, that is no interpolator's
@@ -58,13 +58,16 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     power = np.abs(spectrum) ** 2
     floor = np.maximum(np.median(power, axis=0), median_filter(power, (_AROUND, 1)))
     error = 2.0 * np.sqrt(floor / np.log(2.0)) / window.sum()
+    turns = np.arange(8, 8 + len(spectrum)) / (4 * count)
+    depth_left = np.sinc(turns)  # of the mean over a trigger cycle
     alike = _fits(swings, np.ones(lines), error)[1]  # a modulation of all lines is no beat
     best, least = nothing, 1.0
     for name in METHODS:
         mean, swing = _interpolated(name, frequency)
         log_p_value, misfit, size = _fits(swings, swing / mean, error)
         chance = np.log(len(METHODS) * count) + log_p_value
-        fitting = (misfit < np.minimum(alike, _POOR * lines)) & (size <= _DEEPEST)
+        fitting = (misfit < np.minimum(alike, _POOR * lines)) & (
+            np.abs(size / depth_left - 1.0) < _OFF)
         least = min(least, float(np.exp(np.min(chance))))
         if not np.any(fitting & (chance < np.log(_CERTAIN))):
             continue
