@@ -100,7 +100,8 @@ def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, ef
     confusion = benchmark('independent_confusion')
     run = confusion.judge(effects, seed, tmp_path)
     assert run.right, run
-    assert run.after <= 0.2 * run.before or not effects
+    assert all(abs(z) < 4.0 for z in run.errors.values())
+    assert run.after < 0.5 * run.before or not effects  # six acquisitions to fit
     assert row in confusion.table([run])
 
 
