@@ -88,7 +88,8 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         if not rejected and not (new > old or told or (kind.seen and new > old - _SAME)):
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
-        if not rejected and not (told or kind.seen):
+        plain = told or kind.seen or (finding.p_value < _DECISIVE and not kind.scatters)
+        if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
         found.append(Candidate(name, number, finding, new, rejected))
     return found
