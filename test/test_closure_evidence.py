@@ -53,17 +53,42 @@ def test_lost_pulses_between_triggers_change_nothing(rng):
     np.testing.assert_allclose(found.reference[1:], true[there][1:], atol=1e-12)
 
 
+def beats(frequency, place):
+    """Return what linear interpolation at each `place` makes of lines, over their mean, less 1."""
+    later = np.exp(2j * np.pi * frequency)
+    gain = (1.0 - place + place * later) / later**place
+    return gain.real / gain.real.mean(axis=0) - 1.0
+
+
+FREQUENCY = np.array([0.08, 0.16, 0.24, 0.32])
+
+
 def test_beat_is_found_among_what_else_moves_the_lines(rng):
-    frequency = np.array([0.08, 0.16, 0.24, 0.32])
     cycle = np.arange(600)[:, None]
-    beat = 0.25 * (np.pi * frequency) ** 2 * np.cos(2.0 * np.pi * 0.0873 * cycle)
+    beat = beats(FREQUENCY, (0.0873 * cycle) % 1.0)
     # Another shaft's orders: every line beats for itself, and far more than by interpolation.
     others = 0.2 * np.cos(2.0 * np.pi * 0.239 * cycle + rng.uniform(0.0, 6.0, 4))
     noise = rng.normal(0.0, 1e-3, (600, 4))
-    assert find_beat(others + noise, frequency).method == ''
-    found = find_beat(beat + others + noise, frequency)
+    assert find_beat(others + noise, FREQUENCY).method == ''
+    found = find_beat(beat + others + noise, FREQUENCY)
     assert found.method == 'linear'
-    assert found.depth == pytest.approx(np.abs(beat).max(axis=0), rel=0.02, abs=1e-3)
+    wave = np.exp(-2j * np.pi * 0.0873 * cycle)
+    assert found.depth == pytest.approx(2.0 * np.abs((beat * wave).mean(axis=0)), rel=0.05,
+                                        abs=1e-3)
+
+
+def test_lines_that_beat_otherwise_were_not_interpolated(rng):
+    cycle = np.arange(240)[:, None]
+    beat = beats(FREQUENCY, (0.0873 * cycle) % 1.0)
+
+    def method(radial):
+        return find_beat(radial + rng.normal(0.0, 2e-4, beat.shape), FREQUENCY).method
+
+    assert method(beat) == 'linear'
+    assert method(0.5 * beat) == ''  # not as deep
+    assert method(beat[:, ::-1]) == ''  # not as the frequencies
+    delay = np.array([0, 4, 7, 2])  # out of step
+    assert method(np.stack([np.roll(row, n) for row, n in zip(beat.T, delay)], axis=1)) == ''
 
 
 def test_errors_within_ticks_are_told_from_larger_ones(rng):

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.expectation import expect, Lines
 from sa_jitter_ros.closure.gathering import line_evidence
 from sa_jitter_ros.closure.observation import observe
@@ -153,19 +152,6 @@ def test_noise_that_passes_for_larger_jitter_is_not_corrected():
     noisy = simulated(noise=1.5, jitter=1e-6)
     with pytest.raises(SignalError, match='align noise to itself'):
         observe(noisy, replace(MODEL, keyphasor_rate=20000.0, noise_std=1.5))
-
-
-def test_lines_that_beat_out_of_step_were_not_interpolated(rng):
-    frequency = np.array([0.08, 0.16, 0.24, 0.32])
-    cycle = np.arange(240)
-    depth = 0.25 * (np.pi * frequency) ** 2
-
-    def method(phase):
-        beat = depth * np.cos(2.0 * np.pi * 0.0873 * cycle[:, None] + phase)
-        return find_beat(beat + rng.normal(0.0, 2e-4, beat.shape), frequency).method
-
-    assert method(np.zeros(4)) != ''
-    assert method(np.array([0.0, 2.0, 4.0, 1.0])) == ''
 
 
 @pytest.mark.parametrize('correlation', [0.0, 0.7, 0.95])

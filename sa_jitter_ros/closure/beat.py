@@ -24,7 +24,7 @@ _CERTAIN = 1e-9
 _OFF = 0.15  # depth beside that of samples at even places between the others
 _KNOWN = 0.05  # error of the shape
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
-_POOR = 2.0  # mean square misfit of the depths, in their errors, that is no interpolator's
+_POOR = 3.0  # mean square misfit of the depths, in their errors, that is no interpolator's
 
 
 @dataclass(frozen=True)
