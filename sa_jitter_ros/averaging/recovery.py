@@ -77,8 +77,8 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
     pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
     pulse error. `orders` restricts the recovery to these; without it, those integer orders and
-    orders in `also` are taken that stand out most, at most `most_orders` and as many as are in
-    `also`. `with_ripple` fits a speed ripple u (1 - u) of every cycle jointly.
+    orders in `also` are taken that stand out most, at most `most_orders` and as many more as are
+    not integer in `also`. `with_ripple` fits a speed ripple u (1 - u) of every cycle jointly.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
     ratio or standard deviation that is not positive.
@@ -146,6 +146,7 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
     samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
     given = np.unique([g for g in orders if 0.0 < g * ratio <= 0.5 * len(samples)])
     search = None if len(orders) else LineSearch.of(samples, ratio, also)
+    most = most_orders + sum(g != round(g) for g in set(also))
     rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
     known = given if search is None else search.orders
     width = _UNIFORM_WIDTH * declared  # of the interval that an error is still expected in
@@ -155,7 +156,7 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
         candidates = (given[given <= reach] if search is None
-                      else search.strongest(errors, most_orders + len(also), below=reach))
+                      else search.strongest(errors, most, below=reach))
         # no more unknowns than half of what a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])
