@@ -40,7 +40,7 @@ def test_lost_pulses_between_triggers_change_nothing(rng):
     model = DeclaredModel(keyphasor_rate=10_000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
                           orders=(8.0,), pulses_per_revolution=4, pulses_per_trigger=3)
     true = 0.003 + np.arange(400) / (4 * SPEED)
-    lost = np.array([40, 41, 113, 200])  # the last two from the divider's own pulses: none, 1
+    lost = np.array([40, 41, 114, 200])  # the third is a trigger
     kept = np.setdiff1d(np.arange(400), lost)
     measured = true[kept] + rng.uniform(-1e-5, 1e-5, kept.size)
     found = trigger_pulses(Recording(
