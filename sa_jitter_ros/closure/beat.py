@@ -37,7 +37,6 @@ class Beat:
 
     method: str
     p_value: float
-    log_p_value: float
     gain: Array
     depth: Array
 
@@ -49,7 +48,7 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     `frequency` (line,) is in units of the sampling rate.
     """
     count, lines = radial.shape
-    nothing = Beat('', 1.0, 0.0, np.ones(lines), np.zeros(lines))
+    nothing = Beat('', 1.0, np.ones(lines), np.zeros(lines))
     if count < 32 or np.unique(frequency).size < 3:
         return nothing
     window = np.hanning(count + 2)[1:-1]
@@ -61,7 +60,7 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     turns = np.arange(8, 8 + len(spectrum)) / (4 * count)
     depth_left = np.sinc(turns)  # of the mean over a trigger cycle
     alike = _fits(swings, np.ones(lines), error)[1]  # a modulation of all lines is no beat
-    best, least = nothing, 1.0
+    best, rarest, least = nothing, np.log(_CERTAIN), 1.0
     for name in METHODS:
         mean, swing = _interpolated(name, frequency)
         log_p_value, misfit, size = _fits(swings, swing / mean, error)
@@ -69,18 +68,16 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
         fitting = (misfit < np.minimum(alike, _POOR * lines)) & (
             np.abs(size / depth_left - 1.0) < _OFF)
         least = min(least, float(np.exp(np.min(chance))))
-        if not np.any(fitting & (chance < np.log(_CERTAIN))):
+        peak = int(np.argmin(np.where(fitting, chance, np.inf)))
+        if not (fitting[peak] and chance[peak] < rarest):
             continue
-        peak = int(np.argmin(np.where(fitting, chance, 0.0)))
-        p_value = float(np.exp(chance[peak]))
-        if best.method and not chance[peak] < best.log_p_value:
-            continue
+        rarest = chance[peak]
         depth = np.abs(swings[peak])
         wanted = size[peak] * swing / mean
         # The shape is known to so much, what a line shows by its own noise.
         share = _KNOWN**2 / (_KNOWN**2 + (error[peak] / wanted) ** 2)
         gain = 1.0 - (1.0 - mean) * (1.0 + share * np.clip(depth / wanted - 1.0, -0.5, 0.5))
-        best = Beat(name, p_value, float(chance[peak]), gain, depth)
+        best = Beat(name, float(np.exp(rarest)), gain, depth)
     return best if best.method else replace(nothing, p_value=least)
 
 

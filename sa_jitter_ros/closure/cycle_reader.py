@@ -18,8 +18,6 @@ ComplexArray = NDArray[np.complex128]
 _SUSPICIOUS, _WIDER = 1.3, 4.0
 _WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
 _LEAST = 1e-9
-# A ripple of this many times its noise in power is taken out of the corrected average.
-_RIPPLE = 3.0
 _WHOLE = 1e-9
 _SEPARATIONS = 6
 # Lines of the average beside an order that tell the noise: beyond the window's main lobe.
@@ -160,12 +158,6 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
         information = np.nansum(2.0 * signal / recovery.noise**2) / 180.0
     cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
     return float(cycles / model.fundamental_frequency)
-
-
-def clear_ripple(recovery: PulseErrorRecovery, model: DeclaredModel) -> FloatArray | None:
-    """Return the ripple (cycle,) in s where it stands above its noise, else None."""
-    clear = np.mean(recovery.ripple**2) > _RIPPLE * ripple_error(recovery, model) ** 2
-    return recovery.ripple if recovery.accepted and clear else None
 
 
 def kept_apart(ratio: float, orders: FloatArray) -> bool:

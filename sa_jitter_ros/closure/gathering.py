@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.expectation import Lines
-from sa_jitter_ros.closure.observation import Observation, recovered_again
+from sa_jitter_ros.closure.observation import Acquisition, Observation, recovered_again
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import (
@@ -257,8 +257,7 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
         [item.standard_errors**2 for item in usable])))
     if not ticks_leave_room(errors, np.array(error), clock):
         return 0.0, 0.0
-    missed = errors - np.array([smooth[item.first:item.first + item.times.size]
-                                for item in usable])
+    missed = errors - _of_acquisitions(smooth, usable)
     missed -= missed.mean(axis=1, keepdims=True)
     variance = float(np.mean(missed.var(axis=1, ddof=1))) - error**2
     if variance <= 0.0:
@@ -267,10 +266,15 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
     return float(np.sqrt(variance)), float(np.clip(together, 0.0, 0.95))
 
 
+def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
+    """Return (acquisition, pulse) of values of all pulses of a record."""
+    return np.array([values[item.first:item.first + item.times.size] for item in items])
+
+
 def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
     """Return recovered errors (acquisition, pulse) less a slope over time that no grid makes."""
     items = observation.acquisitions
-    grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
+    grid = _of_acquisitions(smooth, items)
     times = np.array([item.times - item.times.mean() for item in items])
     left = motion - grid
     slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(

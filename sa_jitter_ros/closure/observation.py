@@ -17,8 +17,7 @@ from sa_jitter_ros.angle.laws import angle_law, AngleLaw
 from sa_jitter_ros.averaging.cycle import grid_points
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.cycle_reader import (
-    amplitudes, clear_ripple, CycleReader, noise_floor, recover, repaired, ripple_error,
-    separated)
+    amplitudes, CycleReader, noise_floor, recover, repaired, ripple_error, separated)
 from sa_jitter_ros.closure.other_sources import other_sources
 from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, TriggerPulses
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
@@ -34,6 +33,8 @@ _OTHER_MACHINE = 5.0
 # Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
 _FULL_BAND = 0.45  # of the sample rate
+# A ripple of this many times its noise in power is taken out of the corrected average.
+_RIPPLE = 3.0
 
 
 @dataclass(frozen=True)
@@ -276,7 +277,8 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
         errors = times - reference
     errors = errors - errors.mean()
     orders = tuple(sources.tolist())
-    bend = clear_ripple(recovery, model) if reference is None and with_ripple else None
+    clear = with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2
+    bend = ripple if reference is None and clear else None
     raw = amplitudes(reader.cycles(pulses.times[near], points, ends=True, law=law),
                      model.cycle_length, orders)
     grid = reader.cycles(better, points, ends=True, ripple=bend, law=clean_law)
