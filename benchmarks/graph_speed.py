@@ -36,6 +36,7 @@ ORDERS = (211.0, 401.0, 701.0)
 TRIGGER_CYCLES = 10
 MESSAGE_BYTES = 296_000  # at most
 MARGIN = 10  # samples behind a cycle that its interpolation reads
+PROFILE = Path(__file__).resolve().parents[1] / 'config' / 'fastdds.xml'
 KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'averages_dropped', 'gaps')
 NODE = ('from sa_jitter_ros.nodes.synchronous_averager import main; raise SystemExit(main())')
 
@@ -82,6 +83,13 @@ def publish(channels: int, seconds: float, length: int) -> None:
 
 
 # --- one measurement -----------------------------------------------------------------------------
+
+def transport(large: bool) -> dict[str, str]:
+    """Return the environment of a process, with the shared memory of `config/fastdds.xml`."""
+    if not large:
+        return dict(os.environ)
+    return {**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}
+
 
 def free_domain() -> int:
     """Return a ROS domain whose discovery port is free on this host."""
@@ -130,8 +138,8 @@ class Sink:
                     {item.key: item.value for item in status.values}))
 
 
-def measure(channels: int, seconds: float, *, block_seconds: float = 0.05, settle: float = 2.0
-            ) -> dict[str, Any]:
+def measure(channels: int, seconds: float, *, large: bool = False, block_seconds: float = 0.05,
+            settle: float = 2.0) -> dict[str, Any]:
     """Run source and averager for `seconds`; the first 2 s do not count."""
     cores = sorted(os.sched_getaffinity(0))
     length = block_samples(channels, block_seconds)
@@ -143,7 +151,7 @@ def measure(channels: int, seconds: float, *, block_seconds: float = 0.05, settl
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(sink.node)
     averager = subprocess.Popen(
-        [sys.executable, '-c', NODE, *arguments],
+        [sys.executable, '-c', NODE, *arguments], env=transport(large),
         preexec_fn=partial(os.sched_setaffinity, 0, {cores[-1]}))
     children = [averager]
 
@@ -156,7 +164,7 @@ def measure(channels: int, seconds: float, *, block_seconds: float = 0.05, settl
         spin(lambda: sink.status, 60.0)  # until the averager is heard
         source = subprocess.Popen(
             [sys.executable, __file__, '--publish', str(channels), str(seconds), str(length)],
-            stdout=subprocess.PIPE, text=True,
+            stdout=subprocess.PIPE, text=True, env=transport(large),
             preexec_fn=partial(os.sched_setaffinity, 0, {cores[0]}))
         children.append(source)
         spin(lambda: sink.arrivals, 60.0)
@@ -177,7 +185,7 @@ def measure(channels: int, seconds: float, *, block_seconds: float = 0.05, settl
                 child.send_signal(signal.SIGINT)
             child.wait(timeout=30.0)
         context.try_shutdown()
-    return {'channels': channels, 'block_milliseconds': 1e3 * length / RATE,
+    return {'channels': channels, 'large': large, 'block_milliseconds': 1e3 * length / RATE,
             'megabytes_per_second': 8e-6 * channels * RATE, 'cpu_share': (used - cpu) / elapsed,
             'source_late': report['late'], 'source_cpu': report['cpu'] / seconds,
             'peak_megabytes': peak, **_latency(sink, report['start'], length, seconds),
@@ -219,6 +227,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Measure the averager over DDS.')
     parser.add_argument('--seconds', type=float, default=15.0, help='of each run')
     parser.add_argument('--channels', type=int, nargs='+', default=[1, 8, 32, 64, 128, 192, 256])
+    parser.add_argument('--large', type=int, nargs='*', default=[64, 128, 192, 256, 320],
+                        help='channels with the shared memory of config/fastdds.xml')
     parser.add_argument('--latency-seconds', type=float, default=60.0,
                         help='of the two runs at 8 channels from which latency is taken')
     parser.add_argument('--publish', nargs=3, help=argparse.SUPPRESS)
@@ -229,9 +239,10 @@ def main() -> int:
         return 0
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
     found: dict[str, Any] = {'load': f'{os.getloadavg()[0]:.1f}', 'runs': [], 'latency': []}
-    for channels in options.channels:
-        print(f'graph: {channels} channels', file=sys.stderr, flush=True)
-        found['runs'].append(measure(channels, options.seconds))
+    for channels, large in [*((count, False) for count in options.channels),
+                            *((count, True) for count in options.large)]:
+        print(f'graph: {channels} channels{", large" * large}', file=sys.stderr, flush=True)
+        found['runs'].append(measure(channels, options.seconds, large=large))
         found['runs'][-1]['sustained'] = sustained(found['runs'][-1])
     for block_seconds in (0.05, 0.01) if options.latency_seconds else ():
         print(f'graph: latency, blocks of {block_seconds:g} s', file=sys.stderr, flush=True)

@@ -66,7 +66,8 @@ def measure(quick: bool) -> dict[str, Any]:
     environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': os.pathsep.join(
         filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))}
     small = ['--scale', '0.1', '--rounds', '2'] if quick else []
-    brief = ['--seconds', '6', '--channels', '8', '--latency-seconds', '0'] if quick else []
+    brief = ['--seconds', '6', '--channels', '8', '--large', '8', '--latency-seconds', '0'
+             ] if quick else []
     return {'core': run(peer_python(), 'core_speed.py', small, plain_environment()),
             'loop': run(sys.executable, 'loop_speed.py', small, environment),
             'graph': run(sys.executable, 'graph_speed.py', brief, environment)}

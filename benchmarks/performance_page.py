@@ -115,13 +115,18 @@ def _loop(loop: Mapping[str, Any]) -> str:
 
 def _graph(runs: Iterable[Mapping[str, Any]]) -> str:
     return table(
-        ('channels', 'MB/s', 'ms in a message', 'CPU share of one core', 'peak memory in MB',
-         'averages', 'latency from the last pulse in ms, median / 99 %', 'sustained'),
-        [(str(run['channels']), f'{run["megabytes_per_second"]:.3g}',
+        ('channels', 'shared memory', 'MB/s', 'ms in a message', 'CPU share of one core',
+         'peak memory in MB', 'averages', 'latency from the last pulse in ms, median / 99 %',
+         'sustained'),
+        [(str(run['channels']), _memory(run), f'{run["megabytes_per_second"]:.3g}',
           f'{run["block_milliseconds"]:.3g}', f'{run["cpu_share"]:.1%}',
           f'{run["peak_megabytes"]:.0f}', f'{run["averages"]} of {run["expected"]}',
           f'{run["pulse_median"]:.0f} / {run["pulse_99"]:.0f}',
           'yes' if run['sustained'] else 'no') for run in runs])
+
+
+def _memory(run: Mapping[str, Any]) -> str:
+    return '64 MB' if run['large'] else '0.5 MB'
 
 
 def _latency(runs: Iterable[Mapping[str, Any]]) -> str:
@@ -142,8 +147,8 @@ def _saturation(runs: Iterable[Mapping[str, Any]]) -> str:
     for run in failed:
         diagnostics = run['diagnostics']
         counts = ', '.join(f'{key} {value}' for key, value in diagnostics['counts'].items())
-        texts.append(f'{run["channels"]} channels: level {diagnostics["level"]} (1 = WARN), '
-                     f'{counts}')
+        texts.append(f'{run["channels"]} channels, {_memory(run)}: level '
+                     f'{diagnostics["level"]} (1 = WARN), {counts}')
         texts += [f'    {message}' for message in diagnostics['messages']]
     return '\n\n'.join(texts)
 
@@ -211,14 +216,17 @@ def _draw_graph(runs: Sequence[Mapping[str, Any]]) -> Figure:
     figure = Figure(figsize=(8.5, 3.4), layout='constrained')
     share, latency = figure.subplots(1, 2)
     for run in runs:
-        marker = {'marker': 'o', 'color': 'tab:blue' if run['sustained'] else 'tab:red'}
-        share.plot(run['channels'], 100.0 * run['cpu_share'], **marker)
-        latency.semilogy(run['channels'], run['pulse_median'], **marker)
-        latency.semilogy(run['channels'], run['pulse_99'], **{**marker, 'marker': '^'})
+        marker = {'markerfacecolor': 'none' if not run['large'] else None,
+                  'color': 'tab:blue' if run['sustained'] else 'tab:red'}
+        share.plot(run['channels'], 100.0 * run['cpu_share'], 'o', **marker)
+        latency.semilogy(run['channels'], run['pulse_median'], 'o', **marker)
+        latency.semilogy(run['channels'], run['pulse_99'], '^', **marker)
     share.set_ylabel('CPU share of one core [%]')
     share.set_ylim(0.0, 100.0)
+    share.set_title('filled: 64 MB of shared memory, open: 0.5 MB; red: not sustained',
+                    fontsize='small')
     latency.set_ylabel('latency [ms]: o median, ^ 99 %')
     for axes in (share, latency):
-        axes.set_xlabel('channels at 93.75 kHz (red: not sustained)')
+        axes.set_xlabel('channels at 93.75 kHz')
         axes.grid(alpha=0.3)
     return figure

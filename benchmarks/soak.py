@@ -1,12 +1,12 @@
 """
 Machine time at the highest sustained rate: memory and latency of the nodes over half an hour.
 
-    .venv/bin/python benchmarks/soak.py --minutes 30 --channels 64
+    .venv/bin/python benchmarks/soak.py --minutes 30 --channels 128
 
 Source, averager (on a core of its own) and predictor are processes of their own over DDS. The
-source publishes vibration at 93.75 kHz in real time, as in `graph_speed.py`. Numbers go to
-`out/soak.json`, figure and table to docs/reliability.md. The exit status is 1 if anything was
-dropped, lost or missing.
+source publishes vibration at 93.75 kHz in real time, as in `graph_speed.py`, through the shared
+memory of `config/fastdds.xml`. Numbers go to `out/soak.json`, figure and table to
+docs/reliability.md. The exit status is 1 if anything was dropped, lost or missing.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from typing import Any
 
 import graph_speed
 from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
-                         TRIGGER_CYCLES)
+                         transport, TRIGGER_CYCLES)
 from matplotlib.figure import Figure
 import numpy as np
 from performance_page import fill, table
@@ -64,7 +64,7 @@ def nodes(correct: bool) -> Iterator[dict[str, subprocess.Popen[str]]]:
                 arguments += ['-p', f'correct_jitter:={str(correct).lower()}']
             core = cores[-1] if name == 'synchronous_averager' else cores[0]
             running[name] = subprocess.Popen(
-                [sys.executable, '-c', code, *arguments], text=True,
+                [sys.executable, '-c', code, *arguments], text=True, env=transport(True),
                 preexec_fn=partial(os.sched_setaffinity, 0, {core}))
         yield running
     finally:
@@ -97,7 +97,7 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
             raise RuntimeError('the averager was not heard within 60 s')
         source = subprocess.Popen(
             [sys.executable, graph_speed.__file__, '--publish', str(channels), str(seconds),
-             str(length)], stdout=subprocess.PIPE, text=True)
+             str(length)], stdout=subprocess.PIPE, text=True, env=transport(True))
         watched = {**{name: item.pid for name, item in running.items()}, 'source': source.pid}
         rss: dict[str, list[tuple[float, float]]] = {name: [] for name in watched}
         begin = time.monotonic()
@@ -205,7 +205,7 @@ def main() -> int:
     """Run, keep the numbers, and write the page."""
     parser = argparse.ArgumentParser(description='Run the averager at full rate for long.')
     parser.add_argument('--minutes', type=float, default=30.0)
-    parser.add_argument('--channels', type=int, default=64)
+    parser.add_argument('--channels', type=int, default=128)
     parser.add_argument('--correct-jitter', action='store_true')
     parser.add_argument('--block-seconds', type=float, default=0.05, help='of a message, at most')
     parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'soak.json')

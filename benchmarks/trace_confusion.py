@@ -162,9 +162,10 @@ def told(found: Trace) -> str:
     return f'{names or "-"} ({found.verdict})'
 
 
-def one(seed: int, names: Sequence[str]) -> tuple[str, float, float, float, float, str, bool]:
+def one(seed: int, names: Sequence[str], acquisitions: int
+        ) -> tuple[str, float, float, float, float, str, bool]:
     """Return the verdict and the errors of one run."""
-    found = run(seed, names)
+    found = run(seed, names, acquisitions=acquisitions)
     values = '; '.join(f'{item.effect.values} +- {dict(item.standard_errors)}'
                        for item in found.findings if item.effect is not None)
     return (told(found), found.before.rms, found.after.rms, found.before.chi2_per_dof,
@@ -179,6 +180,7 @@ def main() -> None:
     parser.add_argument('--effects', nargs='*', default=list(EFFECTS))
     parser.add_argument('--unknown', type=int, default=20, help='runs of each unknown effect')
     parser.add_argument('--pairs', type=int, default=10, help='runs of each pair')
+    parser.add_argument('--acquisitions', type=int, default=24, help='of each run')
     parser.add_argument('--workers', type=int, default=1)
     parser.add_argument('--verbose', action='store_true')
     options = parser.parse_args()
@@ -188,7 +190,8 @@ def main() -> None:
                              *((pair, options.pairs) for pair in PAIRS), ((), options.null)]:
             if not seeds:
                 continue
-            rows = list(pool.map(partial(one, names=names), range(seeds)))
+            rows = list(pool.map(partial(one, names=names, acquisitions=options.acquisitions),
+                                 range(seeds)))
             print(f'\n{"+".join(names) or "declared model"}: {seeds} runs')
             for verdict, count in Counter(row[0] for row in rows).most_common():
                 print(f'  {count:4d}  {verdict}')

@@ -65,10 +65,12 @@ def test_page_is_written_from_small_runs(benchmark, process_environment, tmp_pat
     found = {
         'core': run('core_speed.py', *small, environment=process_environment),
         'loop': run('loop_speed.py', *small, environment=process_environment),
-        'graph': run('graph_speed.py', '--channels', '2', '--seconds', '5', '--latency-seconds',
-                     '0', environment=process_environment)}
-    graph, = found['graph']['runs']
+        'graph': run('graph_speed.py', '--channels', '2', '--large', '2', '--seconds', '5',
+                     '--latency-seconds', '0', environment=process_environment)}
+    graph, large = found['graph']['runs']
     assert graph['sustained'], graph
+    assert large['sustained'], large
+    assert large['peak_megabytes'] > graph['peak_megabytes'] + 32.0  # of shared memory
     assert 0.0 < graph['data_median'] < graph['pulse_99']
     assert found['loop']['prediction'].keys() >= {'uniform, 40 trigger cycles'}
     text = page.fill((ROOT / 'docs' / 'performance.md').read_text(), page.sections(found))

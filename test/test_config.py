@@ -1,6 +1,9 @@
 """The parameter files that come with the package start their nodes."""
 
+import os
 from pathlib import Path
+import subprocess
+import sys
 
 import pytest
 from rclpy.context import Context
@@ -39,3 +42,33 @@ def test_parameter_file_starts_its_node_and_every_entry_counts(name):
         node.destroy_node()
     finally:
         context.try_shutdown()
+
+
+SEGMENT = """
+import rclpy
+rclpy.init()
+node = rclpy.create_node('large')
+for line in open('/proc/self/maps'):
+    first, last = (int(end, 16) for end in line.split()[0].split('-'))
+    if '/dev/shm/fast' in line and '_port' not in line:
+        print(last - first)
+rclpy.shutdown()
+"""
+
+
+@pytest.mark.skipif(os.environ.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')
+                    != 'rmw_fastrtps_cpp', reason='the profile is for Fast DDS')
+def test_transport_profile_gives_a_node_more_shared_memory():
+    found = []
+    for profile in ('', str(CONFIG / 'fastdds.xml')):
+        environment = {key: value for key, value in os.environ.items()
+                       if key != 'FASTRTPS_DEFAULT_PROFILES_FILE'}
+        if profile:
+            environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = profile
+        done = subprocess.run([sys.executable, '-c', SEGMENT], env=environment, timeout=120,
+                              capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        found.append([int(line) for line in done.stdout.split()])
+    built_in, given = found
+    assert max(built_in) < 2e6
+    assert max(given) >= 64 << 20

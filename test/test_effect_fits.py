@@ -17,6 +17,7 @@ from sa_jitter_ros.effects.pulse_covariance import log_likelihood
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy.linalg import toeplitz
+from scipy.signal import lfilter
 
 MODEL = DeclaredModel(keyphasor_rate=5_000.0, trigger_speed=25.0, trigger_cycles=20,
                       orders=(8.0, 16.0), sample_rate=6_000.0)
@@ -305,6 +306,25 @@ def test_few_pulses_find_a_memory_or_leave_it_open(rng):
     independent = [EFFECTS['excess_jitter'].fit(evidence_of(
         rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))) for _ in range(15)]
     assert sum(bool(item.rivals) for item in independent) <= 4  # 5 % of them by chance
+
+
+def test_rare_shocks_that_fade_are_no_correlated_jitter(rng):
+    """A sensor that is late after drop-outs remembers, too, but its innovations are shocks."""
+    def against(errors):
+        found = EFFECTS['correlated_jitter'].fit(evidence_of(rng, 0.1 * declared(rng) + errors))
+        assert found.effect is not None
+        return found.against
+
+    def shocks():
+        size = ACQUISITIONS * PULSES + 50
+        late = 3e-4 * (rng.uniform(size=size) < 0.05) * rng.uniform(0.5, 1.5, size)
+        return lfilter([1.0], [1.0, -0.7], late)[50:].reshape(ACQUISITIONS, PULSES)
+
+    found = [against(shocks()) for _ in range(15)]
+    assert all(found)
+    assert sum('law' in text for text in found) >= 8  # some shocks alone are a memory, a line
+    normal = [against(stationary(rng, 1e-8 * 0.7**LAGS)) for _ in range(60)]
+    assert sum('law' in text for text in normal) <= 1
 
 
 def test_modulation_is_told_by_few_acquisitions(rng):

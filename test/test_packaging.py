@@ -110,7 +110,7 @@ def test_every_folder_with_modules_is_installed(setup):
 
 def test_every_configuration_is_installed(setup):
     files = {file for _, files in setup['data_files'] for file in files}
-    assert files >= {str(file.relative_to(ROOT)) for file in ROOT.glob('config/*.yaml')}
+    assert files >= {str(file.relative_to(ROOT)) for file in ROOT.glob('config/*')}
     assert 'package.xml' in files
 
 
@@ -151,8 +151,8 @@ def test_colcon_builds_what_ros2_run_looks_for(tmp_path, scripts):
     assert {path.name for path in executables} == set(scripts)
     assert module.is_relative_to(tmp_path / 'install')
     assert (share / 'package.xml').is_file()
-    configured = {path.name for path in (share / 'config').glob('*.yaml')}
-    assert configured == {path.name for path in ROOT.glob('config/*.yaml')}
+    configured = {path.name for path in (share / 'config').iterdir()}
+    assert configured == {path.name for path in ROOT.glob('config/*')}
 
 
 def run(folder, *command):

@@ -23,10 +23,12 @@ SIGNIFICANT = 0.02
 _EVIDENCE = 1e-3
 # Held-out pulse errors that are e^7 times likelier by chance are rarer than e^-7.
 _TOLD, _MOVED = 7.0, 0.01
-_DECISIVE, _MATERIAL = 1e-6, 2.0 * ACCURACY
+_DECISIVE = 1e-6
 # Scatter of an amplitude, in parts of it, that nobody asks the cause of.
 _FAINT = 1e-3
 _NEARLY_ALL = 0.8
+# Chi2 per degree of freedom of amplitudes whose scatter a cause explains.
+_NO_MORE = 1.5
 _HIDDEN = 'the ticks of the clock leave room for the errors of all pulses'
 # Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
 _SAME = 0.01
@@ -79,12 +81,20 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         rejected = finding.against
         if not rejected and finding.p_value > _EVIDENCE:
             rejected = f'its evidence may be chance: {finding.evidence}'
-        gained, new, old = ('amplitude', score.amplitude_score, current.amplitude_score) if (
-            kind.scatters) else ('attenuation', score.score, current.score)
-        p_value = 3.0 * current.p_amplitude if kind.scatters else current.p_attenuation
-        decisive = own > ACCURACY and left**2 < 0.5 * own**2 if kind.scatters else (
-            _decisive(finding, current, score))
-        told = not kind.scatters and _told(bench, effects, finding, current, score)
+        if kind.scatters:
+            gained, new, old = 'amplitude', score.amplitude_score, current.amplitude_score
+            p_value = 3.0 * current.p_amplitude
+            decisive = own > ACCURACY and left**2 < 0.5 * own**2
+            told = own > ACCURACY and finding.p_value < _DECISIVE and (
+                (new - old) * score.z.size > _TOLD)
+            # unsteadiness was fitted to the held-out amplitudes, too: a cause need not beat it
+            better = new > old or (decisive and score.chi2_per_dof < _NO_MORE)
+        else:
+            gained, new, old = 'attenuation', score.score, current.score
+            p_value = current.p_attenuation
+            decisive = _decisive(finding, current, score)
+            told = _told(bench, effects, finding, current, score)
+            better = new > old or told or (kind.seen and new > old - _SAME)
         needed = p_value < SIGNIFICANT or kind.seen or decisive or told
         least = _FAINT if kind.scatters else ACCURACY
         if not rejected and not kind.seen and _moved(without(), bench.expect(
@@ -93,10 +103,10 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
                         f'(p = {min(p_value, 1.0):.2g})')
-        if not rejected and not (new > old or told or (kind.seen and new > old - _SAME)):
+        if not rejected and not better:
             rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
                         f'{new:.3f} after {old:.3f}')
-        plain = told or kind.seen or (finding.p_value < _DECISIVE and not kind.scatters)
+        plain = kind.seen or (not kind.scatters and (told or finding.p_value < _DECISIVE))
         if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
         found.append(Candidate(name, number, finding, new, rejected))
@@ -135,7 +145,7 @@ def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
 
 def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
     """Tell whether an effect predicts what the declared model takes for chance."""
-    return (finding.p_value < _DECISIVE and before.rms > _MATERIAL
+    return (finding.p_value < _DECISIVE and before.rms > ACCURACY
             and after.rms < 0.5 * before.rms)
 
 

@@ -29,6 +29,9 @@ from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 Array = NDArray[Any]
 
+#: What was predicted for effects and an acquisition: moments and noise (line,).
+Memory = dict[tuple[tuple[Effect, ...], int], tuple[AverageMoments, Array]]
+
 #: What resampling leaves of uncertainty in an amplitude, in parts of it.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
@@ -74,24 +77,30 @@ class Expectation:
 
 def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Effect],
            pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int], *,
-           unsteadiness: float = 0.0) -> Expectation:
+           unsteadiness: float = 0.0, memory: Memory | None = None) -> Expectation:
     """
     Predict the `chosen` acquisitions, each at its own speed.
 
     `level` (line,) are mean amplitudes, which noise is compared with; `pulses[a][i]` is what is
     known of the pulses of acquisition a for the channels whose `group` (channel,) is i;
-    `unsteadiness` is what the amplitudes scatter by themselves, in parts of the level.
+    `unsteadiness` is what the amplitudes scatter by themselves, in parts of the level. `memory`
+    keeps what was computed, for calls that differ in `effects`, `chosen` and `unsteadiness` only.
     """
-    settings: dict[float, _Setting] = {}
-    rows = []
+    memory = {} if memory is None else memory
+    key = tuple(effects)
+    alike: dict[float, list[int]] = {}
     for a in chosen:
-        item = observation.acquisitions[a]
-        speed = _speed(item, observation.model)
-        if speed not in settings:
-            settings[speed] = _setting(observation, speed, effects)
-        setting = settings[speed]
-        each = _of_lines(item, lines, [setting.moments(known) for known in pulses[a]], group)
-        rows.append((each.scaled(setting.gain[lines.order]), setting.noise[lines.order]))
+        if (key, a) not in memory:
+            speed = _speed(observation.acquisitions[a], observation.model)
+            alike.setdefault(speed, []).append(a)
+    for speed, some in alike.items():
+        setting = _setting(observation, speed, effects)
+        found = iter(setting.moments([item for a in some for item in pulses[a]]))
+        for a in some:
+            each = _of_lines(observation.acquisitions[a], lines, [next(found) for _ in pulses[a]],
+                             group)
+            memory[key, a] = each.scaled(setting.gain[lines.order]), setting.noise[lines.order]
+    rows = [memory[key, a] for a in chosen]
     moments = AverageMoments(*(np.concatenate([getattr(each, name) for each, _ in rows])
                                for name in ('mean', 'variance', 'pseudo_variance')))
     noise = np.array([noise for _, noise in rows]) / level**2
@@ -113,33 +122,49 @@ class _Setting:
     gain: Array
     noise: Array
 
-    def moments(self, pulses: Pulses) -> tuple[AverageMoments, Array]:
+    def moments(self, pulses: Sequence[Pulses]) -> list[tuple[AverageMoments, Array]]:
         """Return what unit components show of themselves and (order, source) of each other."""
+        known = [known_errors(self.observation.model, self.effects, item) for item in pulses]
+        found: dict[int, tuple[AverageMoments, Array]] = {}
+        alike: dict[tuple[float, ...], list[int]] = {}
+        for i, (item, errors) in enumerate(zip(pulses, known)):
+            if errors is None:
+                found[i] = self._of_unknown_pulses
+            else:
+                alike.setdefault((len(errors), item.error_std, item.unknown_std,
+                                  item.unknown_correlation), []).append(i)
+        for some in alike.values():
+            rows = self._of_known_pulses(np.array([known[i] for i in some]), pulses[some[0]])
+            found.update(zip(some, rows))
+        return [found[i] for i in range(len(pulses))]
+
+    def _of_known_pulses(self, errors: Array, like: Pulses) -> list[tuple[AverageMoments, Array]]:
+        """Return what is predicted with known `errors` (acquisition, pulse), unsure alike."""
         model = self.observation.model
-        errors = known_errors(model, self.effects, pulses)
-        if errors is None:
-            return self._of_unknown_pulses
         blur, unsure = 0.0, self.processes
         if any(effect.replaces_jitter(model) for effect in self.effects):
-            blur = pulses.error_std * model.fundamental_frequency
-            if pulses.unknown_std:
+            blur = like.error_std * model.fundamental_frequency
+            if like.unknown_std:
                 unsure = (*unsure, *CorrelatedJitter(
-                    pulses.unknown_std, pulses.unknown_correlation).processes(model))
+                    like.unknown_std, like.unknown_correlation).processes(model))
         doubt = IndependentPulseJitter(Normal(blur), weights=model.weights)
         unsure = (*unsure, doubt) if blur else unsure
-        found = _known(self.observation, unsure, errors)
+        each = _aligned(scenario_moments(model, unsure, errors), model, unsure)
         leakage = _leakage(self.observation, unsure, errors)
+        mean = each.mean
         if blur:
-            found = replace(found, mean=found.mean * _sharpening(self.observation.orders, doubt))
+            mean = mean * _sharpening(self.observation.orders, doubt)
             leakage = leakage * np.resize(_sharpening(self.observation.sources, doubt),
-                                          leakage.shape[1])
-        return found, leakage
+                                          leakage.shape[2])
+        return [(AverageMoments(*row), leaks) for *row, leaks in zip(
+            mean, each.variance, each.pseudo_variance, leakage)]
 
     @cached_property
     def _of_unknown_pulses(self) -> tuple[AverageMoments, Array]:
         """What is predicted where nothing is known of the pulses."""
+        none = np.zeros((1, self.observation.model.trigger_cycles + 1))
         return (_unknown(self.observation, self.effects, self.processes),
-                _leakage(self.observation, self.processes, None))
+                _leakage(self.observation, self.processes, none)[0])
 
 
 def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) -> _Setting:
@@ -196,18 +221,10 @@ def _unknown(observation: Observation, effects: Sequence[Effect],
     return _aligned(moments.averaged(model.trigger_cycles), model, processes)
 
 
-def _known(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
-           ) -> AverageMoments:
-    """Return the moments (order,) with known pulse errors (s)."""
-    each = scenario_moments(observation.model, processes, errors[None])
-    return _aligned(AverageMoments(each.mean[0], each.variance[0], each.pseudo_variance[0]),
-                    observation.model, processes)
-
-
 def _aligned(moments: AverageMoments, model: DeclaredModel,
              processes: Sequence[AngleErrorProcess]) -> AverageMoments:
     """
-    Return the moments (order,) of averages that are turned back by their mean angle error.
+    Return the moments (..., order) of averages that are turned back by their mean angle error.
 
     The amplitude does not know that angle, which slow errors turn a whole average by; the law of
     the amplitude is near the normal one only without it. E|X|^2 stays as it is.
@@ -231,28 +248,32 @@ def _aligned(moments: AverageMoments, model: DeclaredModel,
     return AverageMoments(mean, variance, pseudo * np.minimum(most, 1.0))
 
 
-def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess],
-             errors: Array | None) -> Array:
+def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
+             ) -> Array:
     """
-    Return the mean amplitude (order, source) that each unit source shows at each order.
+    Return the mean amplitude (acquisition, order, source) of each unit source at each order.
 
-    Sources that are no lines of the trigger cycle have their mirror images after them.
+    `errors` (acquisition, pulse) in s. Sources that are no lines of the trigger cycle have their
+    mirror images after them.
     """
     model, sources = observation.model, observation.sources
     r, count = model.cycle_length, model.trigger_cycles
     if not kept_apart(r, sources):
         sources = np.concatenate((sources, -sources))
-    e = np.zeros(count + 1) if errors is None else errors * model.fundamental_frequency
-    turns = r * np.ptp(np.append(sources, observation.orders)) + np.ptp(np.diff(e)) * sources.max()
+    e = errors * model.fundamental_frequency
+    turns = r * np.ptp(np.append(sources, observation.orders)) + float(
+        np.ptp(np.diff(e), axis=1).max()) * sources.max()
     u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
     offset = model.weights.path(e, u, count)
     cycle = np.arange(count)[:, None]
-    table = np.zeros((observation.orders.size, sources.size), complex)
+    table = np.zeros((len(e), observation.orders.size, sources.size), complex)
     for s, source in enumerate(sources):
-        first = joint_characteristic(processes, [np.array([source])], [u], [0]) * np.ones(u.size)
-        wave = np.exp(2j * np.pi * source * offset) * first * w
+        first = joint_characteristic(processes, [np.array([source])], [u], [0]) * w
         shift = 2j * np.pi * r * (source - observation.orders)
-        table[:, s] = np.mean((wave @ np.exp(shift * u[:, None])) * np.exp(shift * cycle), axis=0)
+        inside, between = np.exp(shift * u[:, None]) * first[:, None], np.exp(shift * cycle)
+        for a, row in enumerate(offset):
+            wave = np.exp(2j * np.pi * source * row)
+            table[a, :, s] = np.mean((wave @ inside) * between, axis=0)
     return table
 
 

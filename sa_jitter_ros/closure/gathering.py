@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.beat import find_beat
+from sa_jitter_ros.closure.cycle_reader import repaired
 from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Acquisition, Observation, recovered_again
+from sa_jitter_ros.closure.tone import find_tone
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import (
@@ -17,13 +19,12 @@ from sa_jitter_ros.effects.lattice import (
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.recordings.recording import Recording
-from scipy import optimize, stats
+from scipy import stats
 
 Array = NDArray[Any]
 
 _STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
-_TWIN = 4.0
 _CERTAIN = 1e-4
 _GROUPS = 3
 # A clock this much faster than the declared one is no cause of anything.
@@ -116,7 +117,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
 
 def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
            pulses: Sequence[Sequence[Pulses]], clock: Clock, effects: Sequence[Effect],
-           tone: LineEvidence) -> Evidence:
+           scatter: LineEvidence) -> Evidence:
     """Return the evidence of the `chosen` acquisitions, less what `effects` explain."""
     model = observation.model
     picked = [observation.acquisitions[a] for a in chosen]
@@ -147,8 +148,8 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
         against_reference=observation.against_reference,
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
         clock=clock, explained=tuple(effects),
-        lines=replace(tone, radial=tone.radial[list(usable)],
-                      noise_density=tone.noise_density[list(usable)]))
+        lines=replace(scatter, radial=scatter.radial[list(usable)],
+                      noise_density=scatter.noise_density[list(usable)]))
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
@@ -172,7 +173,8 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
                      * model.fundamental_frequency / observation.sample_rate)
     evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
                        beat_gain=beat.gain)
-    return _with_tone(evidence, cycles, observation)
+    times, angle = _middles(observation, shortest)
+    return replace(evidence, tone=find_tone(cycles[:len(times)], times, angle, evidence.order))
 
 
 def _cycles(observation: Observation) -> Array:
@@ -182,49 +184,22 @@ def _cycles(observation: Observation) -> Array:
                      for item in observation.acquisitions])
 
 
-def _with_tone(evidence: LineEvidence, cycles: Array, observation: Observation) -> LineEvidence:
+def _middles(observation: Observation, cycles: int) -> tuple[Array, Array]:
     """
-    Find the tone that turns most clearly against an order, from cycle to cycle over the record.
+    Return time (s) and fundamental cycles (acquisition, cycle) of the middles of the cycles.
 
-    A modulation has a twin on the other side of the order, a tone has none.
+    Of several recordings, whose times do not go together, those of the first.
     """
-    model = observation.model
-    turned = cycles * np.exp(-1j * np.angle(cycles.mean(axis=1, keepdims=True)))
-    series = turned.reshape(-1, cycles.shape[2])
-    series = series - series.mean(axis=0)
-    count = len(series)
-    window = np.hanning(count + 2)[1:-1]
-    spectrum = np.abs(np.fft.fft(series * window[:, None], 4 * count, axis=0)) ** 2
-    turns = np.fft.fftfreq(4 * count)
-    spectrum[np.abs(turns) < 2.0 / count] = 0.0
-    floor = np.median(spectrum[spectrum[:, 0] > 0.0], axis=0) / np.log(2.0)
-    single = spectrum - _TWIN * spectrum[(-np.arange(4 * count)) % (4 * count)]
-    height = single / floor
-    peak, line = np.unravel_index(int(np.argmax(height)), height.shape)
-    # Along the radius only: the pulse errors have been fitted to what turns.
-    along = series[:, line].real * window
-    middle = np.arange(count) - 0.5 * (count - 1)
-
-    def size(turn: float) -> float:
-        return float(np.abs(np.exp(-2j * np.pi * turn * middle) @ along))
-
-    turn = float(optimize.minimize_scalar(
-        lambda x: -size(x), bounds=turns[peak] + np.array((-0.25, 0.25)) / count,
-        method='bounded', options={'xatol': 1e-5 / count}).x)
-    amplitude = 2.0 * size(turn) / window.sum()
-    # White noise of variance s2 leaves s2 sum(window^2) in a bin of the spectrum.
-    power = np.abs(np.fft.rfft(along)[1:]) ** 2
-    s2 = float(np.median(power)) / np.log(2.0) / float(window @ window)
-    error = np.sqrt(2.0 * s2 * (window @ window)) / window.sum()
-    bend = np.sqrt(2.0 * s2 * np.sum((window * middle) ** 2)) / (window @ middle**2) / amplitude
-    return replace(
-        evidence, tone_amplitude=float(amplitude / np.sinc(turn)),
-        tone_frequency=float(evidence.order[line] * model.fundamental_frequency
-                             + turn / model.trigger_period),
-        tone_standard_error=float(error / np.sinc(turn)),
-        tone_frequency_error=float(bend / (2.0 * np.pi * model.trigger_period)),
-        tone_p_value=min(1.0, count * cycles.shape[2] * float(np.exp(
-            -max(height[peak, line], 0.0)))))
+    times, places = [], []
+    before = np.concatenate(([0], np.cumsum(observation.pulses.missing)))
+    for i, item in enumerate(observation.acquisitions):
+        if i and item.first <= observation.acquisitions[i - 1].first:
+            break
+        true = item.times - np.where(np.isfinite(item.errors), item.errors, 0.0)
+        fixed, _ = repaired(true, item.missing)
+        times.append(0.5 * (fixed[:-1] + fixed[1:])[:cycles])
+        places.append(item.first + before[item.first] + 0.5 + np.arange(cycles))
+    return np.array(times), np.array(places) * observation.model.cycle_length
 
 
 def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.closure.expectation import expect, Expectation, Lines
+from sa_jitter_ros.closure.expectation import expect, Expectation, Lines, Memory
 from sa_jitter_ros.closure.gathering import gather
 from sa_jitter_ros.closure.observation import Observation
 from sa_jitter_ros.closure.residual import Residual, residual, Sensitivity
@@ -43,6 +43,7 @@ class Bench:
     held_out: tuple[int, ...]
     declared: tuple[Effect, ...]
     untold: Mapping[str, str] = field(default_factory=dict)
+    memory: Memory = field(default_factory=dict, repr=False)
 
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""
@@ -53,7 +54,8 @@ class Bench:
                unsteadiness: float = 0.0) -> Expectation:
         """Predict some acquisitions."""
         return expect(self.observation, self.lines, self.level, [*self.declared, *effects],
-                      self.pulses, self.group, chosen, unsteadiness=unsteadiness)
+                      self.pulses, self.group, chosen, unsteadiness=unsteadiness,
+                      memory=self.memory)
 
     def observed(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
         """Return attenuation, its variance and amplitude over level (acquisition, line)."""

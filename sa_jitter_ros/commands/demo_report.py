@@ -65,10 +65,10 @@ def draw_waveform(plan: Plan, raw: AverageMessage, error: AverageMessage | None,
                       label='with corrected pulses')
         axes.set_ylabel(f'{plan.channels[channel]}\n{_unit(plan)}')
         axes.margins(x=0.0)
-    panels[0].legend(loc='upper right', ncols=3, fontsize='small')
     panels[0].set_title(f'{plan.title}: average of {raw.header.fundamental_cycles} revolutions, '
                         f'tach shaft at {raw.header.mean_trigger_speed:.4g} Hz', fontsize='medium')
     panels[-1].set_xlabel('angle of the shaft [degrees]')
+    panels[-1].legend(loc='upper center', bbox_to_anchor=(0.5, -0.25), ncols=3, fontsize='small')
     _save(figure, path)
 
 

@@ -21,6 +21,17 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
+class Tone:
+    """`frequency` (Hz) and peak `amplitude` of the clearest tone, their errors, its chance."""
+
+    frequency: float
+    amplitude: float
+    frequency_error: float
+    standard_error: float
+    p_value: float
+
+
+@dataclass(frozen=True)
 class LineEvidence:
     """
     How the amplitudes of the lines (an order on a channel) scatter, pulse errors taken out.
@@ -29,10 +40,9 @@ class LineEvidence:
     (acquisition, line) the standard deviation per sample of white noise that makes the line's
     noise, in the units of the recording; `radial` (acquisition, cycle, line) each cycle's
     amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
-    alone. `tone_frequency` (Hz) and `tone_amplitude` are those of the line that stands out most
-    between the synchronous ones;
-    `beat_method` is the interpolator whose beat the lines show, '' for none, and
-    `beat_gain` (line,) what it has left of the amplitudes.
+    alone. `tone` is what stands out most between the synchronous lines. `beat_method` is the
+    interpolator whose beat the lines show, '' for none, and `beat_gain` (line,) what it has left
+    of the amplitudes.
     """
 
     order: Array
@@ -41,11 +51,7 @@ class LineEvidence:
     noise_density: Array
     radial: Array
     radial_noise: Array
-    tone_frequency: float = float('nan')
-    tone_amplitude: float = 0.0
-    tone_standard_error: float = float('nan')
-    tone_frequency_error: float = float('nan')
-    tone_p_value: float = 1.0
+    tone: Tone | None = None
     beat_method: str = ''
     beat_p_value: float = 1.0
     beat_gain: Array | float = 1.0

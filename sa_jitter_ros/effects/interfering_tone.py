@@ -32,12 +32,12 @@ class InterferingTone(Effect):
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Take the strongest line of the spectrum that is not synchronous."""
-        lines = evidence.lines
-        if not lines.tone_p_value < _SIGNIFICANT:
+        tone = evidence.lines.tone
+        if tone is None or not tone.p_value < _SIGNIFICANT:
             return absent(cls.name, 'no line stands out between the synchronous ones',
-                          p_value=lines.tone_p_value)
-        text = (f'a line of amplitude {lines.tone_amplitude:.3g} at {lines.tone_frequency:.6g} Hz '
+                          p_value=1.0 if tone is None else tone.p_value)
+        text = (f'a line of amplitude {tone.amplitude:.3g} at {tone.frequency:.6g} Hz '
                 'that is no order of the shaft')
-        return Finding(cls.name, cls(lines.tone_frequency, lines.tone_amplitude),
-                       {'frequency': lines.tone_frequency_error,
-                        'amplitude': lines.tone_standard_error}, lines.tone_p_value, text)
+        return Finding(cls.name, cls(tone.frequency, tone.amplitude),
+                       {'frequency': tone.frequency_error, 'amplitude': tone.standard_error},
+                       tone.p_value, text)

@@ -24,6 +24,7 @@ Correlation = Callable[[Array, float], Array]
 _MOST_PULSES = 200
 _GOOD = 1e-3
 _DRAWS = 4000
+_FEWEST = 20
 
 
 def white(lags: Array, _: float) -> Array:
@@ -189,7 +190,8 @@ def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
     p_line = float(min(1.0, spectrum.size * stats.gamma.sf(peak * rows, rows)))
     if p_line < _GOOD:
         return f'the errors hold a line spectrum that it does not have: p = {p_line:.2g}'
-    p_law = min(_law_p_value(evidence, fit), _moments_p_value(evidence))
+    p_law = min(_law_p_value(evidence, fit), _moments_p_value(evidence),
+                _shocks_p_value(white_left[:, :-1].ravel()))
     if p_law < _GOOD:
         return f'the law of the errors is not the one it has: p = {p_law:.2g}'
     power = np.mean(white_left**2, axis=1)
@@ -243,6 +245,14 @@ def _moments_p_value(evidence: Evidence) -> float:
         tail = min(np.count_nonzero(drawn >= seen), np.count_nonzero(drawn <= seen))
         p_values.append(2.0 * (tail + 1.0) / (_DRAWS + 1.0))
     return float(min(1.0, *p_values))
+
+
+def _shocks_p_value(innovations: Array) -> float:
+    """Test for rare large shocks, which a memory spreads until the errors look normal."""
+    if innovations.size < _FEWEST:
+        return 1.0
+    tailed = stats.kurtosistest(innovations, alternative='greater').pvalue
+    return float(min(1.0, 2.0 * min(stats.skewtest(innovations).pvalue, tailed)))
 
 
 def _effective_repeats(errors: Array) -> float:

@@ -1,0 +1,105 @@
+"""
+The tone that no shaft makes: a line of one frequency while the speed of the shafts drifts.
+
+It is looked for in the amplitudes of single trigger cycles, in which a tone near an order turns
+against it, at the times of the cycles. An order of another shaft does so, too, but evenly from
+cycle to cycle, whatever the speed; where the speed drifts, this tells the two apart.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.evidence import Tone
+from scipy import optimize
+from scipy.ndimage import maximum_filter1d
+
+Array = NDArray[Any]
+
+_PADDED = 4  # values of a spectrum a line
+_TWIN = 4.0
+_EVEN = 1.5
+_EXACT = 1e-3
+
+
+def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
+    """
+    Find the tone that turns most clearly against an order.
+
+    `cycles` (acquisition, cycle, line) are complex peak amplitudes, corrected, of the `orders`
+    (line,); `times` (acquisition, cycle) the middles of the cycles in s and `angle` the
+    fundamental cycles there. A modulation has a twin on the other side of the order, a tone has
+    none.
+    """
+    turned = cycles * np.exp(-1j * np.angle(cycles.mean(axis=1, keepdims=True)))
+    series = turned.reshape(-1, cycles.shape[2])
+    series = series - series.mean(axis=0)
+    count = len(series)
+    time, turns = times.ravel() - times.mean(), angle.ravel() - angle.mean()
+    speed = float(np.polyfit(time, turns, 1)[0])
+    period = float(np.median(np.diff(times, axis=1)))
+    # What an order is ahead of its mean frequency: a tone near it turns back by as much.
+    ahead = 2.0 * np.pi * np.outer(turns - speed * time, orders)
+    window = np.hanning(count + 2)[1:-1, None]
+    places, even_places = time / period, turns / speed / period
+    size = _PADDED * int(max(np.ptp(places), np.ptp(even_places)) + 2.0)
+    spectrum, twin = (np.abs(_spectrum(item * np.exp(1j * ahead) * window, places, size)) ** 2
+                      for item in (series, series.conj()))
+    rate = np.fft.fftfreq(size)
+    spectrum[np.abs(rate) < 2.0 / count] = 0.0
+    floor = np.median(spectrum[spectrum[:, 0] > 0.0], axis=0) / np.log(2.0)
+    even = np.abs(_spectrum(series * window, even_places, size)) ** 2
+    drift = np.abs(np.diff(ahead, axis=0)).max(axis=0) / (2.0 * np.pi)
+    for line in range(orders.size):
+        reach = 2 * int((drift[line] + 3.0 / count) * size) + 1
+        steady = maximum_filter1d(even[:, line], min(reach, size), mode='wrap')
+        spectrum[steady > _EVEN * spectrum[:, line], line] = 0.0
+    height = (spectrum - _TWIN * twin) / floor
+    peak, line = divmod(int(np.argmax(height)), orders.size)
+    # Along the radius only: the pulse errors have been fitted to what turns.
+    weight = window[:, 0]
+    along = series[:, line].real * weight
+    back = along * np.exp(1j * ahead[:, line])
+
+    def strength(turn: float) -> float:
+        return float(np.abs(np.exp(-2j * np.pi * turn * places) @ back))
+
+    turn = float(optimize.minimize_scalar(
+        lambda x: -strength(x), bounds=rate[peak] + np.array((-0.25, 0.25)) / count,
+        method='bounded', options={'xatol': 1e-5 / count}).x)
+    amplitude = 2.0 * strength(turn) / weight.sum()
+    # White noise of variance s2 leaves s2 sum(window^2) in a bin of the spectrum.
+    power = np.abs(np.fft.rfft(along)[1:]) ** 2
+    s2 = float(np.median(power)) / np.log(2.0) / float(weight @ weight)
+    error = np.sqrt(2.0 * s2 * (weight @ weight)) / weight.sum()
+    bend = np.sqrt(2.0 * s2 * np.sum((weight * time) ** 2)) / (weight @ time**2) / amplitude
+    lost = np.sinc(turn)  # in the mean over a cycle
+    return Tone(
+        frequency=float(abs(orders[line] * speed + turn / period)),
+        amplitude=float(amplitude / lost), frequency_error=float(bend / (2.0 * np.pi)),
+        standard_error=float(error / lost),
+        p_value=min(1.0, series.size * math.exp(-max(float(height[peak, line]), 0.0))))
+
+
+def _spectrum(values: Array, places: Array, size: int) -> Array:
+    """
+    Return the Fourier transform (size, line) of `values` (place, line) at uneven `places`.
+
+    Frequencies are those of `fftfreq` for unit steps, the phase that of the first place. Values
+    are put on the next whole place, and what that turns them by is developed in powers of the
+    distance.
+    """
+    nearest = np.rint(places - places[0]).astype(int)
+    turn = -2j * np.pi * np.fft.fftfreq(size)[:, None]
+    apart = (places - places[0] - nearest)[:, None]
+    largest = np.pi * float(np.abs(apart).max())
+    total = np.zeros((size, values.shape[1]), complex)
+    term, power = values.astype(complex), 0
+    while power == 0 or largest**power / math.factorial(power) > _EXACT:
+        grid = np.zeros_like(total)
+        np.add.at(grid, nearest, term)
+        total += np.fft.fft(grid, axis=0) * turn**power
+        power += 1
+        term = term * apart / power
+    return total
