@@ -222,7 +222,7 @@ def _draw_graph(runs: Sequence[Mapping[str, Any]]) -> Figure:
         latency.semilogy(run['channels'], run['pulse_median'], 'o', **marker)
         latency.semilogy(run['channels'], run['pulse_99'], '^', **marker)
     share.set_ylabel('CPU share of one core [%]')
-    share.set_ylim(0.0, 100.0)
+    share.set_ylim(0.0, 105.0)
     share.set_title('filled: 64 MB of shared memory, open: 0.5 MB; red: not sustained',
                     fontsize='small')
     latency.set_ylabel('latency [ms]: o median, ^ 99 %')

@@ -26,6 +26,7 @@ import graph_speed
 from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
                          transport, TRIGGER_CYCLES)
 from matplotlib.figure import Figure
+from matplotlib.ticker import ScalarFormatter
 import numpy as np
 from performance_page import fill, table
 import rclpy
@@ -187,6 +188,8 @@ def draw(found: Mapping[str, Any], file: Path) -> None:
         above.plot(every[:, 0] / 60.0, every[:, column], 'o-', markersize=3, label=name)
     above.set_ylabel('latency from the last pulse [ms]')
     above.set_yscale('log')
+    for formatter in (above.yaxis.set_major_formatter, above.yaxis.set_minor_formatter):
+        formatter(ScalarFormatter())
     for name, rss in found['rss'].items():
         times, values = np.array(rss).T
         below.plot(times / 60.0, values, label=name)

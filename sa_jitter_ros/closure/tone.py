@@ -40,33 +40,25 @@ def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
     speed = float(np.polyfit(time, turns, 1)[0])
     period = float(np.median(np.diff(times, axis=1)))
     # What an order is ahead of its mean frequency: a tone near it turns back by as much.
-    ahead = 2.0 * np.pi * np.outer(turns - speed * time, orders)
-    window = np.hanning(count + 2)[1:-1, None]
-    places, even_places = time / period, turns / speed / period
-    size = _PADDED * int(max(np.ptp(places), np.ptp(even_places)) + 2.0)
-    spectrum, twin = (np.abs(_spectrum(item * np.exp(1j * ahead) * window, places, size)) ** 2
-                      for item in (series, series.conj()))
-    rate = np.fft.fftfreq(size)
-    spectrum[np.abs(rate) < 2.0 / count] = 0.0
-    floor = np.median(spectrum[spectrum[:, 0] > 0.0], axis=0) / np.log(2.0)
-    even = np.abs(_spectrum(series * window, even_places, size)) ** 2
-    drift = np.abs(np.diff(ahead, axis=0)).max(axis=0) / (2.0 * np.pi)
-    for line in range(orders.size):
-        reach = 2 * int((drift[line] + 3.0 / count) * size) + 1
-        steady = maximum_filter1d(even[:, line], min(reach, size), mode='wrap')
-        spectrum[steady > _EVEN * spectrum[:, line], line] = 0.0
-    height = (spectrum - _TWIN * twin) / floor
-    peak, line = divmod(int(np.argmax(height)), orders.size)
+    ahead = 2.0 * np.pi * (turns - speed * time)
+    weight = np.hanning(count + 2)[1:-1]
+    places = time / period
+    best, line, rate = -np.inf, 0, 0.0
+    for i, order in enumerate(orders):
+        height, rates = _heights(series[:, i] * weight, order * ahead, places,
+                                 turns / speed / period)
+        peak = int(np.argmax(height))
+        if height[peak] > best:
+            best, line, rate = float(height[peak]), i, float(rates[peak])
     # Along the radius only: the pulse errors have been fitted to what turns.
-    weight = window[:, 0]
     along = series[:, line].real * weight
-    back = along * np.exp(1j * ahead[:, line])
+    back = along * np.exp(1j * orders[line] * ahead)
 
     def strength(turn: float) -> float:
         return float(np.abs(np.exp(-2j * np.pi * turn * places) @ back))
 
     turn = float(optimize.minimize_scalar(
-        lambda x: -strength(x), bounds=rate[peak] + np.array((-0.25, 0.25)) / count,
+        lambda x: -strength(x), bounds=rate + np.array((-0.25, 0.25)) / count,
         method='bounded', options={'xatol': 1e-5 / count}).x)
     amplitude = 2.0 * strength(turn) / weight.sum()
     # White noise of variance s2 leaves s2 sum(window^2) in a bin of the spectrum.
@@ -79,27 +71,48 @@ def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
         frequency=float(abs(orders[line] * speed + turn / period)),
         amplitude=float(amplitude / lost), frequency_error=float(bend / (2.0 * np.pi)),
         standard_error=float(error / lost),
-        p_value=min(1.0, series.size * math.exp(-max(float(height[peak, line]), 0.0))))
+        p_value=min(1.0, series.size * math.exp(-max(best, 0.0))))
+
+
+def _heights(series: Array, ahead: Array, places: Array, even_places: Array
+             ) -> tuple[Array, Array]:
+    """
+    Return how high tones stand over the noise beside one order, and their turns a cycle.
+
+    `series` (cycle,) is what turns against the order, `ahead` (cycle,) the phase by which that is
+    ahead; `places` and `even_places` count the cycles by time and by angle.
+    """
+    size = _PADDED * int(max(np.ptp(places), np.ptp(even_places)) + 2.0)
+    spectrum, twin = (np.abs(_spectrum(item * np.exp(1j * ahead), places, size)) ** 2
+                      for item in (series, series.conj()))
+    even = np.abs(_spectrum(series, even_places, size)) ** 2
+    rates = np.fft.fftfreq(size)
+    beside = np.abs(rates) >= 2.0 / series.size
+    floor = max(float(np.median(spectrum[beside])) / np.log(2.0), np.finfo(float).tiny)
+    drift = float(np.abs(np.diff(ahead)).max()) / (2.0 * np.pi)
+    reach = min(2 * int((drift + 3.0 / series.size) * size) + 1, size)
+    sharp = maximum_filter1d(even, reach, mode='wrap') <= _EVEN * spectrum
+    return np.where(beside & sharp, spectrum - _TWIN * twin, 0.0) / floor, rates
 
 
 def _spectrum(values: Array, places: Array, size: int) -> Array:
     """
-    Return the Fourier transform (size, line) of `values` (place, line) at uneven `places`.
+    Return the Fourier transform (size,) of `values` (place,) at uneven `places`.
 
     Frequencies are those of `fftfreq` for unit steps, the phase that of the first place. Values
     are put on the next whole place, and what that turns them by is developed in powers of the
     distance.
     """
     nearest = np.rint(places - places[0]).astype(int)
-    turn = -2j * np.pi * np.fft.fftfreq(size)[:, None]
-    apart = (places - places[0] - nearest)[:, None]
+    turn = -2j * np.pi * np.fft.fftfreq(size)
+    apart = places - places[0] - nearest
     largest = np.pi * float(np.abs(apart).max())
-    total = np.zeros((size, values.shape[1]), complex)
+    total = np.zeros(size, complex)
     term, power = values.astype(complex), 0
     while power == 0 or largest**power / math.factorial(power) > _EXACT:
-        grid = np.zeros_like(total)
-        np.add.at(grid, nearest, term)
-        total += np.fft.fft(grid, axis=0) * turn**power
+        grid = (np.bincount(nearest, term.real, size)
+                + 1j * np.bincount(nearest, term.imag, size))
+        total += np.fft.fft(grid) * turn**power
         power += 1
         term = term * apart / power
     return total
