@@ -134,7 +134,7 @@ def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
     """Say that an effect leaves nearly all of a significant residual; '' where it does not."""
     if scatters:
         old, new = before.chi2_per_dof - 1.0, after.chi2_per_dof - 1.0
-        if after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
+        if 3.0 * after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
             return (f'it leaves nearly all of the scatter: chi2 per degree of freedom '
                     f'{new + 1.0:.3g} after {old + 1.0:.3g}')
     elif after.p_attenuation < SIGNIFICANT and after.rms > _NEARLY_ALL * before.rms:
