@@ -241,6 +241,17 @@ def test_period_of_a_clock_is_fitted_within_its_error(rng):
     check(off)
 
 
+def test_errors_much_larger_than_ticks_are_not_those_of_the_clock(rng):
+    """Times on a grid tell half a tick at most; what errs more than they tell is jitter."""
+    grid = rng.uniform(-1e-4, 1e-4, (ACQUISITIONS, PULSES))
+    for size, there in ((0.0, True), (1e-4, False)):
+        errors = grid + size * np.sign(grid)  # in step with the ticks
+        evidence = evidence_of(rng, errors)
+        evidence = replace(evidence, pulses=tuple(
+            replace(item, errors=row) for item, row in zip(evidence.pulses, grid)))
+        assert (EFFECTS['keyphasor_quantisation'].fit(evidence).effect is not None) == there
+
+
 def test_what_is_known_of_the_pulses_is_no_slope(rng):
     """Marks that were explained are in the measured times and not in the errors that are left."""
     angles = (0.03, -0.02, 0.01, -0.02)

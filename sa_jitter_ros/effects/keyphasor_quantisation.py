@@ -19,6 +19,9 @@ from scipy import stats
 _PHASES, _SEED = 128, 6
 _SAME_RATE = 0.01
 _SIGNIFICANT = 1e-4
+# Least correlation of the errors with those that a grid imposes; what the grid does not see of the
+# motion makes the slope flatter, but other errors make it steeper.
+_ALIKE, _STEEPEST = 0.5, 1.5
 
 
 @dataclass(frozen=True)
@@ -64,9 +67,10 @@ class KeyphasorQuantisation(Effect):
         text = (f'the pulse times lie on a grid of {clock:.6g} Hz, and the errors that the grid '
                 f'imposes on a smooth motion are the recovered ones: correlation '
                 f'{correlation:.3f}, slope {slope:.2f}, p = {p_value:.2g}')
-        if p_value > _SIGNIFICANT or correlation < 0.5:
+        if p_value > _SIGNIFICANT or correlation < _ALIKE or slope > _STEEPEST:
             return absent(cls.name, f'the pulse times lie on a grid of {clock:.6g} Hz, but their '
-                          f'errors are others: correlation {correlation:.3f}', p_value=p_value)
+                          f'errors are others: correlation {correlation:.3f}, slope {slope:.2f}',
+                          p_value=p_value)
         return Finding(cls.name, cls(clock, std),
                        {'clock_rate': evidence.clock.standard_error, 'period_std': std_error},
                        float(p_value), text)
