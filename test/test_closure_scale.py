@@ -127,6 +127,27 @@ def test_each_acquisition_is_predicted_at_its_own_speed(observation):
     assert found.amplitude_variance == pytest.approx(right.amplitude_variance, rel=1e-3)
 
 
+def test_acquisitions_are_predicted_alike_together_alone_and_from_memory(observation):
+    """Known pulses of several acquisitions are predicted at once; what was predicted is kept."""
+    effects = [make_effect('keyphasor_quantisation', clock_rate=MODEL.keyphasor_rate),
+               make_effect('amplitude_modulation', std=0.05)]
+    lines, level, group = lines_of(observation)
+    pulses = [[Pulses(item.times, item.first, item.errors, None, 1e-6 * (i % 2))]
+              for i, item in enumerate(observation.acquisitions)]
+    memory = {}
+
+    def predicted(chosen, kept=None):
+        found = expect(observation, lines, level, effects, pulses, group, chosen, memory=kept,
+                       unsteadiness=0.01)
+        return np.stack((found.attenuation, found.amplitude_variance))
+
+    together = predicted(range(4), memory)
+    alone = np.concatenate([predicted([a]) for a in range(4)], axis=1)
+    assert together == pytest.approx(alone, rel=1e-6)
+    assert np.array_equal(predicted([2, 1], memory), together[:, [2, 1]])
+    assert len(memory) == 4
+
+
 def test_uncertain_pulse_errors_do_not_attenuate(observation, rng):
     """The mean prediction by errors that are off is that by the true ones."""
     clock = make_effect('keyphasor_quantisation', clock_rate=MODEL.keyphasor_rate)

@@ -35,6 +35,7 @@ Memory = dict[tuple[tuple[Effect, ...], int], tuple[AverageMoments, Array]]
 #: What resampling leaves of uncertainty in an amplitude, in parts of it.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
+_MOST_KEPT = 20_000  # acquisitions, of a few kB each
 # Speeds closer than this are the same.
 _SPEED_STEP = 1e-3
 _SHARPEST = 2.0
@@ -87,6 +88,8 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
     keeps what was computed, for calls that differ in `effects`, `chosen` and `unsteadiness` only.
     """
     memory = {} if memory is None else memory
+    if len(memory) > _MOST_KEPT:
+        memory.clear()
     key = tuple(effects)
     alike: dict[float, list[int]] = {}
     for a in chosen:
