@@ -1,4 +1,4 @@
-"""The parameter files that come with the package start their nodes."""
+"""The parameter files of the package start their nodes, and its profile their transport."""
 
 import os
 from pathlib import Path

@@ -8,10 +8,8 @@ most specific evidence first.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
-from sa_jitter_ros.closure.expectation import Expectation
 from sa_jitter_ros.closure.residual import ACCURACY, Residual
 from sa_jitter_ros.closure.scoring import Bench
 from sa_jitter_ros.effects import Effect, EFFECTS
@@ -61,11 +59,6 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
                  ) and evidence.of_all.hidden_by_ticks
     unneeded = (f'not needed: nothing significant remains (p = {current.p_value:.2g})')
     found = []
-
-    @cache
-    def without() -> Expectation:
-        return bench.expect(effects, bench.held_out)
-
     for name, kind in EFFECTS.items():
         if name in taken:
             continue
@@ -97,8 +90,7 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
             better = new > old or told or (kind.seen and new > old - _SAME)
         needed = p_value < SIGNIFICANT or kind.seen or decisive or told
         least = _FAINT if kind.scatters else ACCURACY
-        if not rejected and not kind.seen and _moved(without(), bench.expect(
-                [*effects, finding.effect], bench.held_out), kind.scatters) < least:
+        if not rejected and not kind.seen and _moved(bench, effects, finding.effect) < least:
             rejected = f'it is too small to matter: the {gained} of no line changes by {least:g}'
         if not rejected and not needed:
             rejected = (f'not needed: the {gained} leaves nothing significant '
@@ -123,10 +115,12 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
     return max(left, key=lambda item: item.held_out_score or 0.0) if left else None
 
 
-def _moved(without: Expectation, with_it: Expectation, scatters: bool) -> float:
+def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
     """Return the largest RMS, over the acquisitions, by which an effect moves a line."""
+    without, with_it = (bench.expect(known, bench.held_out) for known in (
+        effects, [*effects, more]))
     square = (np.maximum(with_it.amplitude_variance - without.amplitude_variance, 0.0)
-              if scatters else (with_it.attenuation - without.attenuation) ** 2)
+              if more.scatters else (with_it.attenuation - without.attenuation) ** 2)
     return float(np.sqrt(np.mean(square, axis=0).max()))
 
 

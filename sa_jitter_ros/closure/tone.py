@@ -18,9 +18,9 @@ from scipy.ndimage import maximum_filter1d
 Array = NDArray[Any]
 
 _PADDED = 4  # values of a spectrum a line
-_TWIN = 4.0
-_EVEN = 1.5
-_EXACT = 1e-3
+# Power over that of its twin, and power of an even line near it over its own.
+_TWIN, _EVEN = 4.0, 1.5
+_EXACT = 1e-3  # last power of the distance from a whole place that counts
 
 
 def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
@@ -42,11 +42,10 @@ def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
     # What an order is ahead of its mean frequency: a tone near it turns back by as much.
     ahead = 2.0 * np.pi * (turns - speed * time)
     weight = np.hanning(count + 2)[1:-1]
-    places = time / period
+    places, even_places = time / period, turns / speed / period
     best, line, rate = -np.inf, 0, 0.0
     for i, order in enumerate(orders):
-        height, rates = _heights(series[:, i] * weight, order * ahead, places,
-                                 turns / speed / period)
+        height, rates = _heights(series[:, i] * weight, order * ahead, places, even_places)
         peak = int(np.argmax(height))
         if height[peak] > best:
             best, line, rate = float(height[peak]), i, float(rates[peak])
