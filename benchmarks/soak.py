@@ -1,7 +1,7 @@
 """
 Machine time at the highest sustained rate: memory and latency of the nodes over half an hour.
 
-    .venv/bin/python benchmarks/soak.py --minutes 30 --channels 128
+    .venv/bin/python benchmarks/soak.py --minutes 30 --channels 192
 
 Source, averager (on a core of its own) and predictor are processes of their own over DDS. The
 source publishes vibration at 93.75 kHz in real time, as in `graph_speed.py`, through the shared
@@ -26,7 +26,7 @@ import graph_speed
 from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
                          transport, TRIGGER_CYCLES)
 from matplotlib.figure import Figure
-from matplotlib.ticker import ScalarFormatter
+from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 import numpy as np
 from performance_page import fill, table
 import rclpy
@@ -188,8 +188,9 @@ def draw(found: Mapping[str, Any], file: Path) -> None:
         above.plot(every[:, 0] / 60.0, every[:, column], 'o-', markersize=3, label=name)
     above.set_ylabel('latency from the last pulse [ms]')
     above.set_yscale('log')
-    for formatter in (above.yaxis.set_major_formatter, above.yaxis.set_minor_formatter):
-        formatter(ScalarFormatter())
+    above.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    above.yaxis.set_major_formatter(ScalarFormatter())
+    above.yaxis.set_minor_formatter(NullFormatter())
     for name, rss in found['rss'].items():
         times, values = np.array(rss).T
         below.plot(times / 60.0, values, label=name)
