@@ -53,8 +53,7 @@ def drifting(observation, size, rng):
     """Return an observation whose lines have another load in each acquisition, each its own."""
     def changed(item):
         gain = 1.0 + size * rng.standard_normal(item.raw.shape)
-        return replace(item, raw=gain * item.raw, corrected=gain * item.corrected,
-                       cycles=gain * item.cycles)
+        return replace(item, raw_cycles=gain * item.raw_cycles, cycles=gain * item.cycles)
     return replace(observation, acquisitions=tuple(map(changed, observation.acquisitions)))
 
 

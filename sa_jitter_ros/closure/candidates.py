@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from sa_jitter_ros.closure.dependence import Dependence, dependences, still_moving
 from sa_jitter_ros.closure.residual import ACCURACY, Residual
 from sa_jitter_ros.closure.scoring import Bench
 from sa_jitter_ros.effects import Effect, EFFECTS
@@ -50,8 +51,12 @@ class Candidate:
 
 
 def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
-            own: float, significant: bool) -> list[Candidate]:
-    """Fit every effect that is not there yet and score it on the held-out acquisitions."""
+            moves: Sequence[Dependence], own: float, significant: bool) -> list[Candidate]:
+    """
+    Fit every effect that is not there yet and score it on the held-out acquisitions.
+
+    `current` and `moves` are the residual so far and how it moves, `own` the unsteadiness.
+    """
     effects = [finding.effect for finding in chosen if finding.effect is not None]
     taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
     number = len(chosen) + 1
@@ -101,6 +106,10 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         plain = kind.seen or (not kind.scatters and (told or finding.p_value < _DECISIVE))
         if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
+        if not rejected and not kind.seen and not kind.scatters:
+            left_moving = still_moving(moves, dependences(
+                bench, [*effects, finding.effect], [*chosen, finding]))
+            rejected = str(left_moving or '')
         found.append(Candidate(name, number, finding, new, rejected))
     return found
 

@@ -63,11 +63,12 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
                 'observed minus predicted attenuation).')
     if content['verdict'] == 'traced':
         return f'The declared model lacks {added}: with it {error}.'
+    left = ', '.join(filter(None, (f'p = {_number(after["p_value"])}', content['remains'])))
     if added:
         return (f'The residual is not explained: even with {added} a significant one remains '
-                f'(p = {_number(after["p_value"])}); {error}.')
-    return (f'The residual is significant (p = {_number(after["p_value"])}, held-out error '
-            f'{_number(after["rms"])}) and none of the known effects explains it.')
+                f'({left}); {error}.')
+    return (f'The residual is significant ({left}, held-out error {_number(after["rms"])}) and '
+            'none of the known effects explains it.')
 
 
 def html(content: Mapping[str, Json], figures: Sequence[Illustration],
@@ -79,6 +80,7 @@ def html(content: Mapping[str, Json], figures: Sequence[Illustration],
         f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
         *_effects(content['missing_effects']),
         '<h2>Error of held-out acquisitions</h2>', _error_table(content),
+        '<h2>What the residual changes with</h2>', _dependence_table(content['dependence']),
         *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
         '<h2>Candidates</h2>', _candidate_table(content['candidates']),
         '<h2>Lines</h2>', _line_table(content['lines']),
@@ -107,6 +109,17 @@ def _error_table(content: Mapping[str, Json]) -> str:
         *((text, _number(before[key]), _number(after[key])) for key, text in _ERRORS),
         ('scatter of the amplitudes that nothing explains, part of the scale',
          *2 * (_number(content['unsteadiness']),))])
+
+
+def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
+    return _table(
+        ('from its lowest to its highest', 'from', 'to', 'change before', 'p value',
+         'change after', 'p value'),
+        [(item['on'].replace('_', ' '), _number(item['low']),
+          f'{_number(item["high"])} {item["unit"]}'.strip(),
+          *(text for when in ('before', 'after') for text in (
+              f'{_number(item[when]["change"])} ± {_number(item[when]["standard_error"])}',
+              _number(item[when]['p_value'])))) for item in rows])
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:

@@ -9,6 +9,7 @@ raw over corrected amplitude: what noise, modulation and interpolation do to bot
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,7 @@ class Acquisition:
     errors: FloatArray
     standard_errors: FloatArray
     reference: FloatArray | None
-    raw: ComplexArray
-    corrected: ComplexArray
+    raw_cycles: ComplexArray
     cycles: ComplexArray
     noise: FloatArray
     noise_floor: FloatArray
@@ -66,6 +66,16 @@ class Acquisition:
     ripple_standard_error: float
     recovered: bool
     reason: str
+
+    @cached_property
+    def raw(self) -> ComplexArray:
+        """Return the raw complex peak amplitudes (channel, order)."""
+        return np.asarray(self.raw_cycles.mean(axis=0))
+
+    @cached_property
+    def corrected(self) -> ComplexArray:
+        """Return the corrected complex peak amplitudes (channel, order)."""
+        return np.asarray(self.cycles.mean(axis=0))
 
     @property
     def attenuation(self) -> FloatArray:
@@ -286,6 +296,5 @@ def _acquire(reader: CycleReader, pulses: TriggerPulses, model: DeclaredModel, f
     floor = noise_floor(grid[:, :-1], model.cycle_length, sources[:len(model.orders)],
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
-        first, times, missing, errors, standard_errors, reference, raw.mean(axis=0),
-        clean.mean(axis=0), clean, radial_noise(clean), floor, ripple, bend_error,
-        recovery.accepted, recovery.reason)
+        first, times, missing, errors, standard_errors, reference, raw, clean,
+        radial_noise(clean), floor, ripple, bend_error, recovery.accepted, recovery.reason)

@@ -116,10 +116,10 @@ def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observati
         found.append(Acquisition(
             first=number * count, times=when, missing=np.zeros(count, np.int64),
             errors=errors - errors.mean(), standard_errors=error, reference=None,
-            raw=item.raw[:, kept], corrected=item.corrected[:, kept],
-            cycles=item.corrected[None][:, :, kept], noise=item.noise[:, kept],
-            noise_floor=item.noise[:, kept], ripple=np.full(count, np.nan),
-            ripple_standard_error=math.inf, recovered=True, reason=''))
+            raw_cycles=item.raw[None][:, :, kept], cycles=item.corrected[None][:, :, kept],
+            noise=item.noise[:, kept], noise_floor=item.noise[:, kept],
+            ripple=np.full(count, np.nan), ripple_standard_error=math.inf, recovered=True,
+            reason=''))
     speed = float(np.mean([item.trigger_speed for item in averages]))
     orders = measured[kept]
     record = np.concatenate(times)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.closure.candidates import Candidate
+from sa_jitter_ros.closure.dependence import Dependence, moving
 from sa_jitter_ros.closure.residual import Residual
 from sa_jitter_ros.closure.trace import Trace
 from sa_jitter_ros.effects import parameter_ranges
@@ -37,8 +38,11 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'candidates': [_candidate(item) for item in trace.candidates],
         'error_before': errors(trace.before),
         'error_after': errors(trace.after),
+        'dependence': [_dependence(*pair) for pair in zip(
+            trace.dependences_before, trace.dependences_after)],
         'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
+        'remains': str(moving(trace.dependences_after) or ''),
         'lines': lines,
     })
     return content
@@ -68,6 +72,8 @@ def summary(content: Mapping[str, Json]) -> str:
                 f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
     text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
                 f'{after["chi2_per_dof"]:.3g} after')
+    if content['remains']:
+        text.append(content['remains'])
     if content['unsteadiness']:
         text.append(f'the amplitudes scatter by {content["unsteadiness"]:.2%} of themselves that '
                     'nothing explains: part of the scale of chi2 and p')
@@ -87,6 +93,13 @@ def plain(value: Any) -> Json:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value
+
+
+def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
+    return {'on': before.on, 'unit': before.unit, 'low': before.low, 'high': before.high,
+            **{when: {'change': item.change, 'standard_error': item.standard_error,
+                      'p_value': item.p_value}
+               for when, item in (('before', before), ('after', after))}}
 
 
 def _effect(finding: Finding) -> Mapping[str, Json]:

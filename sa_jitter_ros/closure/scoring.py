@@ -5,7 +5,7 @@ The scale holds what the machine's own amplitudes scatter by (unsteadiness), bes
 jitter and effects predict.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,6 +26,19 @@ Array = NDArray[Any]
 #: machines were measured to have that no effect describes (docs/measured_cases.md).
 STEADY = 0.02
 _CHANCE = 3.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    Residual of the attenuation and its `scale`, (acquisition, line).
+
+    `moved` is what one standard error of each fitted parameter changes in the prediction.
+    """
+
+    difference: Array
+    scale: Array
+    moved: tuple[Array, ...]
 
 
 @dataclass(frozen=True)
@@ -88,6 +101,15 @@ class Bench:
             return 0.0
         return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
 
+    def compare(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Comparison:
+        """Return the residual of the attenuation of the held-out acquisitions, one by one."""
+        attenuation, variance, _ = self.observed(self.held_out)
+        expected = self.expect(effects, self.held_out)
+        return Comparison(
+            attenuation - expected.attenuation, np.sqrt(expected.attenuation_variance + variance),
+            tuple(self.expect(others, self.held_out).attenuation - expected.attenuation
+                  for others in _moved(effects, findings)))
+
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
         """Return the residual of the held-out acquisitions."""
@@ -95,18 +117,23 @@ class Bench:
         expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
         probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
         moved = []
-        for i, finding in enumerate(findings):
-            for shifted in _shifted(finding):
-                others = [*effects[:i], shifted, *effects[i + 1:]]
-                other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
-                moved.append(Sensitivity(
-                    (other.attenuation - expected.attenuation).mean(axis=0),
-                    float(np.mean((other.attenuation_variance - expected.attenuation_variance)
-                                  / (expected.attenuation_variance + variance))),
-                    float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
+        for others in _moved(effects, findings):
+            other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
+            moved.append(Sensitivity(
+                (other.attenuation - expected.attenuation).mean(axis=0),
+                float(np.mean((other.attenuation_variance - expected.attenuation_variance)
+                              / (expected.attenuation_variance + variance))),
+                float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, probability, sensitivities=moved)
+
+
+def _moved(effects: Sequence[Effect], findings: Sequence[Finding]) -> Iterator[list[Effect]]:
+    """Yield the effects with each of their numbers one standard error larger."""
+    for i, finding in enumerate(findings):
+        for shifted in _shifted(finding):
+            yield [*effects[:i], shifted, *effects[i + 1:]]
 
 
 def _shifted(finding: Finding) -> list[Effect]:

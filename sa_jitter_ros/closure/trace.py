@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.closure.candidates import best_of, Candidate, SIGNIFICANT, try_all
+from sa_jitter_ros.closure.dependence import Dependence, dependences, moving
 from sa_jitter_ros.closure.expectation import Expectation, Lines
 from sa_jitter_ros.closure.gathering import (
     channel_groups, choose_lines, gather_pulses, line_evidence)
@@ -37,6 +38,7 @@ class Trace:
     """
     What the trace found; `before` and `after` are residuals of held-out acquisitions.
 
+    `dependences_before` and `dependences_after` tell how they change with order, speed and cycles.
     `prediction_before` and `prediction_after` are those of all acquisitions (acquisition, line) of
     the `lines`; `attenuation` and `amplitude` what was observed. `evidence` is that of the first
     round, with nothing explained. `unsteadiness` is how much the amplitudes scatter by themselves,
@@ -53,6 +55,8 @@ class Trace:
     candidates: tuple[Candidate, ...]
     before: Residual
     after: Residual
+    dependences_before: tuple[Dependence, ...]
+    dependences_after: tuple[Dependence, ...]
     attenuation: Array
     amplitude: Array
     prediction_before: Expectation
@@ -73,7 +77,8 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     """
     observation = together(observations)
     require_acquisitions(observation)
-    return trace_bench(_bench(observation, observations, recordings, declared), progress=progress)
+    return trace_bench(make_bench(observation, observations, recordings, declared),
+                       progress=progress)
 
 
 def require_acquisitions(observation: Observation) -> None:
@@ -92,12 +97,13 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     say = progress or (lambda text: None)
     own = bench.unsteadiness(())
     after = bench.score((), unsteadiness=own)
+    at_first = moves = dependences(bench, (), ())
     chosen: list[Finding] = []
     candidates: list[Candidate] = []
     first_evidence: Evidence | None = None
     reason = ''
     while len(chosen) < _MOST_EFFECTS:
-        significant = after.p_value < SIGNIFICANT
+        significant = remains(after, moves)
         effects = [finding.effect for finding in chosen if finding.effect is not None]
         try:
             evidence = replace(bench.gather(effects, bench.fit),
@@ -107,7 +113,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
             break
         first_evidence = first_evidence or evidence
         say(f'round {len(chosen) + 1}: p = {after.p_value:.2g}, RMS residual {after.rms:.4f}')
-        round_ = try_all(bench, evidence, chosen, after, own, significant)
+        round_ = try_all(bench, evidence, chosen, after, moves, own, significant)
         winner = best_of(round_)
         if winner is None and not significant:
             candidates += round_
@@ -122,23 +128,32 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         effects = [finding.effect for finding in chosen if finding.effect is not None]
         own = bench.unsteadiness(effects)
         after = bench.score(effects, chosen, unsteadiness=own)
-    if reason and after.p_value < SIGNIFICANT:
+        moves = dependences(bench, effects, chosen)
+    unexplained = remains(after, moves)
+    if reason and unexplained:
         candidates += [Candidate(name, 1, Finding(name, None, {}, 1.0, reason, reason), None,
                                  reason) for name in EFFECTS]
     effects = [finding.effect for finding in chosen if finding.effect is not None]
     everything = range(count)
     attenuation, _, amplitude = bench.observed(everything)
-    verdict = ('unexplained' if after.p_value < SIGNIFICANT else 'traced' if chosen else 'none')
+    verdict = ('unexplained' if unexplained else 'traced' if chosen else 'none')
     before = bench.score((), unsteadiness=own) if chosen else after
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        tuple(chosen), tuple(candidates), before, after, attenuation, amplitude,
+        tuple(chosen), tuple(candidates), before, after, at_first, moves,
+        attenuation, amplitude,
         bench.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), first_evidence, verdict, own)
 
 
-def _bench(observation: Observation, observations: Sequence[Observation],
-           recordings: Sequence[Recording], declared: Sequence[Effect]) -> Bench:
+def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
+    """Tell whether a residual is significant, by itself or by what it moves with."""
+    return left.p_value < SIGNIFICANT or moving(moves) is not None
+
+
+def make_bench(observation: Observation, observations: Sequence[Observation],
+               recordings: Sequence[Recording], declared: Sequence[Effect]) -> Bench:
+    """Return all that scoring needs of `observation`, which holds the `observations` together."""
     lines = choose_lines(observation)
     count = len(observation.acquisitions)
     fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))

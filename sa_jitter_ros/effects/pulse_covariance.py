@@ -25,6 +25,7 @@ _MOST_PULSES = 200
 _GOOD = 1e-3
 _DRAWS = 4000
 _FEWEST = 20
+_STEADY = 5e-3  # relative spread of speeds that are one
 
 
 def white(lags: Array, _: float) -> Array:
@@ -203,7 +204,20 @@ def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
         p_steady = float(stats.chi2.sf(ratio, rows - 1))
         if p_steady < _GOOD:
             return f'the size of the errors is not steady over the record: p = {p_steady:.2g}'
+        p_speed = _speed_p_value(evidence, power, float(expected))
+        if p_speed < _GOOD:
+            return f'the size of the errors changes with the speed: p = {p_speed:.2g}'
     return ''
+
+
+def _speed_p_value(evidence: Evidence, power: Array, spread: float) -> float:
+    """Test whether the power of the errors, of relative `spread`, changes with the speed."""
+    speed = 1.0 / np.ptp(evidence.times, axis=1)
+    away = speed / speed.mean() - 1.0
+    if np.std(away) < _STEADY:
+        return 1.0
+    slope = float(np.sum(away * power) / power.mean() / np.sqrt(np.sum(away**2)))
+    return float(2.0 * stats.norm.sf(abs(slope) / spread))
 
 
 def _law_p_value(evidence: Evidence, fit: CovarianceFit) -> float:

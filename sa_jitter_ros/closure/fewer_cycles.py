@@ -1,0 +1,63 @@
+"""Fewer cycles: the same acquisitions averaged over fewer trigger cycles each."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.closure.cycle_reader import repaired
+from sa_jitter_ros.closure.observation import Acquisition, Observation
+from sa_jitter_ros.closure.scoring import Bench
+from sa_jitter_ros.effects.effect import Pulses
+
+
+def fewer_cycles(bench: Bench, count: int) -> Bench:
+    """
+    Return a bench whose acquisitions are averages of `count` trigger cycles of this one's.
+
+    What is left at the end of an acquisition is not used. Those of one that is held out are held
+    out, in its place and one behind the other.
+    """
+    observation = bench.observation
+    parts = observation.model.trigger_cycles // count
+    model = replace(observation.model, trigger_cycles=count)
+    starts = [part * count for part in range(parts)]
+
+    def places(chosen: tuple[int, ...]) -> tuple[int, ...]:
+        return tuple(a * parts + part for a in chosen for part in range(parts))
+
+    acquisitions = tuple(_part(observation, item, start, count)
+                         for item in observation.acquisitions for start in starts)
+    before, after = model.weights.before, model.weights.after
+    pulses = [[_between(row, start, before + count + after) for row in rows]
+              for rows in bench.pulses for start in starts]
+    return replace(bench, observation=replace(observation, model=model, acquisitions=acquisitions),
+                   pulses=pulses, fit=places(bench.fit), held_out=places(bench.held_out),
+                   memory={})
+
+
+def _part(observation: Observation, item: Acquisition, start: int, count: int) -> Acquisition:
+    """Return `count` cycles of an acquisition, at angle 0 where they begin."""
+    stop = start + count
+    pulses, cycles = slice(start, stop + 1), slice(start, stop)
+    _, index = repaired(item.times, item.missing)
+    ratio = observation.model.cycle_length
+    longer = np.sqrt(item.missing.size / count)
+    errors = item.errors[pulses]
+    return replace(
+        item, first=item.first + start, times=item.times[pulses], missing=item.missing[cycles],
+        errors=errors - errors.mean(), standard_errors=item.standard_errors[pulses],
+        reference=None if item.reference is None else item.reference[pulses],
+        raw_cycles=item.raw_cycles[cycles] * _turn(observation, ratio * start),
+        cycles=item.cycles[index[start]:index[stop]] * _turn(observation, ratio * index[start]),
+        noise=longer * item.noise, noise_floor=longer * item.noise_floor,
+        ripple=item.ripple[cycles])
+
+
+def _turn(observation: Observation, angle: float) -> NDArray[np.complex128]:
+    """Return the factor (order,) that moves angle 0 on, by fundamental cycles."""
+    return np.asarray(np.exp(2j * np.pi * angle * observation.sources))
+
+
+def _between(pulses: Pulses, start: int, cycles: int) -> Pulses:
+    """Return the pulses of some cycles."""
+    return pulses.without(start, pulses.times.size - 1 - start - cycles)
