@@ -64,6 +64,15 @@ def traced(*effects, model=MODEL, **options):
     return trace([observe(recording, model)], [recording])
 
 
+def test_order_that_is_declared_twice_counts_once():
+    recording = simulated(acquisitions=8)
+    twice = replace(MODEL, orders=(8.0, 16.0, 8.0, 24.0, 32.0, 16.0))
+    found, once = (trace([observe(recording, model)], [recording]) for model in (twice, MODEL))
+    assert found.observation.orders.tolist() == list(MODEL.orders)
+    assert found.verdict == once.verdict == 'none'
+    assert found.after.rms == pytest.approx(once.after.rms)
+
+
 def test_observation_finds_the_true_errors_and_attenuation():
     recording = simulated(acquisitions=4)
     truth = simulated(acquisitions=4, reference=True)

@@ -98,6 +98,39 @@ def test_noise_alone_is_left_as_it_is():
             correction.corrected.waveform, average.waveform)
 
 
+@pytest.mark.parametrize('amplitude', [1.0, 2.0])
+def test_errors_that_follow_another_shafts_order_are_refused(rng, amplitude):
+    """
+    Order 12.04 is not told from 12 by six cycles.
+
+    A displaced pulse, far beyond the declared jitter, leaves no other order to recover from.
+    """
+    rate, tones = 6400.0, {1.0: 1.0, 5.0: 1.0, 12.04: amplitude, 30.0: 0.8}
+    settings = AverageSettings(trigger_cycles=6, orders=(1.0, 5.0, 30.0), correct_jitter=True,
+                               keyphasor_rate=rate)
+    refused = wrong = 0
+    for displaced in np.linspace(-1.2e-3, 1.2e-3, 31):
+        speed = rng.uniform(22.0, 28.0)
+        true = 0.01 + np.arange(8) / speed
+        pulses = true + rng.uniform(-0.5, 0.5, 8) / rate
+        pulses[rng.integers(7)] += displaced
+        times = np.arange(round(8.5 / speed * rate)) / rate
+        phase = 2.0 * np.pi * rng.random(4)
+        samples = sum(a * np.cos(2.0 * np.pi * g * speed * times + at)
+                      for (g, a), at in zip(tones.items(), phase))
+        averager = StreamingAverager({'shaft': settings}, validator=PulseValidator(),
+                                     timeline=VibrationTimeline())
+        averager.add_pulses(pulses)
+        (_, average), = averager.add_samples(SampleBlock(samples[None], 0.0, rate, 0))
+        recovery = average.correction.recovery
+        errors = (pulses - true)[:7]
+        apart = np.abs(recovery.errors - (errors - errors.mean())) / recovery.standard_errors
+        wrong += recovery.accepted and apart.max() > 8.0
+        refused += "another shaft's order" in recovery.reason
+    assert wrong == 0
+    assert refused > 0
+
+
 def test_correction_needs_blocks_of_cycles():
     with pytest.raises(ParameterError, match='set averaging to block'):
         AverageSettings(correct_jitter=True, averaging='sliding')

@@ -31,7 +31,8 @@ figcaption { color: #555 }
 """
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
-    ('rms_standard_error', 'what chance adds to it, in quadrature'),
+    ('rms_standard_error', 'what its standard error adds to it, in quadrature'),
+    ('rms_parameter_error', 'of this, by what the fitted parameters are uncertain'),
     ('chi2_per_dof', 'chi2 per degree of freedom of the amplitudes'),
     ('ks', 'Kolmogorov-Smirnov distance from the predicted law'),
     ('cramer_von_mises', 'Cramer-von Mises statistic'),

@@ -133,7 +133,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     if model.sample_rate and abs(recording.sample_rate / model.sample_rate - 1.0) > 1e-3:
         raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
                          f'has {recording.sample_rate:g} Hz')
-    model = replace(model, sample_rate=recording.sample_rate)
+    once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each leaks into others only
+    model = replace(model, sample_rate=recording.sample_rate, orders=once)
     pulses = trigger_pulses(recording, model)
     samples = np.ascontiguousarray(recording.read().T)
     if not np.all(np.isfinite(samples)):
@@ -146,11 +147,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
             'trigger cycles inside the vibration: lower trigger_cycles or record longer')
     rows = tuple(range(samples.shape[1]))
-    declared = tuple(float(g) for g in model.orders)
     orders = np.array(sources if len(sources) else [
-        *declared, *other_sources(reader, pulses, model, starts, rows)])
+        *once, *other_sources(reader, pulses, model, starts, rows)])
     if pulses.reference is not None and not _reference_serves(
-            reader, pulses, model, starts, np.array(declared), rows):
+            reader, pulses, model, starts, np.array(once), rows):
         pulses = replace(pulses, reference=None)
     found = []
     for count, first in enumerate(starts):
@@ -164,7 +164,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             raise SignalError('the pulse errors cannot be recovered from the vibration: '
                               f'{reason}; give reference_pulse_times or orders above the noise')
     return Observation(
-        model, tuple(found), np.array(declared), orders, recording.channel_names, pulses,
+        model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, recording.description)
 
 

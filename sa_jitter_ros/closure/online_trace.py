@@ -103,7 +103,7 @@ def _longest_stretch(averages: Sequence[Average]) -> Sequence[Average]:
 def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observation:
     """Return the averages as the observation of a record that begins with their first pulse."""
     measured = averages[0].orders
-    kept = [int(np.argmin(np.abs(measured - order))) for order in model.orders
+    kept = [int(np.argmin(np.abs(measured - order))) for order in dict.fromkeys(model.orders)
             if np.isclose(measured, order, rtol=1e-6).any()]
     if not kept:
         raise ModelError(f'averages have the orders {named(measured)}, none of which is declared')

@@ -54,7 +54,7 @@ def errors(item: Residual) -> Mapping[str, Json]:
         'rms': item.rms, 'chi2_per_dof': item.chi2_per_dof, 'ks': item.ks,
         'cramer_von_mises': item.cramer_von_mises, 'coverage_95': item.coverage,
         'mean': item.mean.mean(), 'rms_standard_error': item.rms_standard_error,
-        'p_value': item.p_value}
+        'rms_parameter_error': item.rms_parameter_error, 'p_value': item.p_value}
 
 
 def summary(content: Mapping[str, Json]) -> str:

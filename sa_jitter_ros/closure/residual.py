@@ -40,17 +40,20 @@ class Residual:
     """
     Summary of a residual; `mean` and `standard_error` are per line.
 
-    `rms` is the root mean square over lines of the mean residual, `rms_standard_error` what chance
-    adds to it (in quadrature); `chi2_per_dof`, `ks`, `cramer_von_mises` and `coverage` (of the 95
-    % band) describe the standardised amplitudes `z`. `score` and `amplitude_score` are mean normal
-    log likelihoods of attenuation and amplitude, `p_mean`, `p_scatter` and `p_amplitude` the
-    chances of this much mean residual, scatter of the attenuation and scatter of the amplitude.
+    `rms` is the root mean square over lines of the mean residual, `rms_standard_error` what its
+    standard error adds to it (in quadrature), of which `rms_parameter_error` is by what the fitted
+    parameters are uncertain, the rest by the chance of these acquisitions; `chi2_per_dof`, `ks`,
+    `cramer_von_mises` and `coverage` (of the 95 % band) describe the standardised amplitudes `z`.
+    `score` and `amplitude_score` are mean normal log likelihoods of attenuation and amplitude,
+    `p_mean`, `p_scatter` and `p_amplitude` the chances of this much mean residual, scatter of the
+    attenuation and scatter of the amplitude.
     """
 
     mean: Array
     standard_error: Array
     rms: float
     rms_standard_error: float
+    rms_parameter_error: float
     chi2_per_dof: float
     ks: float
     cramer_von_mises: float
@@ -86,7 +89,8 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
     count = len(difference)
     scale = np.sqrt(variance)
     mean = difference.mean(axis=0)
-    error = np.sqrt(np.mean(scale**2, axis=0) / count)
+    unsure = np.zeros(mean.size) + sum(item.mean**2 for item in sensitivities)
+    error = np.sqrt(np.mean(scale**2, axis=0) / count + unsure)
     shift = amplitude - amplitude_expected
     width = np.sqrt(amplitude_variance)
     z = shift / width
@@ -95,6 +99,7 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
     return Residual(
         mean=mean, standard_error=error, rms=float(np.sqrt(np.mean(mean**2))),
         rms_standard_error=float(np.sqrt(np.mean(error**2))),
+        rms_parameter_error=float(np.sqrt(np.mean(unsure))),
         chi2_per_dof=float(np.mean(z**2)),
         ks=float(stats.kstest(inside, 'uniform').statistic),
         cramer_von_mises=float(uniform.statistic) if uniform is not None else float('nan'),
