@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from sa_jitter_ros.closure.dependence import Dependence, dependences, still_moving
+from sa_jitter_ros.closure.dependence import Dependence, dependences, moving, still_moving
 from sa_jitter_ros.closure.residual import ACCURACY, Residual
 from sa_jitter_ros.closure.scoring import Bench
 from sa_jitter_ros.effects import Effect, EFFECTS
@@ -76,42 +76,74 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
             continue
         left = bench.unsteadiness([*effects, finding.effect]) if kind.scatters else own
         score = bench.score([*effects, finding.effect], [*chosen, finding], unsteadiness=left)
-        rejected = finding.against
-        if not rejected and finding.p_value > _EVIDENCE:
-            rejected = f'its evidence may be chance: {finding.evidence}'
-        if kind.scatters:
-            gained, new, old = 'amplitude', score.amplitude_score, current.amplitude_score
-            p_value = 3.0 * current.p_amplitude
-            decisive = own > ACCURACY and left**2 < 0.5 * own**2
-            told = own > ACCURACY and finding.p_value < _DECISIVE and (
-                (new - old) * score.z.size > _TOLD)
-            # unsteadiness was fitted to the held-out amplitudes, too: a cause need not beat it
-            better = new > old or (decisive and score.chi2_per_dof < _NO_MORE)
-        else:
-            gained, new, old = 'attenuation', score.score, current.score
-            p_value = current.p_attenuation
-            decisive = _decisive(finding, current, score)
-            told = _told(bench, effects, finding, current, score)
-            better = new > old or told or (kind.seen and new > old - _SAME)
-        needed = p_value < SIGNIFICANT or kind.seen or decisive or told
-        least = _FAINT if kind.scatters else ACCURACY
-        if not rejected and not kind.seen and _moved(bench, effects, finding.effect) < least:
-            rejected = f'it is too small to matter: the {gained} of no line changes by {least:g}'
-        if not rejected and not needed:
-            rejected = (f'not needed: the {gained} leaves nothing significant '
-                        f'(p = {min(p_value, 1.0):.2g})')
-        if not rejected and not better:
-            rejected = (f'the {gained} of held-out acquisitions is predicted no better: log score '
-                        f'{new:.3f} after {old:.3f}')
-        plain = kind.seen or (not kind.scatters and (told or finding.p_value < _DECISIVE))
+        gain = (_gain_of_amplitude(finding, current, score, own, left) if kind.scatters
+                else _gain_of_attenuation(bench, effects, finding, current, moves, score))
+        rejected = finding.against or _rejection(bench, effects, finding, gain)
+        plain = kind.seen or (not kind.scatters and (gain.told or finding.p_value < _DECISIVE))
         if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
         if not rejected and not kind.seen and not kind.scatters:
-            left_moving = still_moving(moves, dependences(
-                bench, [*effects, finding.effect], [*chosen, finding]))
-            rejected = str(left_moving or '')
-        found.append(Candidate(name, number, finding, new, rejected))
+            rejected = str(still_moving(moves, dependences(
+                bench, [*effects, finding.effect], [*chosen, finding])) or '')
+        found.append(Candidate(name, number, finding, gain.score, rejected))
     return found
+
+
+@dataclass(frozen=True)
+class _Gain:
+    """
+    What held-out acquisitions gain by an effect: log `score` and the one `before`.
+
+    `p_value` is that of the residual `of` attenuation or amplitude so far. `decisive` and `told`
+    say that the effect is there whatever that p value, `better` that it predicts no worse.
+    """
+
+    of: str
+    score: float
+    before: float
+    p_value: float
+    decisive: bool
+    told: bool
+    better: bool
+
+
+def _gain_of_amplitude(finding: Finding, current: Residual, score: Residual, own: float,
+                       left: float) -> _Gain:
+    """Return what an effect on the scatter gains; it leaves the unsteadiness `left` of `own`."""
+    new, old = score.amplitude_score, current.amplitude_score
+    decisive = own > ACCURACY and left**2 < 0.5 * own**2
+    told = own > ACCURACY and finding.p_value < _DECISIVE and (new - old) * score.z.size > _TOLD
+    # unsteadiness was fitted to the held-out amplitudes, too: a cause need not beat it
+    better = new > old or (decisive and score.chi2_per_dof < _NO_MORE)
+    return _Gain('amplitude', new, old, current.p_amplitudes, decisive, told, better)
+
+
+def _gain_of_attenuation(bench: Bench, effects: Sequence[Effect], finding: Finding,
+                         current: Residual, moves: Sequence[Dependence], score: Residual) -> _Gain:
+    """Return what an effect on the attenuation gains."""
+    new, old = score.score, current.score
+    told = _told(bench, effects, finding, current, score)
+    better = new > old or told or (EFFECTS[finding.name].seen and new > old - _SAME)
+    change = moving(moves)
+    p_value = min(current.p_attenuation, change.p_value if change else 1.0)
+    return _Gain('attenuation', new, old, p_value, _decisive(finding, current, score), told,
+                 better)
+
+
+def _rejection(bench: Bench, effects: Sequence[Effect], finding: Finding, gain: _Gain) -> str:
+    """Say why an effect is not needed or no help; '' if it is."""
+    if finding.p_value > _EVIDENCE:
+        return f'its evidence may be chance: {finding.evidence}'
+    assert finding.effect is not None
+    seen, least = finding.effect.seen, _FAINT if finding.effect.scatters else ACCURACY
+    if not seen and _moved(bench, effects, finding.effect) < least:
+        return f'it is too small to matter: the {gain.of} of no line changes by {least:g}'
+    if not (gain.p_value < SIGNIFICANT or seen or gain.decisive or gain.told):
+        return f'not needed: the {gain.of} leaves nothing significant (p = {gain.p_value:.2g})'
+    if not gain.better:
+        return (f'the {gain.of} of held-out acquisitions is predicted no better: log score '
+                f'{gain.score:.3f} after {gain.before:.3f}')
+    return ''
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
@@ -137,7 +169,7 @@ def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
     """Say that an effect leaves nearly all of a significant residual; '' where it does not."""
     if scatters:
         old, new = before.chi2_per_dof - 1.0, after.chi2_per_dof - 1.0
-        if 3.0 * after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
+        if after.p_amplitudes < SIGNIFICANT and new > _NEARLY_ALL * old:
             return (f'it leaves nearly all of the scatter: chi2 per degree of freedom '
                     f'{new + 1.0:.3g} after {old + 1.0:.3g}')
     elif after.p_attenuation < SIGNIFICANT and after.rms > _NEARLY_ALL * before.rms:

@@ -68,12 +68,22 @@ class Residual:
     @property
     def p_attenuation(self) -> float:
         """Return the p value of mean and scatter of the attenuation together."""
-        return float(min(1.0, 3.0 * min(self.p_mean, self.p_scatter)))
+        return _one_of_three(self.p_mean, self.p_scatter)
+
+    @property
+    def p_amplitudes(self) -> float:
+        """Return the p value of the scatter of the amplitude."""
+        return _one_of_three(self.p_amplitude)
 
     @property
     def p_value(self) -> float:
-        """Return the p value of the largest of the three tests, corrected for their number."""
-        return float(min(1.0, 3.0 * min(self.p_mean, self.p_scatter, self.p_amplitude)))
+        """Return the p value of the largest of the three tests."""
+        return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude)
+
+
+def _one_of_three(*p_values: float) -> float:
+    """Return the smallest p value, corrected for there being three tests."""
+    return float(min(1.0, 3.0 * min(p_values)))
 
 
 def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Array,
