@@ -26,7 +26,9 @@ TEETH_FAULTS = ('missing', 'double', 'stray', 'displaced', 'far displaced')
 PULSES = ('lost', 'repeated', 'swapped', 'late', 'foreign', 'wild')
 SPACING = 8  # teeth between two faults of teeth or pulses
 JITTER = 1.0 / RATE  # s, declared width of the errors that all teeth have
-STEADY = 24  # teeth at the end of a scene without them: the next law may read eight cycles back
+# Teeth at the end of a scene without them. The next scene's law may be one that curves between
+# such pulses: it reads eight cycles back from averages that wait for their last pulses.
+STEADY = 56
 REJECTED = ('layout', 'header', 'channels', 'rate')  # messages that are refused as such
 
 

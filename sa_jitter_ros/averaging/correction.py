@@ -17,9 +17,6 @@ _REACH = 0.02  # of a trigger cycle by which a corrected pulse may move
 # Phase in rad up to which the recovered errors may be uncertain at an order. Beyond it the noise
 # of the order itself has a say in them, and aligning noise to itself raises the amplitude.
 _UNCERTAIN = 0.3
-# True errors of the pulses take power from an order, taking them out cannot; amplitudes that stand
-# this many standard deviations out of the noise count.
-_LOSS, _CLEAR = 0.02, 2.0
 
 
 @dataclass(frozen=True)
@@ -94,13 +91,13 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
         grid, periods=np.diff(raw.pulses), ratio=settings.cycles, first_angle=raw.angle,
         declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
     corrected = raw
-    if recovery.accepted:
+    largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
+    if largest > reach:
+        recovery = replace(recovery, accepted=False, errors=np.zeros_like(recovery.errors),
+                           reason=f'a pulse error of {largest:.3g} s is above {reach:.3g} s, '
+                                  f'{_REACH:.0%} of a trigger cycle: validate the pulses')
+    elif recovery.accepted:
         corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
-        reason = _refusal(raw, corrected, recovery.errors)
-        if reason:
-            corrected = raw
-            recovery = replace(recovery, accepted=False, reason=reason,
-                               errors=np.zeros_like(recovery.errors))
     phase = np.zeros(len(raw.orders))
     if recovery.accepted:
         frequency = raw.orders * settings.cycles / np.diff(raw.pulses).mean()
@@ -114,23 +111,6 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
         error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
     return Correction(corrected, recovery, attenuation,
                       np.hypot(error, attenuation * phase**2 / 2.0))
-
-
-def _refusal(raw: SynchronousAverage, corrected: SynchronousAverage, errors: FloatArray) -> str:
-    """Say why recovered `errors` (s) are not those of the pulses; empty if they may be."""
-    largest, reach = np.abs(errors).max(), _REACH * np.diff(raw.pulses).min()
-    if largest > reach:
-        return (f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a '
-                'trigger cycle: validate the pulses')
-    before, after = (np.abs(item.amplitudes) for item in (raw, corrected))
-    clear = np.maximum(before, after) > _CLEAR * raw.noise
-    power = [np.sum((raw.orders * amplitude)[clear] ** 2) for amplitude in (before, after)]
-    if power[1] < (1.0 - _LOSS) * power[0]:
-        return ('without the recovered errors the orders asked for hold '
-                f'{power[1] / power[0]:.2f} of their power, weighted by order^2, where they '
-                "should gain: the errors follow another shaft's order; average more trigger "
-                'cycles, or validate the pulses')
-    return ''
 
 
 def _average_again(raw: SynchronousAverage, cycles: Sequence[CycleSamples],

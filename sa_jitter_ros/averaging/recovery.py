@@ -37,6 +37,9 @@ _WORTHWHILE = 0.7
 # Amplitudes below this share of a channel's RMS are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
+# Errors that pulses have took power from the orders. Taking them out must not lose more, but for
+# what neighbours that a cycle does not keep apart make of it.
+_LOSS = 0.15
 
 
 @dataclass(frozen=True)
@@ -85,9 +88,9 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     """
     cycles, periods = _validated(cycles, periods, ratio, declared_standard_deviation)
     declared = declared_standard_deviation * ratio / float(np.mean(periods))
-    fit, reason = _staged_fit(cycles, ratio=ratio, first_angle=first_angle, orders=orders,
-                              also=also, most_orders=most_orders, declared=declared,
-                              with_ripple=with_ripple)
+    fit, gain, reason = _staged_fit(
+        cycles, ratio=ratio, first_angle=first_angle, orders=orders, also=also,
+        most_orders=most_orders, declared=declared, with_ripple=with_ripple)
     if fit is None:
         count, _, channels = cycles.shape
         return PulseErrorRecovery(
@@ -102,7 +105,7 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
         errors = fit.errors * seconds
     errors -= errors.mean()
     standard_errors = fit.standard_errors * seconds
-    reason = _refusal(errors, standard_errors, periods, declared_standard_deviation)
+    reason = _refusal(errors, standard_errors, periods, declared_standard_deviation, gain)
     turns = np.multiply.outer(fit.orders, fit.errors)
     gains = np.exp(1j * pi * (turns[:, :-1] + turns[:, 1:])) * np.sinc(np.diff(turns))
     return PulseErrorRecovery(
@@ -127,7 +130,7 @@ def _validated(cycles: FloatArray, periods: FloatArray, ratio: float, declared: 
 
 
 def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArray,
-             declared: float) -> str:
+             declared: float, gain: float) -> str:
     """Say why errors should not be corrected; empty if they should."""
     typical = float(np.sqrt(np.mean(standard_errors**2)))
     if not typical < _WORTHWHILE * declared:
@@ -136,13 +139,21 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
                 'align noise to itself')
     if np.any(np.diff(errors) >= periods):
         return 'the recovered errors would swap pulses: check ratio and pulses'
+    if gain < 1.0 - _LOSS:
+        return (f'without the recovered errors the orders hold {gain:.2f} of their power, '
+                'weighted by order^2, where they should gain: the errors follow another '
+                "shaft's order; average more trigger cycles, or validate the pulses")
     return ''
 
 
 def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders: Sequence[float],
                 also: Sequence[float], most_orders: int, declared: float, with_ripple: bool
-                ) -> tuple[PulseErrorFit | None, str]:
-    """Fit low orders first and higher ones as the errors become known; or say why it cannot be."""
+                ) -> tuple[PulseErrorFit | None, float, str]:
+    """
+    Fit low orders first and higher ones as the errors become known.
+
+    Returns what the power of the orders gains by the errors, too, or why nothing can be fitted.
+    """
     samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
     given = np.unique([g for g in orders if 0.0 < g * ratio <= 0.5 * len(samples)])
     search = None if len(orders) else LineSearch.of(samples, ratio, also)
@@ -183,7 +194,8 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
         if complete:
             break
     if problem is None:
-        return None, ('no synchronous order stands above the noise up to '
-                      f'{_MOST_TURNS / width:.4g}, from where the declared jitter leaves phases '
-                      'ambiguous')
-    return problem.solve(errors, expected=_WEAK_PRIOR * declared), ''
+        return None, 1.0, (
+            'no synchronous order stands above the noise up to '
+            f'{_MOST_TURNS / width:.4g}, from where the declared jitter leaves phases ambiguous')
+    fit = problem.solve(errors, expected=_WEAK_PRIOR * declared)
+    return fit, 1.0 if search is None else search.gain(fit.errors), ''

@@ -33,6 +33,7 @@ _COHERENCE = 0.15
 _SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
+_CLEAR = 100.0  # times the power of the orders around
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,7 @@ class LineSearch:
         part = part - part.mean(axis=(0, 1))
         window = np.sin(pi * np.arange(points) / points) ** 2
         # A taper over the cycles keeps strong orders from showing at their neighbours.
-        taper = np.sin(pi * (np.arange(part.shape[1]) + 0.5) / part.shape[1]) ** 2
-        spectra = rfft(part * np.multiply.outer(window, taper)[:, :, None], axis=0)
+        spectra = rfft(part * np.multiply.outer(window, _taper(part.shape[1]))[:, :, None], axis=0)
         top = 0.4 * points / ratio
         others = [g for g in also if 0.0 < g <= top]
         return cls(spectra, np.union1d(np.arange(1.0, int(top) + 1.0), others), ratio, first)
@@ -75,15 +75,35 @@ class LineSearch:
         They are at most `most`; `errors` (pulse,) of the average, in fundamental cycles, are taken
         out of the phases.
         """
-        count = self.spectra.shape[1]
         g = self.orders[self.orders <= below]
         if not len(g):
             return g
+        contrast = np.max(_contrast(self.power(errors, g)), axis=1)
+        return np.asarray(g[np.argsort(-contrast)[:most]])
+
+    def gain(self, errors: FloatArray) -> float:
+        """
+        Return how the power of all clear orders changes when `errors` (pulse,) are taken out.
+
+        Orders are weighted by their square, as what they tell of the errors. Errors that the
+        pulses have can but raise it; 1 where no order is clear.
+        """
+        before, after = (self.power(item, self.orders, tapered=False)
+                         for item in (0.0 * errors, errors))
+        clear = np.maximum(_contrast(before), _contrast(after)) > _CLEAR
+        weight = clear * self.orders[:, None] ** 2 / np.maximum(
+            np.sum(before, axis=0), np.finfo(float).tiny)
+        known = float(np.sum(weight * before))
+        return float(np.sum(weight * after)) / known if known else 1.0
+
+    def power(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> FloatArray:
+        """Return an array (order, channel), the power of orders `g` without `errors` (pulse,)."""
+        count = self.spectra.shape[1]
         errors = errors[self.first:self.first + count + 1]
         angle = self.ratio * (self.first + np.arange(count)) + errors[:-1]
         position = np.outer(g, self.ratio + np.diff(errors))
         nearest = np.rint(g * self.ratio).astype(np.intp)
-        phase = np.exp(-2j * pi * np.outer(g, angle))
+        phase = np.exp(-2j * pi * np.outer(g, angle)) / (1.0 if tapered else _taper(count))
         line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
         for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
             bins = nearest + offset
@@ -92,10 +112,17 @@ class LineSearch:
             weight = phase * lobe * np.exp(-1j * pi * x)
             weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
             line += np.einsum('gk,gkc->gc', weight, self.spectra.take(bins, axis=0, mode='clip'))
-        power = np.abs(line) ** 2
-        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
-        contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
-        return np.asarray(g[np.argsort(-contrast)[:most]])
+        return np.asarray(np.abs(line) ** 2)
+
+
+def _taper(count: int) -> FloatArray:
+    return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
+
+
+def _contrast(power: FloatArray) -> FloatArray:
+    """Return power (order, channel) over that of the orders around."""
+    background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
+    return np.asarray(power / np.maximum(background, np.finfo(float).tiny))
 
 
 def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
