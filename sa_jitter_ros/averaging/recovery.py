@@ -162,12 +162,15 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
     known = given if search is None else search.orders
     width = _UNIFORM_WIDTH * declared  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
-    errors, used = np.zeros(len(cycles) + 1), np.empty(0)
+    errors, used, clear = np.zeros(len(cycles) + 1), np.empty(0), np.empty(0)
     problem = None
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
-        candidates = (given[given <= reach] if search is None
-                      else search.strongest(errors, most, below=reach))
+        if search is None:
+            candidates = given[given <= reach]
+        else:
+            candidates, plain = search.strongest(errors, most, below=reach)
+            clear = np.union1d(clear, plain)
         # no more unknowns than half of what a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])
@@ -198,4 +201,4 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
             'no synchronous order stands above the noise up to '
             f'{_MOST_TURNS / width:.4g}, from where the declared jitter leaves phases ambiguous')
     fit = problem.solve(errors, expected=_WEAK_PRIOR * declared)
-    return fit, 1.0 if search is None else search.gain(fit.errors), ''
+    return fit, 1.0 if search is None else search.gain(fit.errors, clear), ''

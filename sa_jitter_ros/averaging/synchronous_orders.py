@@ -68,31 +68,33 @@ class LineSearch:
         others = [g for g in also if 0.0 < g <= top]
         return cls(spectra, np.union1d(np.arange(1.0, int(top) + 1.0), others), ratio, first)
 
-    def strongest(self, errors: FloatArray, most: int, *, below: float) -> FloatArray:
+    def strongest(self, errors: FloatArray, most: int, *, below: float
+                  ) -> tuple[FloatArray, FloatArray]:
         """
-        Return the orders up to `below` that stand out most from their neighbourhood, best first.
+        Return the orders up to `below` that stand out most, best first, and those that do clearly.
 
         They are at most `most`; `errors` (pulse,) of the average, in fundamental cycles, are taken
         out of the phases.
         """
         g = self.orders[self.orders <= below]
         if not len(g):
-            return g
-        contrast = np.max(_contrast(self.power(errors, g)), axis=1)
-        return np.asarray(g[np.argsort(-contrast)[:most]])
+            return g, g
+        power = self.power(errors, g)
+        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
+        contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
+        best = np.argsort(-contrast)[:most]
+        return g[best], g[best[contrast[best] > _CLEAR]]
 
-    def gain(self, errors: FloatArray) -> float:
+    def gain(self, errors: FloatArray, orders: FloatArray) -> float:
         """
-        Return how the power of all clear orders changes when `errors` (pulse,) are taken out.
+        Return how the power of some `orders` changes when `errors` (pulse,) are taken out.
 
         Orders are weighted by their square, as what they tell of the errors. Errors that the
-        pulses have can but raise it; 1 where no order is clear.
+        pulses have can but raise it; 1 where there is no order.
         """
-        before, after = (self.power(item, self.orders, tapered=False)
+        before, after = (self.power(item, orders, tapered=False)
                          for item in (0.0 * errors, errors))
-        clear = np.maximum(_contrast(before), _contrast(after)) > _CLEAR
-        weight = clear * self.orders[:, None] ** 2 / np.maximum(
-            np.sum(before, axis=0), np.finfo(float).tiny)
+        weight = orders[:, None] ** 2 / np.maximum(np.sum(before, axis=0), np.finfo(float).tiny)
         known = float(np.sum(weight * before))
         return float(np.sum(weight * after)) / known if known else 1.0
 
@@ -117,12 +119,6 @@ class LineSearch:
 
 def _taper(count: int) -> FloatArray:
     return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
-
-
-def _contrast(power: FloatArray) -> FloatArray:
-    """Return power (order, channel) over that of the orders around."""
-    background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
-    return np.asarray(power / np.maximum(background, np.finfo(float).tiny))
 
 
 def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
