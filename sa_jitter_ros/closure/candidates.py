@@ -82,7 +82,8 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         plain = kind.seen or (not kind.scatters and (gain.told or finding.p_value < _DECISIVE))
         if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
-        if not rejected and not kind.seen and not kind.scatters:
+        in_times = kind.seen or finding.effect.replaces_jitter(bench.observation.model)
+        if not rejected and not in_times and not kind.scatters:
             rejected = str(still_moving(moves, dependences(
                 bench, [*effects, finding.effect], [*chosen, finding])) or '')
         found.append(Candidate(name, number, finding, gain.score, rejected))
