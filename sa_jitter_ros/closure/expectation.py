@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.closure.cycle_reader import kept_apart
 from sa_jitter_ros.closure.observation import Acquisition, Observation
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
-from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.prediction import jitter_processes, known_errors, scenario_moments
 from sa_jitter_ros.statistics.amplitude_law import AmplitudeLaw, normal_law
 from sa_jitter_ros.statistics.angle_error import (
@@ -186,8 +186,7 @@ def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) 
 
 def _speed(item: Acquisition, model: DeclaredModel) -> float:
     """Return the speed of an acquisition in Hz, the declared one unless it differs."""
-    cycles = item.missing.size + item.missing.sum()
-    ratio = model.trigger_period * cycles / (item.times[-1] - item.times[0])
+    ratio = model.trigger_period / mean_period(item.times, item.missing)
     return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))
 
 

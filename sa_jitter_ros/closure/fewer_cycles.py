@@ -7,7 +7,18 @@ from numpy.typing import NDArray
 from sa_jitter_ros.closure.cycle_reader import repaired
 from sa_jitter_ros.closure.observation import Acquisition, Observation
 from sa_jitter_ros.closure.scoring import Bench
-from sa_jitter_ros.effects.effect import Pulses
+
+_FEWEST = 4  # cycles of an average, and fundamental cycles
+_FOLD = 8
+
+
+def with_fewer_cycles(bench: Bench) -> Bench:
+    """Return the bench with `fewer` of an eighth of the cycles, or of the least that will do."""
+    model = bench.observation.model
+    count = int(max(_FEWEST, np.ceil(_FEWEST / model.cycle_length), model.trigger_cycles // _FOLD))
+    if 2 * count > model.trigger_cycles:
+        return bench
+    return replace(bench, fewer=fewer_cycles(bench, count))
 
 
 def fewer_cycles(bench: Bench, count: int) -> Bench:
@@ -27,8 +38,8 @@ def fewer_cycles(bench: Bench, count: int) -> Bench:
 
     acquisitions = tuple(_part(observation, item, start, count)
                          for item in observation.acquisitions for start in starts)
-    before, after = model.weights.before, model.weights.after
-    pulses = [[_between(row, start, before + count + after) for row in rows]
+    reach = model.weights.before + count + model.weights.after
+    pulses = [[row.without(start, row.times.size - 1 - start - reach) for row in rows]
               for rows in bench.pulses for start in starts]
     return replace(bench, observation=replace(observation, model=model, acquisitions=acquisitions),
                    pulses=pulses, fit=places(bench.fit), held_out=places(bench.held_out),
@@ -56,8 +67,3 @@ def _part(observation: Observation, item: Acquisition, start: int, count: int) -
 def _turn(observation: Observation, angle: float) -> NDArray[np.complex128]:
     """Return the factor (order,) that moves angle 0 on, by fundamental cycles."""
     return np.asarray(np.exp(2j * np.pi * angle * observation.sources))
-
-
-def _between(pulses: Pulses, start: int, cycles: int) -> Pulses:
-    """Return the pulses of some cycles."""
-    return pulses.without(start, pulses.times.size - 1 - start - cycles)

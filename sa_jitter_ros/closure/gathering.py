@@ -12,7 +12,7 @@ from sa_jitter_ros.closure.cycle_reader import repaired
 from sa_jitter_ros.closure.expectation import Lines
 from sa_jitter_ros.closure.observation import Acquisition, Observation, recovered_again
 from sa_jitter_ros.closure.tone import find_tone
-from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
@@ -264,5 +264,5 @@ def _without_gaps(known: Array, missing: Array, times: Array) -> Array:
     """Return known errors less those of missing pulses, which the recovery repairs itself."""
     if not missing.any():
         return known
-    period = (times[-1] - times[0]) / (missing.size + missing.sum())
+    period = mean_period(times, missing)
     return np.asarray(known - period * np.concatenate(([0.0], np.cumsum(missing))))

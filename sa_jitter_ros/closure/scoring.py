@@ -43,7 +43,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class Bench:
-    """Everything that scoring needs; `untold` says of effects why these data cannot tell them."""
+    """
+    Everything that scoring needs; `untold` says of effects why these data cannot tell them.
+
+    `fewer` is the same averaged over fewer cycles, where the acquisitions hold enough of them.
+    """
 
     observation: Observation
     lines: Lines
@@ -57,6 +61,7 @@ class Bench:
     declared: tuple[Effect, ...]
     untold: Mapping[str, str] = field(default_factory=dict)
     memory: Memory = field(default_factory=dict, repr=False)
+    fewer: 'Bench | None' = None
 
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.closure.candidates import best_of, Candidate, SIGNIFICANT, try_all
 from sa_jitter_ros.closure.dependence import Dependence, dependences, moving
 from sa_jitter_ros.closure.expectation import Expectation, Lines
+from sa_jitter_ros.closure.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.closure.gathering import (
     channel_groups, choose_lines, gather_pulses, line_evidence)
 from sa_jitter_ros.closure.observation import Observation, together
@@ -164,9 +165,9 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
     orders = observation.orders.size
     corrected = np.abs(observation.stacked('corrected')[..., :orders])
     level = lines.of(corrected[list(fit)].mean(axis=0))
-    return Bench(observation, lines, level, [row for _, rows in known for row in rows],
-                 clock, group, line_evidence(observation, lines), fit, held_out,
-                 tuple(declared))
+    return with_fewer_cycles(Bench(
+        observation, lines, level, [row for _, rows in known for row in rows], clock, group,
+        line_evidence(observation, lines), fit, held_out, tuple(declared)))
 
 
 def _one_clock(clocks: Sequence[Clock]) -> Clock:

@@ -92,6 +92,12 @@ class Pulses:
             missing=None if self.missing is None else self.missing[cycles])
 
 
+def mean_period(times: Array, missing: Array | None) -> float:
+    """Return the mean trigger period in s of pulses of which `missing` (interval,) lack."""
+    lost = 0 if missing is None else missing.sum()
+    return float((times[-1] - times[0]) / (len(times) - 1 + lost))
+
+
 class Effect:
     """
     An effect that does nothing: the base of all.

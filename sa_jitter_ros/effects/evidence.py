@@ -12,12 +12,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.effects.prediction import known_errors
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 Array = NDArray[Any]
+
+#: Relative spread of speeds that are one: nothing can be told from how they differ.
+SAME_SPEED = 5e-3
 
 
 @dataclass(frozen=True)
@@ -91,12 +94,14 @@ class Evidence:
         return self.whole or self
 
     @property
+    def periods(self) -> Array:
+        """Return the mean trigger period of each acquisition (acquisition,) in s."""
+        return np.array([mean_period(pulses.times, pulses.missing) for pulses in self.pulses])
+
+    @property
     def period(self) -> float:
         """Return the mean trigger period in s."""
-        times = np.array([pulses.times for pulses in self.pulses])
-        cycles = times.shape[1] - 1 + np.array([0 if pulses.missing is None else
-                                                pulses.missing.sum() for pulses in self.pulses])
-        return float(np.mean((times[:, -1] - times[:, 0]) / cycles))
+        return float(np.mean(self.periods))
 
     @property
     def times(self) -> Array:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.effect import Array, Effect, mean_period, parameter, Pulses
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
@@ -42,8 +42,7 @@ class MissingPulses(Effect):
         """Return how far the counted angle is behind in the average at hand."""
         if pulses.missing is None:
             return None
-        period = (pulses.times[-1] - pulses.times[0]) / (
-            pulses.missing.size + pulses.missing.sum())
+        period = mean_period(pulses.times, pulses.missing)
         return np.asarray(period * np.concatenate(([0.0], np.cumsum(pulses.missing))))
 
     @classmethod

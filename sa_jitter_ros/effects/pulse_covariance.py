@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.evidence import Evidence, SAME_SPEED
 from scipy import optimize, stats
 from scipy.linalg import cho_factor, cho_solve, solve_triangular, toeplitz
 from scipy.special import ndtr
@@ -25,7 +25,6 @@ _MOST_PULSES = 200
 _GOOD = 1e-3
 _DRAWS = 4000
 _FEWEST = 20
-_STEADY = 5e-3  # relative spread of speeds that are one
 
 
 def white(lags: Array, _: float) -> Array:
@@ -212,9 +211,9 @@ def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
 
 def _speed_p_value(evidence: Evidence, power: Array, spread: float) -> float:
     """Test whether the power of the errors, of relative `spread`, changes with the speed."""
-    speed = 1.0 / np.ptp(evidence.times, axis=1)
+    speed = 1.0 / evidence.periods
     away = speed / speed.mean() - 1.0
-    if np.std(away) < _STEADY:
+    if np.std(away) < SAME_SPEED:
         return 1.0
     slope = float(np.sum(away * power) / power.mean() / np.sqrt(np.sum(away**2)))
     return float(2.0 * stats.norm.sf(abs(slope) / spread))
