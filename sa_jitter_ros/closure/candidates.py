@@ -116,7 +116,7 @@ def _gain_of_amplitude(finding: Finding, current: Residual, score: Residual, own
     told = own > ACCURACY and finding.p_value < _DECISIVE and (new - old) * score.z.size > _TOLD
     # unsteadiness was fitted to the held-out amplitudes, too: a cause need not beat it
     better = new > old or (decisive and score.chi2_per_dof < _NO_MORE)
-    return _Gain('amplitude', new, old, current.p_amplitudes, decisive, told, better)
+    return _Gain('amplitude', new, old, current.p_amplitude, decisive, told, better)
 
 
 def _gain_of_attenuation(bench: Bench, effects: Sequence[Effect], finding: Finding,
@@ -170,7 +170,7 @@ def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
     """Say that an effect leaves nearly all of a significant residual; '' where it does not."""
     if scatters:
         old, new = before.chi2_per_dof - 1.0, after.chi2_per_dof - 1.0
-        if after.p_amplitudes < SIGNIFICANT and new > _NEARLY_ALL * old:
+        if after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
             return (f'it leaves nearly all of the scatter: chi2 per degree of freedom '
                     f'{new + 1.0:.3g} after {old + 1.0:.3g}')
     elif after.p_attenuation < SIGNIFICANT and after.rms > _NEARLY_ALL * before.rms:

@@ -45,8 +45,8 @@ class Residual:
     parameters are uncertain, the rest by the chance of these acquisitions; `chi2_per_dof`, `ks`,
     `cramer_von_mises` and `coverage` (of the 95 % band) describe the standardised amplitudes `z`.
     `score` and `amplitude_score` are mean normal log likelihoods of attenuation and amplitude,
-    `p_mean`, `p_scatter` and `p_amplitude` the chances of this much mean residual, scatter of the
-    attenuation and scatter of the amplitude.
+    `p_mean`, `p_scatter` and `p_amplitude_scatter` the chances of this much mean residual, scatter
+    of the attenuation and scatter of the amplitude.
     """
 
     mean: Array
@@ -60,7 +60,7 @@ class Residual:
     coverage: float
     p_mean: float
     p_scatter: float
-    p_amplitude: float
+    p_amplitude_scatter: float
     score: float
     amplitude_score: float
     z: Array
@@ -71,14 +71,14 @@ class Residual:
         return _one_of_three(self.p_mean, self.p_scatter)
 
     @property
-    def p_amplitudes(self) -> float:
-        """Return the p value of the scatter of the amplitude."""
-        return _one_of_three(self.p_amplitude)
+    def p_amplitude(self) -> float:
+        """Return the p value of the scatter of the amplitude, as one of three tests."""
+        return _one_of_three(self.p_amplitude_scatter)
 
     @property
     def p_value(self) -> float:
         """Return the p value of the largest of the three tests."""
-        return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude)
+        return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude_scatter)
 
 
 def _one_of_three(*p_values: float) -> float:
@@ -117,8 +117,9 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         p_mean=_mean_p_value(difference / scale, scale, [item.mean for item in sensitivities]),
         p_scatter=_scatter_p_value(difference - mean, scale,
                                    [item.variance for item in sensitivities]),
-        p_amplitude=_scatter_p_value(shift - shift.mean(axis=0), width,
-                                     [item.amplitude_variance for item in sensitivities]),
+        p_amplitude_scatter=_scatter_p_value(
+            shift - shift.mean(axis=0), width,
+            [item.amplitude_variance for item in sensitivities]),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)
 
