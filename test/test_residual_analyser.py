@@ -121,6 +121,7 @@ def test_channels_without_signal_do_not_count():
 @pytest.mark.parametrize(('change', 'reason'), [
     ({'trigger_cycles': 40}, 'for 40 trigger cycles and the averages have 25'),
     ({'ratio': 1.0}, 'for the ratio 1, which makes 25 fundamental cycles'),
+    ({'ratio': 2.476}, 'fundamental cycles, and an average has 60 whole ones'),
     ({'trigger_speed': 30.0}, 'for 30 Hz and the tach shaft turns at 25 Hz'),
     ({'orders': (5.0,)}, 'orders 19, 38 and the prediction 5'),
 ])

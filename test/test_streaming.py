@@ -1,6 +1,8 @@
 """The streaming averager against closed forms: any cut, any order of arrival, faults."""
 
+from fractions import Fraction
 from functools import lru_cache
+import math
 import tracemalloc
 
 from hypothesis import given, settings, strategies as st
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 from sa_jitter_ros.angle.pulses import PulseValidator
 from sa_jitter_ros.angle.resampling import gain
-from sa_jitter_ros.averaging.shaft import AverageSettings, AVERAGING
+from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.shaft import AverageSettings, AVERAGING, ShaftAverager
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -191,6 +194,83 @@ def test_waveform_of_less_than_a_fundamental_cycle_is_undefined():
     assert average.fundamental_cycles == 0
     assert np.isnan(average.waveform).all()
     assert np.isfinite(average.amplitudes).all()
+
+
+@pytest.mark.parametrize('averaging', AVERAGING)
+def test_a_cycle_that_began_before_the_window_is_not_in_its_waveform(averaging):
+    """A fundamental cycle of 50 trigger cycles does not fit into a window of 40."""
+    shaft = ShaftAverager(AverageSettings(cycles=0.02, trigger_cycles=40, averaging=averaging))
+    for number in range(200):
+        cycle = CycleSamples(np.full((200, 1), float(number)), -0.03, 2000.0,
+                             np.array([0.0, 0.04]), 0)
+        average = shaft.update(cycle)
+        if average is None:
+            continue
+        if averaging == 'exponential' and number >= 49:
+            assert average.fundamental_cycles == 1
+            assert np.isfinite(average.waveform).all()
+        else:
+            assert average.fundamental_cycles == 0
+            assert np.isnan(average.waveform).all()
+
+
+def steady_cycles(ratio, order, first, count, rate=93750.0, speed=25.0):
+    """Yield trigger cycles of a cosine, the angle counted in whole numbers from cycle `first`."""
+    period, margin = 1.0 / speed, 40
+    times = (np.arange(round(period * rate) + 2 * margin + 2) - margin) / rate
+    for number in range(first, first + count):
+        angle = float(Fraction(ratio).limit_denominator(1000) * number % 1) + ratio * speed * times
+        yield CycleSamples(np.cos(2.0 * np.pi * order * angle)[:, None], -margin / rate, rate,
+                           np.array([0.0, period]), 0)
+
+
+@pytest.mark.parametrize('averaging', AVERAGING)
+@pytest.mark.parametrize('first', [0, 6_000_000, 1_000_000_000])
+@pytest.mark.parametrize(('ratio', 'points'), [(2.2, 2048), (2.4, 0), (7 / 3, 1000)])
+def test_the_angle_is_as_good_after_years(averaging, first, ratio, points):
+    """Rounded, the angle of the waveform was wrong by a point after 2.4E5 s at 25 Hz."""
+    shaft = ShaftAverager(AverageSettings(
+        cycles=ratio, trigger_cycles=15, orders=(100.0,), averaging=averaging,
+        samples_per_revolution=points), first_cycle=first)
+    for cycle in steady_cycles(ratio, 100.0, first, 40):
+        average = shaft.update(cycle) or None
+        if average is not None:
+            line = 2.0 * np.fft.rfft(average.waveform[0])[100] / average.waveform.shape[1]
+            assert abs(line - 1.0) < 1e-4
+            assert abs(average.amplitudes[0, 0] - 1.0) < 1e-4
+            assert average.fundamental_cycles in (math.floor(15 * ratio) - 1,
+                                                  math.floor(15 * ratio))
+
+
+def test_time_since_1970_costs_nothing():
+    """A sample at 1.76E9 s falls between doubles 0.24 us apart: 0.06 rad at 40 kHz."""
+    rate, frequency, found = 93750.0, 40e3, []
+    pulses = np.arange(12) / 32.0  # exact there, too
+    for start in (0.0, 1.76e9):
+        averager = StreamingAverager(
+            {'shaft': AverageSettings(trigger_cycles=10, orders=(frequency / 32.0,))},
+            validator=PulseValidator(), timeline=VibrationTimeline())
+        averager.add_pulses(start + pulses)
+        for index in range(0, 36000, 4000):
+            times = (index + np.arange(4000)) / rate
+            for _, average in averager.add_samples(SampleBlock(
+                    np.cos(2.0 * np.pi * frequency * times)[None], start + index / rate, rate,
+                    index)):
+                found.append(average.amplitudes[0, 0])
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+
+
+@pytest.mark.parametrize('averaging', ['sliding', 'exponential'])
+def test_noise_of_a_window_is_estimated_anew_when_an_eighth_of_it_is(averaging, rng):
+    shaft = ShaftAverager(AverageSettings(trigger_cycles=40, averaging=averaging))
+    noise = []
+    for _ in range(61):
+        average = shaft.update(CycleSamples(rng.standard_normal((200, 1)), -0.03, 2000.0,
+                                            np.array([0.0, 0.04]), 0))
+        if average is not None:
+            noise.append(float(average.noise[0, 0]))
+    assert np.isfinite(noise).all()
+    assert np.flatnonzero(np.diff(noise)).tolist() == [4, 9, 14, 19]
 
 
 @pytest.mark.parametrize('ratio', [1.0, 2.40789])

@@ -128,6 +128,7 @@ class PulseValidator:
         self._judge = IntervalJudge(
             target, self._clock, bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval)
+        self.pulses_per_trigger = per_trigger
         self._time_tolerance = time_tolerance
         self._held: list[float] = []  # pulses after time ran back
         self._out_of_order = self._restarts = self._non_finite = 0

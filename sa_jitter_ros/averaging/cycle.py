@@ -22,6 +22,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
+_SMALL_NUMBER = 512  # denominator of r up to which all cycles share the waveform's points
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class CycleSamples:
     """
     The samples of one trigger cycle, with what interpolation needs on either side.
 
-    `samples` (sample, channel) of which the first is at `start_time` (s), at `rate` (Hz);
-    `pulses` (s) are those that the angle law reads, the cycle begins at `pulses[first]`.
+    `samples` (sample, channel) of which the first is `lead` s after `start_time` (s), at `rate`
+    (Hz); `pulses` (s) are those that the angle law reads, the cycle begins at `pulses[first]`.
+    Since 1970 so many seconds have gone by that one sum of the two would round by 0.1 us.
     """
 
     samples: FloatArray
@@ -38,6 +40,7 @@ class CycleSamples:
     rate: float
     pulses: FloatArray
     first: int
+    lead: float = 0.0
 
     @property
     def period(self) -> float:
@@ -46,7 +49,8 @@ class CycleSamples:
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
         """Values (len(u), channel) at fractions `u` of the cycle."""
-        positions = cycle_times(law, self.pulses - self.start_time, self.first, u) * self.rate
+        pulses = (self.pulses - self.start_time) - self.lead
+        positions = cycle_times(law, pulses, self.first, u) * self.rate
         # a pulse on the first or last sample may round to just outside it
         np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
         return interpolate(self.samples, positions, method=method, cutoff=cutoff)
@@ -62,6 +66,17 @@ def grid_points(period: float, rate: float) -> int:
     return math.ceil(math.pow(2.0, math.ceil(12.0 * math.log2(needed)) / 12.0))
 
 
+@lru_cache(maxsize=64)
+def exact_cycles(cycles: float) -> Fraction:
+    """
+    Return r as the fraction that its decimals, or the teeth of gears, mean.
+
+    Angles are multiples of it: of a rounded r they would be off by a waveform point after days.
+    """
+    share = Fraction(cycles).limit_denominator(1_000_000)
+    return share if abs(float(share) - cycles) <= 1e-14 * cycles else Fraction(cycles)
+
+
 def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> int:
     """
     Waveform points per fundamental cycle that lose none of the samples' band.
@@ -70,8 +85,9 @@ def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> 
     trigger cycle.
     """
     needed = 1.05 * period * rate / cycles
-    share = Fraction(cycles).limit_denominator(512)
-    step = share.denominator if abs(float(share) - cycles) < 1e-12 * cycles else 1
+    step = exact_cycles(cycles).denominator
+    if step > _SMALL_NUMBER:
+        step = 1
     multiple = math.ceil(min(max(needed, 8.0), MAX_POINTS) / step)
     return min(step * int(next_fast_len(multiple, real=True)), MAX_POINTS)
 
@@ -90,38 +106,50 @@ def needed_margin(method: str, cutoff: float) -> int:
 
 
 @lru_cache(maxsize=16)
-def _order_basis(points: int, cycles: float, orders: tuple[float, ...]) -> FloatArray:
+def _order_basis(points: int, cycles: float, orders: tuple[float, ...]
+                 ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
     """
-    Real and imaginary parts (points + 1, 2 len(orders)) that project a cycle on the orders.
+    Factors of exp(-j 2 pi g theta) on a grid of `points` steps, so that long cycles need no table.
 
-    Trapezoidal weights, twice the mean of x exp(-j 2 pi g theta): peak amplitudes.
+    Point k has `fine` (order, width) at k % width times, at k // width, what the halves of
+    `coarse` (2 orders, rows + 1) hold: real and imaginary parts. The last one is that of the end.
     """
-    theta = cycles * np.arange(points + 1) / points
-    weight = np.full(points + 1, 2.0 / points)
-    weight[[0, -1]] /= 2.0
-    basis = weight[:, None] * np.exp(-2j * np.pi * theta[:, None] * np.array(orders))
-    return np.concatenate((basis.real, basis.imag), axis=1)
+    width = math.isqrt(points)
+    step = -2j * np.pi * cycles / points * np.array(orders)[:, None]
+    coarse = np.exp(step * width * np.arange(points // width + 1))
+    return (np.exp(step * np.arange(width)), np.concatenate((coarse.real, coarse.imag)),
+            np.exp(step * points))
 
 
-def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], angle: float
+def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], angle: Fraction | float
             ) -> ComplexArray:
     """
     Complex peak amplitudes (channel, order) of one trigger cycle.
 
     `grid` (points + 1, channel) are its values at equal steps of angle, both ends included; it
-    begins at `angle` (fundamental cycles), to which phases refer.
+    begins at `angle` (fundamental cycles), to which phases refer. Trapezoidal weights, twice the
+    mean of x exp(-j 2 pi g theta).
     """
-    parts = grid.T @ _order_basis(len(grid) - 1, cycles, orders)
-    amplitude = parts[:, :len(orders)] + 1j * parts[:, len(orders):]
-    return np.asarray(amplitude * np.exp(-2j * np.pi * np.array(orders) * angle))
+    points, channels, count = len(grid) - 1, grid.shape[1], len(orders)
+    fine, coarse, end = _order_basis(points, cycles, orders)
+    width, rows = fine.shape[1], coarse.shape[1] - 1
+    parts = coarse[:, :rows] @ grid[:rows * width].reshape(rows, width * channels)
+    rest = grid[rows * width:points]
+    sums = (parts[:count] + 1j * parts[count:]).reshape(count, width, channels)
+    total = np.matmul(fine[:, None], sums)[:, 0] + (grid[-1] * end - grid[0]) / 2.0
+    if len(rest):
+        last = coarse[:count, rows:] + 1j * coarse[count:, rows:]
+        total += last * (fine[:, :len(rest)] @ rest)
+    whole = math.floor(angle)  # of which integer orders make whole turns
+    turns = np.mod(orders, 1.0) * whole + np.array(orders) * float(angle - whole)
+    return np.asarray(total.T * (2.0 / points * np.exp(-2j * np.pi * turns)))
 
 
-def first_point(angle: float, points: int) -> int:
+def first_point(angle: Fraction, points: int) -> int:
     """Index of the first waveform point at or after an angle (fundamental cycles)."""
-    return math.ceil(angle * points - 1e-6)
+    return math.ceil(angle * points)
 
 
 def on_grid(points: int, cycles: float) -> bool:
     """Whether the waveform's points fall on the same angles of every trigger cycle."""
-    product = points * cycles
-    return abs(product - round(product)) < 1e-9 * product and round(product) > 0
+    return (exact_cycles(cycles) * points).denominator == 1

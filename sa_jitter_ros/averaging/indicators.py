@@ -1,9 +1,9 @@
 """
 Condition indicators of a synchronous average: one number for each way a gear shows damage.
 
-``x`` is the average, ``d`` its difference and ``r`` its residual signal (`residual`), ``s(.)`` a
-standard deviation over one revolution (divisor n), ``mk(.)`` a central moment over one revolution
-and ``A`` peak amplitudes of lines. In the order of `INDICATORS`:
+``x`` is the average, ``d`` its difference and ``r`` its residual signal (`gear_signals`), ``s(.)``
+a standard deviation over one revolution (divisor n), ``mk(.)`` a central moment over one
+revolution and ``A`` peak amplitudes of lines. In the order of `INDICATORS`:
 
     rms, peak, crest_factor   sqrt(mean x^2); max |x|; peak / rms. An offset of x counts.
     kurtosis                  m4(x) / s(x)^4; 3 for Gaussian noise. Dyer and Stewart (1978)
@@ -20,10 +20,10 @@ and ``A`` peak amplitudes of lines. In the order of `INDICATORS`:
     sideband_level_factor     sum of A over the first sidebands of the mesh orders / s(x).
                               Vecer, Kreidl, Smid (2005)
 
-Overviews: Lebold et al. (2000), named in `residual`; Vecer, Kreidl, Smid, "Condition indicators
-for gearbox condition monitoring systems", Acta Polytechnica 45 (2005). Where a denominator is 0 to
-rounding (constant signal, nothing left) the value is NaN; without mesh orders everything from fm0
-on is.
+Overviews: Lebold et al. (2000), named in `gear_signals`; Vecer, Kreidl, Smid, "Condition
+indicators for gearbox condition monitoring systems", Acta Polytechnica 45 (2005). Where a
+denominator is 0 to rounding (constant signal, nothing left) the value is NaN; without mesh orders
+everything from fm0 on is.
 """
 
 from dataclasses import dataclass

@@ -191,7 +191,7 @@ class ExponentialMean:
     @property
     def standard_error(self) -> FloatArray:
         """Standard error of the mean; NaN below two arrays."""
-        if self.count < 2:
-            return np.full(self._variance.shape, np.nan)
         share = self._squared_weights
+        if self.count < 2 or share >= 1.0:  # the mean is the last array alone
+            return np.full(self._variance.shape, np.nan)
         return np.asarray(np.sqrt(self._variance * share / (1.0 - share)))

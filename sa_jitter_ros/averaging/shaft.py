@@ -7,6 +7,7 @@ it holds is bounded by the settings, and its result depends on the cycles alone.
 
 from collections import deque
 from dataclasses import dataclass
+from fractions import Fraction
 import math
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.angle.laws import angle_law, LAWS
 from sa_jitter_ros.angle.resampling import METHODS
 from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleSamples,
-                                           first_point, grid_points, needed_margin, on_grid,
-                                           project, waveform_cutoff)
+                                           exact_cycles, first_point, grid_points,
+                                           needed_margin, on_grid, project, waveform_cutoff)
 from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, RunningMean, SlidingMean
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -155,13 +156,13 @@ class ShaftAverager:
                 f'sampling rate of {cycle.rate:.6g} Hz: check ratio and pulses_per_revolution')
         if not self._counted:
             self._choose_grid(cycle)
-        angle = settings.cycles * self._cycle
+        angle = self._angle(self._cycle)
         grid, first, points = self._resample(cycle, angle)
         amplitudes = project(grid, settings.cycles, settings.orders, angle)
         amplitudes[:, self.beyond_nyquist(cycle.period, cycle.rate)] = np.nan
         if not self._counted:
             self._expect_from(angle)
-        self._add_points(first, points, angle + settings.cycles)
+        self._add_points(first, points, self._angle(self._cycle + 1))
         self._amplitude_mean.update(amplitudes)
         self._amplitudes.append(amplitudes)
         self._pulses.append(float(cycle.pulses[cycle.first + 1]))
@@ -176,6 +177,10 @@ class ShaftAverager:
         if settings.averaging == 'block':
             self._start()
         return average
+
+    def _angle(self, cycle: int) -> Fraction:
+        """Angle (fundamental cycles) at which a trigger cycle begins."""
+        return exact_cycles(self.settings.cycles) * cycle
 
     def beyond_nyquist(self, period: float, rate: float) -> NDArray[np.bool_]:
         """Which orders are at or above half the sampling rate."""
@@ -196,7 +201,7 @@ class ShaftAverager:
         if not needed <= self._points <= 2.2 * needed:
             self._points = self._chosen(cycle.period, cycle.rate)
 
-    def _resample(self, cycle: CycleSamples, angle: float
+    def _resample(self, cycle: CycleSamples, angle: Fraction
                   ) -> tuple[FloatArray, int, FloatArray]:
         """Grid of the trigger cycle, both ends included; first waveform point, and the points."""
         r, n, method = self.settings.cycles, self._points, self.settings.interpolation
@@ -204,18 +209,19 @@ class ShaftAverager:
         if on_grid(n, r) and cutoff == 1.0:
             count = round(n * r)
             grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
-            return grid, round(angle * n), grid[:-1]
+            return grid, first_point(angle, n), grid[:-1]
         count = grid_points(cycle.period, cycle.rate)
         grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
-        first, end = first_point(angle, n), first_point(angle + r, n)
-        u = np.clip((np.arange(first, end) / n - angle) / r, 0.0, 1.0)
+        first, end = first_point(angle, n), first_point(self._angle(self._cycle + 1), n)
+        u = (np.arange(end - first, dtype=np.float64) + float(first - angle * n)) / (n * r)
         return grid, first, cycle.at(self._law, u, method=method, cutoff=cutoff)
 
     # --- the average in progress ---
 
     def _start(self) -> None:
         settings = self.settings
-        self._counted = 0
+        self._counted = self._noise_due = 0
+        self._noise: FloatArray = np.empty((0, 0))
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycles, 1.0))
         self._amplitudes: deque[ComplexArray] = deque(maxlen=settings.trigger_cycles)
@@ -232,18 +238,17 @@ class ShaftAverager:
             return SlidingMean()
         return BlockMean()
 
-    def _expect_from(self, angle: float) -> None:
+    def _expect_from(self, angle: Fraction) -> None:
         """Begin with the first fundamental cycle that is whole from this angle on."""
-        self._first_whole = math.ceil(angle - 1e-9)
-        self._next_point = self._first_whole * self._points
+        self._next_point = math.ceil(angle) * self._points
 
-    def _add_points(self, first: int, points: FloatArray, end: float) -> None:
+    def _add_points(self, first: int, points: FloatArray, end: Fraction) -> None:
         """Put points into their fundamental cycle; the mean takes one that is whole at `end`."""
         if len(self._wave) != self._points:
             self._wave = np.full((self._points, points.shape[1]), np.nan)
         if self._full:
             self._take_wave()
-        whole = math.floor(end + 1e-9) * self._points
+        whole = math.floor(end) * self._points
         points = points[max(self._next_point - first, 0):]
         while len(points):
             at = self._next_point % self._points
@@ -257,6 +262,8 @@ class ShaftAverager:
 
     def _take_wave(self) -> None:
         self._full = False
+        if not self._wave_mean.count:
+            self._first_whole = self._next_point // self._points - 1
         self._wave_mean.update(self._wave)
         if self.settings.averaging == 'sliding':  # keeps what it is given
             self._wave = np.empty_like(self._wave)
@@ -267,10 +274,10 @@ class ShaftAverager:
             return
         assert isinstance(self._amplitude_mean, SlidingMean)
         self._amplitude_mean.forget(self._amplitude_mean.count - self.settings.trigger_cycles)
-        start = self.settings.cycles * (self._cycle - self.settings.trigger_cycles)
-        whole = math.ceil(start - 1e-9)
-        self._wave_mean.forget(whole - self._first_whole)
-        self._first_whole = max(whole, self._first_whole)
+        whole = math.ceil(self._angle(self._cycle - self.settings.trigger_cycles))
+        gone = min(max(whole - self._first_whole, 0), self._wave_mean.count)
+        self._wave_mean.forget(gone)
+        self._first_whole += gone
 
     def _result(self) -> SynchronousAverage:
         settings = self.settings
@@ -280,17 +287,24 @@ class ShaftAverager:
         if count:
             waveform, error = self._wave_mean.mean, self._wave_mean.standard_error
         if settings.averaging == 'exponential':
-            count = min(count, int(settings.trigger_cycles * settings.cycles))
-        cycles = np.array(self._amplitudes)
-        angles = settings.cycles * (self._cycle - np.arange(len(cycles), 0, -1))
+            window = math.floor(self._angle(settings.trigger_cycles))
+            count = min(count, max(window, 1))
         average = SynchronousAverage(
             start_time=self._pulses[0], end_time=self._pulses[-1], sequence=self._sequence,
             trigger_cycles=settings.trigger_cycles, fundamental_cycles=count,
             waveform=waveform.T, standard_error=error.T, orders=np.array(settings.orders),
-            amplitudes=self._amplitude_mean.mean,
-            noise=radial_noise(without_leakage(
-                cycles, settings.orders, settings.cycles, angles)),
-            angle=float(angles[0]),
+            amplitudes=self._amplitude_mean.mean, noise=self._estimated_noise(),
+            angle=float(self._angle(self._cycle - len(self._amplitudes))),
             pulses=np.array(self._pulses))
         self._sequence += 1
         return average
+
+    def _estimated_noise(self) -> FloatArray:
+        """Noise of the mean; of a window that slides anew when an eighth of it is."""
+        if self._counted >= self._noise_due:
+            orders, cycles = self.settings.orders, self.settings.cycles
+            amplitudes = np.array(self._amplitudes)
+            angles = cycles * (self._cycle - np.arange(len(amplitudes), 0, -1))
+            self._noise = radial_noise(without_leakage(amplitudes, orders, cycles, angles))
+            self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
+        return self._noise

@@ -152,7 +152,7 @@ class StreamingAverager:
         keep = next(i for i, item in enumerate(waiting)
                     if waiting[-1].elapsed - item.elapsed <= limit)
         if keep:
-            self.counts.pulses_dropped += keep
+            self.counts.pulses_dropped += keep * self.validator.pulses_per_trigger
             self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
                           f'{limit:g} s (raise it for a slower shaft)')
         self._forget_used()
@@ -219,8 +219,8 @@ class StreamingAverager:
             margin = max(item.margin(end.time - start.time, rate) for item in self.shafts.values())
             if end.time - start.time + 2 * margin / rate > timeline.buffer_seconds:
                 remedy = f' (raise buffer_seconds = {timeline.buffer_seconds:g} s, it is longer)'
-        return (f'no gapless vibration for the trigger cycle from {start.time:.6g} s to '
-                f'{end.time:.6g} s{remedy}')
+        return (f'no gapless vibration for the trigger cycle from {start.time:.6f} s to '
+                f'{end.time:.6f} s{remedy}')
 
     def _hand_over(self, stretch: Stretch) -> list[tuple[str, SynchronousAverage]]:
         """Give the next cycle to every shaft."""
@@ -240,9 +240,10 @@ class StreamingAverager:
             margin = shaft.margin(float(pulses[first + 1] - pulses[first]), stretch.clock.rate)
             self._lead = max(self._lead, 1.5 * margin / stretch.clock.rate)
             offset = max(int(np.floor(low)) - margin, 0)
+            clock, begin = stretch.clock, stretch.index + offset
             cycle = CycleSamples(
-                stretch.samples[offset:int(np.ceil(high)) + margin + 1],
-                stretch.clock.time_of(stretch.index + offset), stretch.clock.rate, pulses, first)
+                stretch.samples[offset:int(np.ceil(high)) + margin + 1], clock.time, clock.rate,
+                pulses, first, lead=(begin - clock.index) / clock.rate)
             try:
                 average = shaft.update(cycle)
             except SignalError as error:  # of this shaft: the others go on

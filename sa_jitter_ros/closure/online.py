@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.cycle import exact_cycles
 from sa_jitter_ros.closure.expectation import RESOLUTION
 from sa_jitter_ros.closure.residual import Residual, residual
 from sa_jitter_ros.errors import ModelError, SignalError
@@ -19,6 +20,8 @@ Array = NDArray[Any]
 _STRONG = 0.2  # of its order's strongest channel
 _NOISE = 0.1  # of its amplitude that a line may scatter by
 _SPEED = 0.1
+_MOST_PULSES = 1000  # per revolution
+_BEGINNINGS = 1000  # of averages in a run, from which the number of whole cycles in them follows
 
 
 @dataclass(frozen=True)
@@ -97,12 +100,13 @@ def require_comparable(averages: Sequence[Average], published: Published) -> Non
         raise ModelError(f'the prediction is for {published.trigger_cycles} trigger cycles and '
                          f'the averages have {last.trigger_cycles}: set trigger_cycles of '
                          'averager and predictor to the same')
-    cycles = published.ratio * _share(last) * last.trigger_cycles
-    if not cycles - 2.0 < last.fundamental_cycles < cycles + 1e-3 * cycles + 1e-6:
+    cycles = exact_cycles(published.ratio) * _share(last) * last.trigger_cycles
+    possible = {math.floor(cycles * (n + 1)) - math.ceil(cycles * n) for n in range(_BEGINNINGS)}
+    for count in {item.fundamental_cycles for item in averages} - possible:
         raise ModelError(
-            f'the prediction is for the ratio {published.ratio:g}, which makes {cycles:.5g} '
-            f'fundamental cycles, and the averages have {last.fundamental_cycles}: set ratio of '
-            'averager and predictor to the same')
+            f'the prediction is for the ratio {published.ratio:g}, which makes '
+            f'{float(cycles):.5g} fundamental cycles, and an average has {count} whole ones: set '
+            'ratio of averager and predictor to the same')
     speed = float(np.mean([item.trigger_speed for item in averages]))
     if abs(speed / published.trigger_speed - 1.0) > _SPEED:
         raise ModelError(f'the prediction is for {published.trigger_speed:g} Hz and the tach '
@@ -148,7 +152,7 @@ def compare(averages: Sequence[Average], published: Published) -> tuple[Array, R
 
 def declared_by(averages: Sequence[Average], published: Published) -> DeclaredModel:
     """Return the model that a prediction's header tells, where its predictor cannot be asked."""
-    share = Fraction(_share(averages[-1])).limit_denominator(1000)
+    share = _share(averages[-1])
     clock = 1.0 / (math.sqrt(12.0) * published.keyphasor_rate)
     uniform = math.isclose(published.pulse_error_std, clock, rel_tol=1e-6)
     return DeclaredModel(
@@ -188,10 +192,10 @@ def named(orders: Array) -> str:
     return ', '.join(f'{order:g}' for order in orders)
 
 
-def _share(average: Average) -> float:
+def _share(average: Average) -> Fraction:
     """Return the revolutions of the tach shaft in a trigger cycle."""
-    return (average.trigger_speed * (average.end_time - average.start_time)
-            / average.trigger_cycles)
+    revolutions = average.trigger_speed * (average.end_time - average.start_time)
+    return Fraction(revolutions / average.trigger_cycles).limit_denominator(_MOST_PULSES)
 
 
 def _common(averages: Sequence[Average], published: Published) -> Array:
