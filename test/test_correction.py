@@ -98,6 +98,26 @@ def test_noise_alone_is_left_as_it_is():
             correction.corrected.waveform, average.waveform)
 
 
+def test_a_declared_order_that_is_no_integer_tells_the_errors(rng):
+    rate, speed = 6400.0, 25.0
+    true = 0.01 + np.arange(32) / speed
+    pulses = true + rng.uniform(-0.5, 0.5, 32) / rate
+    times = np.arange(round(32.5 / speed * rate)) / rate
+    samples = np.cos(2.0 * np.pi * 40.5 * speed * (times - 0.01))
+    averager = StreamingAverager(
+        {'shaft': AverageSettings(trigger_cycles=30, orders=(40.5,), correct_jitter=True,
+                                  keyphasor_rate=rate)},
+        validator=PulseValidator(), timeline=VibrationTimeline())
+    averager.add_pulses(pulses)
+    (_, average), = averager.add_samples(SampleBlock(
+        (samples + 0.01 * rng.standard_normal(len(samples)))[None], 0.0, rate, 0))
+    recovery = average.correction.recovery
+    assert recovery.accepted
+    errors = (pulses - true)[:31]
+    apart = (recovery.errors - (errors - errors.mean())) / recovery.standard_errors
+    assert np.sqrt(np.mean(apart**2)) < 1.5
+
+
 @pytest.mark.parametrize('amplitude', [1.0, 2.0])
 def test_errors_that_follow_another_shafts_order_are_refused(rng, amplitude):
     """

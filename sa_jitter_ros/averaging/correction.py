@@ -89,7 +89,7 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
     clock = settings.keyphasor_rate or cycles[0].rate
     recovery = recover_pulse_errors(
         grid, periods=np.diff(raw.pulses), ratio=settings.cycles, first_angle=raw.angle,
-        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+        also=settings.orders, declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
     corrected = raw
     largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
     if largest > reach:

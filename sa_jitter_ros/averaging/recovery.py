@@ -37,6 +37,9 @@ _WORTHWHILE = 0.7
 # Amplitudes below this share of a channel's RMS are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
+# So few cycles do not tell an order from another shaft's beside it; an error of so many declared
+# standard deviations is rather a pulse that is not where its tooth is.
+_FEW_CYCLES, _FAR = 10, 6.0
 # Errors that pulses have took power from the orders. Taking them out must not lose more, but for
 # what neighbours that a cycle does not keep apart make of it.
 _LOSS = 0.15
@@ -137,6 +140,11 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
         return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
                 f'{_WORTHWHILE:g} of the declared jitter, {declared:.3g} s: correcting would '
                 'align noise to itself')
+    largest = float(np.max(np.abs(errors)))
+    if len(periods) < _FEW_CYCLES and largest > _FAR * declared:
+        return (f'a recovered error of {largest:.3g} s is more than {_FAR:g} times the declared '
+                f'jitter, {declared:.3g} s, which {len(periods)} trigger cycles do not tell from '
+                "another shaft's order: average more trigger cycles, or validate the pulses")
     if np.any(np.diff(errors) >= periods):
         return 'the recovered errors would swap pulses: check ratio and pulses'
     if gain < 1.0 - _LOSS:

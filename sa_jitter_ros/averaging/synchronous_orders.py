@@ -80,7 +80,8 @@ class LineSearch:
         if not len(g):
             return g, g
         power = self.power(errors, g)
-        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='nearest')
+        # Mirrored, not repeated: of copies of itself order 1 could not stand out.
+        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='reflect')
         contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
         best = np.argsort(-contrast)[:most]
         return g[best], g[best[contrast[best] > _CLEAR]]
