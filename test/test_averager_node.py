@@ -152,7 +152,9 @@ def test_blocks_without_header_are_counted_and_the_node_says_so(bench, kind):
     assert len(b.amplitudes()) == 3
     assert b.amplitudes()[0].values.shape[0] == 1
     assert_true(b.amplitudes(), MACHINE, ORDERS)
-    assert 'a loss would not be seen' in b.diagnostics()[1]
+    level, text, _ = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'a loss would not be seen' in text
 
 
 def imu(time, *values):
@@ -227,6 +229,32 @@ def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
     status = b.status()
     assert status['pulses_dropped'] == 40 + named
     assert status['keyphasor'] == 'kp'
+
+
+def test_a_keyphasor_without_a_name_is_one_too(bench):
+    b = bench()
+    b.send_pulses([-0.5], source='')
+    b.play(MACHINE, 1.0)
+    assert b.amplitudes() == []
+    assert b.status()['pulses_dropped'] == len(MACHINE.pulses(1.0))
+
+
+def test_an_error_that_nobody_thought_of_costs_its_message_only(bench, monkeypatch):
+    b = bench()
+    add_pulses = b.node._averager.add_pulses
+
+    def failing(times):
+        if 0.3 < times[0] < 0.33:
+            raise ZeroDivisionError('unthought of')
+        return add_pulses(times)
+
+    monkeypatch.setattr(b.node._averager, 'add_pulses', failing)
+    b.play(MACHINE, 1.0)
+    assert len(b.amplitudes()) == 2
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'ZeroDivisionError: unthought of' in text
+    assert values['messages_rejected'] == '1'
 
 
 def malformed():
@@ -473,11 +501,21 @@ BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 def test_incompatible_publisher_is_an_error_that_names_the_override(bench):
     b = bench(qos=BEST_EFFORT)
-    assert b.spin(lambda: len(b.node.faults) == 2)
-    level, text, _ = b.diagnostics()
-    assert level == DiagnosticStatus.ERROR
-    assert 'qos_overrides./vibration.subscription.reliability' in text
-    assert 'qos_overrides./tach_pulse.subscription.reliability' in text
+    named = ['qos_overrides./vibration.subscription.reliability',
+             'qos_overrides./tach_pulse.subscription.reliability']
+    assert b.spin(lambda: all(name in b.diagnostics()[1] for name in named))
+    assert b.diagnostics()[0] == DiagnosticStatus.ERROR
+    for publisher in b.publishers.values():
+        b.bench.destroy_publisher(publisher)
+    assert b.spin(lambda: b.diagnostics()[0] == DiagnosticStatus.OK)  # nobody is there to fit
+
+
+def test_durability_can_be_overridden_as_the_error_says(bench):
+    names = [f'qos_overrides./{topic}.subscription.durability'
+             for topic in ('vibration', 'tach_pulse')]
+    b = bench(qos=QoSProfile(depth=10), overrides=[
+        Parameter(name, value='transient_local') for name in names])
+    assert b.spin(lambda: all(name in b.diagnostics()[1] for name in names))
 
 
 def test_quality_of_service_can_be_overridden(bench):

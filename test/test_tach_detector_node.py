@@ -176,6 +176,41 @@ def test_parameters_change_while_it_runs(bench):
     assert not successful
 
 
+@pytest.mark.parametrize('factor', [2.0, 1.0 + 1e-10])
+def test_a_source_that_comes_back_with_another_rate_is_learnt_anew(bench, factor):
+    b = bench()
+    play(b, waveform(2.0))
+    before = len(pulses(b))
+    samples = waveform(4.0)
+    for first in range(0, len(samples), 250):
+        b.send('tach_waveform', messages.encode_samples(SampleBlock(
+            samples[None, first:first + 250], 3.0 + first / (factor * RATE), factor * RATE,
+            15000 + first)))
+    b.settle()
+    assert b.spin(lambda: not b.node._waiting)
+    b.settle()
+    late = pulses(b)[before:]
+    # the first block of another layout may be a fault; it tells with the second one
+    assert len(late) >= len(KeyphasorDetector().update(samples, 0.0, RATE)) - 2
+    np.testing.assert_allclose(np.diff(late), 1.0 / SPEED / factor, rtol=1e-3)
+
+
+def test_another_name_loses_nothing_and_other_options_count_what_they_lose(bench):
+    b = bench(minimum_interval=0.05)  # above the period of 0.047 s
+    play(b, waveform(2.0))
+    dropped = int(b.diagnostics()[2]['pulses_dropped'])
+    assert dropped > 10
+    assert b.set_parameter('keyphasor', 'another') == (True, '')
+    assert int(b.diagnostics()[2]['pulses_dropped']) == dropped
+    assert b.set_parameter('minimum_interval', 0.0) == (True, '')
+    play(b, waveform(2.2)[10000:], start=2.0, index=10000)  # too short to learn from
+    assert int(b.diagnostics()[2]['pulses_dropped']) == dropped
+    assert b.set_parameter('edge', 'falling') == (True, '')
+    values = b.diagnostics()[2]
+    assert int(values['pulses_dropped']) == dropped
+    assert int(values['samples_dropped']) == 1000
+
+
 def test_unusable_parameters_are_refused_at_the_start(ros_context):
     with pytest.raises(ParameterError, match='edge'):
         TachDetector(context=ros_context, parameter_overrides=[Parameter('edge', value='up')])

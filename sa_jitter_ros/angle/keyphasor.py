@@ -31,7 +31,8 @@ class KeyphasorState:
     """
     What a detector has learnt and counted so far; levels in the waveform's unit, NaN if unknown.
 
-    `too_close` counts pulses dropped for `minimum_interval`, `gaps` breaks of the sample times and
+    `waiting` are samples in which pulses will be looked for when there are levels; `too_close`
+    counts pulses dropped for `minimum_interval`, `gaps` breaks of the sample times and
     `windows_without_levels` learning windows in which the waveform had no two levels.
     """
 
@@ -39,6 +40,7 @@ class KeyphasorState:
     high: float
     threshold: float
     samples: int
+    waiting: int
     pulses: int
     too_close: int
     gaps: int
@@ -115,9 +117,11 @@ class KeyphasorDetector:
         """Return what has been learnt and counted."""
         levels = self._levels or StateLevels(np.nan, np.nan, significant=False)
         low, high = sorted((self._sign * levels.low, self._sign * levels.high))
+        waiting = 0 if self._levels else sum(part.size for *_, part in self._window)
         return KeyphasorState(
             low=low, high=high, threshold=self._sign * self._threshold(levels),
-            samples=self._samples, pulses=self._pulses, too_close=self._too_close,
+            samples=self._samples, waiting=waiting, pulses=self._pulses,
+            too_close=self._too_close,
             gaps=self._gaps, windows_without_levels=self._levelless)
 
     def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:

@@ -57,10 +57,13 @@ class TimelineCounts:
     non_finite: int = 0
 
 
+SAME_RATE = 1e-9  # relative difference of sampling rates that are equal to rounding
+
+
 def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
     """Whether channels are as many and rates (Hz) equal to rounding."""
     return (layout is not None and layout[0] == other[0]
-            and math.isclose(layout[1], other[1], rel_tol=1e-9))
+            and math.isclose(layout[1], other[1], rel_tol=SAME_RATE))
 
 
 @dataclass
@@ -237,11 +240,11 @@ class VibrationTimeline:
             self._forget_jump_ahead(block)
             self.epoch += 1
             self.counts.restarts += 1
-            self.messages.append(f'source restarted at {block.start_time:.6g} s, sample '
+            self.messages.append(f'source restarted at {block.start_time:.6f} s, sample '
                                  f'{block.index}')
         elif self.layout and not _alike(self.layout, (len(block.samples), block.sample_rate)):
             self.counts.gaps += 1
-            self.messages.append(f'source goes on at {block.start_time:.6g} s with '
+            self.messages.append(f'source goes on at {block.start_time:.6f} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = Clock(block.start_time, block.index, block.sample_rate)
         self._gap, self._ledger = (0, 0), SampleLedger()

@@ -78,8 +78,7 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
     ratio = values[f'{name}.ratio']
     if teeth:
         if ratio != 1.0:
-            raise ParameterError(f'{name}.ratio is {ratio} and {name}.ratio_teeth is {teeth}: '
-                                 'give one of them')
+            raise one_ratio(values, name)
         if len(teeth) % 2:
             raise ParameterError(f'{name}.ratio_teeth has {len(teeth)} tooth counts: give pairs '
                                  'of driver and driven')
@@ -94,6 +93,12 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
         averaging=values['averaging'], law=values['angle_law'],
         interpolation=values['interpolation'], correct_jitter=values['correct_jitter'],
         keyphasor_rate=values['keyphasor_rate'])
+
+
+def one_ratio(values: Values, name: str) -> ParameterError:
+    """Return the error that both ways to give a ratio were used."""
+    return ParameterError(f'{name}.ratio is {values[f"{name}.ratio"]} and {name}.ratio_teeth is '
+                          f'{values[f"{name}.ratio_teeth"]}: give one of them')
 
 
 def trigger_share(values: Values) -> float:

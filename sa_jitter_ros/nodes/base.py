@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from copy import copy
 import sys
+import traceback
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -13,7 +14,8 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (DurabilityPolicy, HistoryPolicy, qos_policy_name_from_kind, QoSProfile,
+from rclpy.qos import (DurabilityPolicy, HistoryPolicy, qos_check_compatible,
+                       qos_policy_name_from_kind, QoSCompatibility, QoSPolicyKind, QoSProfile,
                        ReliabilityPolicy)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -24,6 +26,7 @@ from sa_jitter_ros.nodes.parameters import Parameter, ParameterSet
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
                    'clock_deviation', 'messages_rejected')
+UNCOUNTED = 'samples without header are counted from start_time: a loss would not be seen'
 WARNING_PERIOD = 5.0  # s between log lines of the same kind
 
 
@@ -32,6 +35,15 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
                       reliability=ReliabilityPolicy.RELIABLE)
 
 
+def _misfit(subscription: Subscription, policy: str) -> str:
+    name = subscription.topic_name
+    return (f'a publisher of {name} offers an incompatible {policy}: match it with the parameter '
+            f'qos_overrides.{name}.subscription.{policy}')
+
+
+_OVERRIDABLE = QoSOverridingOptions(policy_kinds=(
+    QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY))
 # Given to rclpy as copies: it writes the user's overrides into the profile that it gets.
 INPUT_QOS = _reliable(200, DurabilityPolicy.VOLATILE)
 RESULT_QOS = _reliable(10, DurabilityPolicy.VOLATILE)
@@ -43,15 +55,15 @@ class MonitoringNode(Node):
     A node of this package: described parameters, diagnostics, and no message that can kill it.
 
     `counts` are cumulative; a subclass updates them (in `update_counts`, called before they are
-    published) and says in `summary` what it is doing. A count that grew makes the status WARN, an
-    entry of `faults` makes it ERROR.
+    published) and says in `summary` what it is doing. A count that grew makes the status WARN, a
+    publisher of an input whose quality of service does not fit makes it ERROR.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter], **node_kwargs: Any) -> None:
         super().__init__(name, **node_kwargs)
         self.parameters = ParameterSet(self, parameters)
         self.counts: dict[str, int] = dict.fromkeys(DIAGNOSTIC_KEYS, 0)
-        self.faults: dict[str, str] = {}
+        self._unfit: dict[Subscription, str] = {}  # and the policy that does not fit
         self._reported = dict(self.counts)
         self._last_warning = ''
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -66,7 +78,12 @@ class MonitoringNode(Node):
 
     def create_input(self, kind: type, topic: str, callback: Callable[[Any], None],
                      qos: QoSProfile = INPUT_QOS) -> Subscription:
-        """Subscribe; a bad message is counted and reported, never raised."""
+        """
+        Subscribe; a bad message is reported, never raised.
+
+        Whatever of other packages' errors a message may cause is counted as its rejection, too; a
+        callback that raises a `SaJitterError` but `MessageError` has counted what is lost.
+        """
         def guarded(message: Any) -> None:
             try:
                 callback(message)
@@ -75,32 +92,49 @@ class MonitoringNode(Node):
                 self.warn(f'{topic}: {error}')
             except SaJitterError as error:
                 self.warn(f'{topic}: {error}')
+            except Exception as error:
+                if not self.context.ok():
+                    raise
+                self.counts['messages_rejected'] += 1
+                self.get_logger().error(traceback.format_exc(),
+                                        throttle_duration_sec=WARNING_PERIOD)
+                self.warn(f'{topic}: {type(error).__name__}: {error}')
 
         def incompatible(info: Any) -> None:
             policy = qos_policy_name_from_kind(info.last_policy_kind).lower()
-            name = self.resolve_topic_name(topic)
-            self.faults[topic] = (
-                f'a publisher of {name} offers an incompatible {policy}: match it with the '
-                f'parameter qos_overrides.{name}.subscription.{policy}')
-            self.get_logger().error(self.faults[topic], throttle_duration_sec=WARNING_PERIOD)
+            self._unfit[subscription] = policy
+            self.get_logger().error(_misfit(subscription, policy),
+                                    throttle_duration_sec=WARNING_PERIOD)
 
-        return self.create_subscription(
+        subscription = self.create_subscription(
             kind, topic, guarded, copy(qos),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            qos_overriding_options=_OVERRIDABLE)
+        return subscription
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
         """Return the publisher of a result."""
-        return self.create_publisher(
-            kind, topic, copy(qos),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        return self.create_publisher(kind, topic, copy(qos), qos_overriding_options=_OVERRIDABLE)
 
     # --- telling the user ---
 
     def warn(self, text: str) -> None:
         """Log a warning, throttled, and show it in the next diagnostics."""
-        self._last_warning = text
+        self.show_warning(text)
         self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
+
+    def show_warning(self, text: str) -> None:
+        """Show a warning in the next diagnostics, without a line in the log."""
+        self._last_warning = text
+
+    def _misfits(self) -> list[str]:
+        """Say which publishers that are there offer what an input cannot take."""
+        for subscription in list(self._unfit):
+            offered = self.get_publishers_info_by_topic(subscription.topic_name)
+            if all(qos_check_compatible(item.qos_profile, subscription.qos_profile)[0]
+                   != QoSCompatibility.ERROR for item in offered):
+                del self._unfit[subscription]
+        return [_misfit(*item) for item in self._unfit.items()]
 
     def update_counts(self) -> None:
         """Bring `counts` up to date before they are published."""
@@ -116,8 +150,9 @@ class MonitoringNode(Node):
         status = DiagnosticStatus(level=DiagnosticStatus.OK, message=text, hardware_id='',
                                   name=self.get_fully_qualified_name().lstrip('/'))
         grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
-        if self.faults:
-            status.level, status.message = DiagnosticStatus.ERROR, '; '.join(self.faults.values())
+        faults = self._misfits()
+        if faults:
+            status.level, status.message = DiagnosticStatus.ERROR, '; '.join(faults)
         elif grown or self._last_warning:
             status.level = DiagnosticStatus.WARN
             status.message = self._last_warning or f'{", ".join(grown)} grew'

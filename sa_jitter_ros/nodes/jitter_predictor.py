@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.effects import enabled_effects, predict_with, require_modelled
+from sa_jitter_ros.effects import enabled_effects, predict_with
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.effect_parameters import effect_parameters
@@ -62,9 +62,7 @@ def declared_model(values: Values) -> DeclaredModel:
 def check(values: Values) -> None:
     """Raise `SaJitterError` unless the parameters make a model with effects."""
     model = declared_model(values)
-    require_modelled(model, enabled_effects(values))
-    for effect in enabled_effects(values):
-        effect.processes(model), effect.gain(model), effect.line_variance(model)
+    predict_with(replace(model, orders=(max(model.orders),)), enabled_effects(values))
 
 
 class JitterPredictor(MonitoringNode):

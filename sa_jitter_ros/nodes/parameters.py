@@ -152,14 +152,18 @@ class ParameterSet:
     def declare(self, specifications: Sequence[Parameter]) -> None:
         """Declare; raises `ParameterError` for an override of wrong type or range."""
         for item in specifications:
-            override = self._node._parameter_overrides.get(item.name)
-            unset = override is None or override.value is None
-            value = item.convert(item.default if unset else override.value)
+            value = item.convert(self._node._parameter_overrides[item.name].value
+                                 if self.given(item.name) else item.default)
             self._node.declare_parameter(
                 item.name, value, item.descriptor(), ignore_override=True)
             if value == [] and not item.read_only:  # rclpy takes an empty list for bytes
                 self._node.set_parameters([as_ros_parameter(item.name, value, item.kind)])
             self._specifications[item.name] = item
+
+    def given(self, name: str) -> bool:
+        """Whether the user gave a parameter at the start, even if it is the default."""
+        override = self._node._parameter_overrides.get(name)
+        return override is not None and override.value is not None
 
     def values(self) -> Values:
         """Every parameter's converted value."""

@@ -10,10 +10,10 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
-from sa_jitter_ros.nodes.averager_parameters import (gear_settings, PARAMETERS, pulse_validator,
-                                                     shaft_parameters, shaft_settings,
-                                                     trigger_share)
-from sa_jitter_ros.nodes.base import MonitoringNode, run_node
+from sa_jitter_ros.nodes.averager_parameters import (gear_settings, one_ratio, PARAMETERS,
+                                                     pulse_validator, shaft_parameters,
+                                                     shaft_settings, trigger_share)
+from sa_jitter_ros.nodes.base import MonitoringNode, run_node, UNCOUNTED
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
                                           PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
 from sa_jitter_ros.nodes.parameters import require_shaft_names, Values
@@ -30,12 +30,15 @@ class SynchronousAverager(MonitoringNode):
         for name in names:
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()
+        for name in names:
+            if values[f'{name}.ratio_teeth'] and self.parameters.given(f'{name}.ratio'):
+                raise one_ratio(values, name)
         self._shafts = {name: ShaftOutput(self, name) for name in names}
         self._averager = self._build(values)
         self._check(values)
         self._apply_indicators(values)
         self._values = values
-        self._keyphasor = values['keyphasor']
+        self._keyphasor: str | None = values['keyphasor'] or None
         self._other_keyphasors = 0
         vibration_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
         tach_type = known_type('tach_type', values['tach_type'], PULSE_TYPES)
@@ -83,6 +86,8 @@ class SynchronousAverager(MonitoringNode):
 
     def _on_vibration(self, message: Any) -> None:
         block = self._decoder.decode(message)
+        if self._decoder.counted and not self._averager.timeline.layout:
+            self.warn(UNCOUNTED)
         try:
             averages = self._averager.add_samples(block)
         except SignalError:
@@ -92,7 +97,8 @@ class SynchronousAverager(MonitoringNode):
 
     def _on_pulse_reference(self, message: Any) -> None:
         times, source = decode_pulse_reference(message)
-        self._keyphasor = self._keyphasor or source
+        if self._keyphasor is None:
+            self._keyphasor = source
         if source != self._keyphasor:
             self._other_keyphasors += 1
             self.warn(f'tach_pulse: pulse of keyphasor {source!r} while {self._keyphasor!r} is '
@@ -118,6 +124,8 @@ class SynchronousAverager(MonitoringNode):
     def update_counts(self) -> None:
         """Gather the counts of the core."""
         averager = self._averager
+        if self._decoder.counted:
+            self.show_warning(UNCOUNTED)
         samples, pulses = averager.timeline.counts, averager.pulse_counts
         self.counts.update(
             samples_dropped=samples.samples_dropped,
@@ -136,7 +144,7 @@ class SynchronousAverager(MonitoringNode):
         layout = averager.timeline.layout
         published = sum(shaft.published for shaft in self._shafts.values())
         values = {'trigger_cycles': str(averager.counts.cycles), 'averages': str(published),
-                  'keyphasor': self._keyphasor,
+                  'keyphasor': self._keyphasor or '',
                   **{f'pulses_{key}': str(count)
                      for key, count in asdict(averager.pulse_counts).items()}}
         refused = {name: shaft.refused for name, shaft in self._shafts.items() if shaft.refused}
@@ -148,9 +156,6 @@ class SynchronousAverager(MonitoringNode):
         values.update(channels=str(layout[0]), sample_rate=f'{layout[1]:.10g}')
         if not averager.counts.cycles:
             return 'no trigger cycle completed yet', values
-        if self._decoder.counted:
-            return ('vibration without header: samples are counted from start_time, a loss '
-                    'would not be seen'), values
         return f'{published} averages of {averager.counts.cycles} trigger cycles', values
 
 

@@ -2,14 +2,15 @@
 
 from collections import deque
 from collections.abc import Sequence
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
-from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode, run_node, UNCOUNTED
 from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference, known_type,
                                           PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
 from sa_jitter_ros.nodes.parameters import Parameter, Values
@@ -55,6 +56,10 @@ PARAMETERS = (
 )
 
 
+DETECTOR = ('automatic_threshold', 'threshold', 'hysteresis', 'polarity', 'edge', 'interpolate',
+            'minimum_interval', 'learning_time', 'minimum_difference')
+
+
 def detector_of(values: Values) -> KeyphasorDetector:
     """Detector with these parameters; raises `ParameterError`."""
     return KeyphasorDetector(
@@ -72,14 +77,16 @@ class TachDetector(MonitoringNode):
         values = self.parameters.values()
         waveform_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
         self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
-        self._keyphasor = values['keyphasor']
+        self._values, self._keyphasor = values, values['keyphasor']
         self._decoder = SampleDecoder(waveform_type, sample_rate=values['sample_rate'],
                                       start_time=values['start_time'],
                                       imu_axis=values['imu_axis'])
         self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
         self._detector = detector_of(values)
+        self._rate = 0.0  # of the run that the detector follows
         self._epoch = 0
         self._pulses = 0
+        self._too_close = self._unused = 0  # of detectors before
         self._waiting: deque[float] = deque()
         self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
         self.create_input(SAMPLE_TYPES[waveform_type], 'tach_waveform', self._on_waveform)
@@ -87,10 +94,22 @@ class TachDetector(MonitoringNode):
         self.parameters.watch(check=detector_of, apply=self._apply)
 
     def _apply(self, values: Values) -> None:
-        self._keyphasor, self._detector = values['keyphasor'], detector_of(values)
+        self._keyphasor = values['keyphasor']
+        if any(values[name] != self._values[name] for name in DETECTOR):
+            self._begin(values)
+        self._values = values
+
+    def _begin(self, values: Values) -> None:
+        """Go on with another detector, to which what was learnt does not apply."""
+        state = self._detector.state
+        self._too_close += state.too_close
+        self._unused += state.waiting
+        self._detector = detector_of(values)
 
     def _on_waveform(self, message: Any) -> None:
         block = self._decoder.decode(message)
+        if self._decoder.counted and not self._timeline.layout:
+            self.warn(UNCOUNTED)
         try:
             if block.samples.shape[0] != 1:
                 raise SignalError(f'{block.samples.shape[0]} channels: send the one channel of '
@@ -100,10 +119,12 @@ class TachDetector(MonitoringNode):
             self.counts['messages_rejected'] += 1
             raise
         for epoch, samples in self._timeline.take():
-            if epoch != self._epoch:  # time ran back: what was learnt is of another run
-                self._detector, self._epoch = detector_of(self.parameters.values()), epoch
+            same = math.isclose(samples.sample_rate, self._rate, rel_tol=SAME_RATE)
+            if epoch != self._epoch or not same:  # what was learnt is of another run
+                self._begin(self._values)
+                self._epoch, self._rate = epoch, samples.sample_rate
             self._publish(self._detector.update(
-                samples.samples[0], samples.start_time, samples.sample_rate))
+                samples.samples[0], samples.start_time, self._rate))
         for line in self._timeline.messages:
             self.warn(line)
         self._timeline.messages.clear()
@@ -123,9 +144,12 @@ class TachDetector(MonitoringNode):
 
     def update_counts(self) -> None:
         """Gather the counts of the core."""
+        if self._decoder.counted:
+            self.show_warning(UNCOUNTED)
         samples, state = self._timeline.counts, self._detector.state
         self.counts.update(
-            samples_dropped=samples.samples_dropped, pulses_dropped=state.too_close,
+            samples_dropped=samples.samples_dropped + self._unused,
+            pulses_dropped=self._too_close + state.too_close,
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
             samples_lost=samples.samples_lost)
