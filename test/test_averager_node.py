@@ -584,6 +584,7 @@ def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, t
     ('trigger_cycles:=0', 'trigger_cycles is 0: give at least 1'),
     ('averaging:=median', "averaging is 'median'"),
     ('shaft.orders:=[1.0, x]', "Couldn't parse parameter override rule"),
+    ('use_sim_time:=3', 'expecting type'),
 ])
 def test_main_says_in_one_line_what_is_wrong(process_environment, argument, says):
     process = run(process_environment, '-p', argument)

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidParameterValueException
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -174,7 +174,13 @@ def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) 
         return 2
     node = None
     try:
-        node = node_class()
+        try:
+            node = node_class()
+        except (InvalidParameterTypeException, RuntimeError) as error:  # of rclpy's own parameters
+            if rclpy.ok():
+                print(f'error: {error}', file=sys.stderr)
+                return 2
+            raise
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         executor.spin()
