@@ -260,6 +260,9 @@ class ResidualAnalyser(MonitoringNode):
                       self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
+        if not (count or self._batches or self._uncorrected):
+            topic = self.resolve_topic_name(f"{self._values['shaft']}/order_amplitude")
+            return f'nothing received on {topic} yet: shaft must be one of the averager', values
         doing = self._doing or self._verdict or 'nothing judged yet'
         return f'{count} of {size} averages; {doing}', values
 
