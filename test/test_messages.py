@@ -131,6 +131,51 @@ def test_imu_repeat_keeps_its_index_and_a_coarse_stamp_does_not():
     assert imu_blocks([0.0, 0.001, 0.001, 0.003], rate=1000.0) == [0, 1, 2, 3]
 
 
+@pytest.mark.parametrize('source_rate', [970.0, 990.0, 999.0, 999.9, 1001.0, 1010.0, 1030.0])
+def test_imu_of_a_slightly_other_rate_loses_nothing(source_rate):
+    stamps = 100.0 + np.arange(20_000) / source_rate
+    assert imu_blocks(stamps, rate=1000.0) == list(range(20_000))
+    if abs(source_rate - 1000.0) <= 10.0:  # and what it does lose is seen
+        kept = np.delete(np.arange(3000), [1500, 2000, 2001])
+        assert imu_blocks(stamps[kept], rate=1000.0) == kept.tolist()
+
+
+@pytest.mark.parametrize(('stamps', 'indices'), [
+    ([0.0, 1.0, 2.0, 4.0, 5.0], [0, 1, 2, 4, 5]),
+    ([0.0, 2.0, 3.0], [0, 2, 3]),
+    ([0.0, 1.0, 2.0, 3.7, 4.0, 5.0, 6.0], [0, 1, 2, 3, 4, 5, 6]),
+    ([0.0, 1.0, 2.0, 2.3, 4.0, 5.0, 6.0], [0, 1, 2, 3, 4, 5, 6]),
+    ([0.0, 0.7, 2.0, 2.3, 4.0, 4.3, 6.7], [0, 1, 2, 3, 4, 5, 6]),
+    ([0.0, 1.0, 2.0, 3.7, 5.0, 6.0], [0, 1, 2, 3, 4, 5]),
+])
+def test_imu_stamp_that_is_late_once_is_no_loss(stamps, indices):
+    assert imu_blocks(100.0 + 0.005 * np.array(stamps), rate=200.0) == indices
+
+
+@pytest.mark.parametrize('jitter', [
+    lambda rng, count: rng.uniform(-0.7, 0.7, count),
+    lambda rng, count: 0.2 * rng.standard_normal(count),
+    lambda rng, count: 0.5 * rng.standard_normal(count)])
+def test_imu_jitter_is_no_loss(rng, jitter):
+    stamps = 100.0 + (np.arange(20_000) + jitter(rng, 20_000)) / 999.0
+    assert imu_blocks(stamps, rate=1000.0) == list(range(20_000))
+
+
+def test_imu_loss_amid_jitter_is_seen_when_it_can_be_told(rng):
+    kept = np.delete(np.arange(3000), range(1500, 1502))
+    stamps = 100.0 + (kept + 0.2 * rng.standard_normal(kept.size)) / 1000.0
+    indices = np.array(imu_blocks(stamps, rate=1000.0))
+    wrong = np.flatnonzero(indices != kept)
+    assert wrong.size <= 3
+    assert np.all(abs(wrong - 1500) <= 3)
+
+
+def test_imu_stamps_of_bursts_are_no_losses():
+    stamps = 100.0 + np.arange(8000) // 8 * 8 / 1000.0
+    indices = np.array(imu_blocks(stamps, rate=1000.0))
+    assert np.all(np.diff(indices[8:]) == 1)  # from the second burst on
+
+
 def test_imu_stamps_that_run_back_start_again():
     assert imu_blocks([9.0, 9.01, 9.02, 1.0, 1.01]) == [0, 1, 2, 0, 1]
 

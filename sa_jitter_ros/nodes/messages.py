@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.errors import MessageError, ParameterError
+from sa_jitter_ros.recordings.stamp_counter import StampCounter
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
@@ -196,7 +197,7 @@ class SampleDecoder:
         self._rate, self._start_time = sample_rate, start_time
         self._axes = tuple(imu_axis)
         self._next_index = 0
-        self._imu_start: float | None = None
+        self._stamps, self._imu_index = StampCounter(sample_rate), 0
         self._imu_last: tuple[float, ...] = ()
         self.counted = False
 
@@ -238,23 +239,13 @@ class SampleDecoder:
 
     def _imu(self, message: Imu) -> SampleBlock:
         rate = self._known_rate()
-        time = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-        if self._imu_start is None:
-            self._imu_start, self._next_index = time, 0
-        # An Imu message carries no index: whole sample periods that its stamp skips are losses.
-        skipped = round((time - self._imu_start) * rate) - self._next_index
-        if skipped < 0 and -skipped > max(rate * 0.01, 1.0):
-            self._imu_start, self._next_index = time, 0  # the clock ran back: a restart
-        elif skipped > 0:
-            self._next_index += skipped
+        time = decode_time(message.header.stamp.sec, message.header.stamp.nanosec)
         vector = message.linear_acceleration
         values = tuple(float(getattr(vector, axis)) for axis in self._axes)
-        if (time, *values) == self._imu_last:  # a repeat keeps its index
-            self._next_index -= 1
+        if (time, *values) != self._imu_last:  # a repeat keeps its index
+            self._imu_index = self._stamps.index(time)
         self._imu_last = time, *values
-        index = self._next_index
-        self._next_index += 1
-        return SampleBlock(np.array(values)[:, None], time, rate, index)
+        return SampleBlock(np.array(values)[:, None], time, rate, self._imu_index)
 
 
 def encode_samples(block: SampleBlock) -> Float64MultiArray:
