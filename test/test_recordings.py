@@ -501,7 +501,7 @@ def test_bag_of_float32_needs_a_rate(recording, tmp_path):
     pytest.importorskip('rosbags')
     write_bag(tmp_path / 'bag', replace(recording, tach=None, start_time=0.0),
               vibration_type='std_msgs/msg/Float32MultiArray')
-    with pytest.raises(RecordingError, match='give sample_rate'):
+    with pytest.raises(RecordingError, match='carries none: set the parameter sample_rate'):
         open_recording(tmp_path / 'bag')
     opened = open_recording(tmp_path / 'bag', sample_rate=RATE)
     np.testing.assert_array_equal(opened.read(), recording.read().astype(np.float32))
@@ -570,13 +570,13 @@ def test_a_bag_block_without_header_is_counted(tmp_path):
     (float64_block(100, time=9.0), 'a second run; split the bag'),
     (float64_block(10**9), 'more than 3600 s'),
     (float64_block(2**53 - 100), 'more than 3600 s'),
-    (float64_block(100.5), 'index 100.5 is no whole number'),
-    (float64_block(-100), 'index -100.0 is no whole number'),
+    (float64_block(100.5), 'index of the first sample is 100.5: send a whole'),
+    (float64_block(-100), 'index of the first sample is -100.0: send a whole'),
     (float64_block(100, time=np.nan), 'time nan'),
     (float64_block(100, rate=0.0), 'rate 0.0'),
-    (float64_block(100, sizes=(2, 101)), 'do not fit'),
-    (float64_block(100, sizes=(200,)), 'do not fit'),
-    (float64_block(100, offset=2), 'data_offset|do not fit'),
+    (float64_block(100, sizes=(2, 101)), 'layout 2x101 .* does not fit'),
+    (float64_block(100, sizes=(200,)), r"dimensions \['channel'\] received"),
+    (float64_block(100, offset=2), 'data_offset 2 received, 3 expected'),
 ])
 def test_bags_that_do_not_go_on(tmp_path, second, message):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
@@ -604,19 +604,28 @@ def test_a_type_that_only_bears_the_name_is_refused(tmp_path):
         open_recording(tmp_path / 'bag')
 
 
-def test_imu_bag_with_a_lost_message(tmp_path):
-    def imu(k):
-        def make(types):
-            vector, numbers = types['geometry_msgs/msg/Vector3'], np.zeros(9)
-            stamp = types['builtin_interfaces/msg/Time'](*divmod(k * 10**7 + 5 * 10**9, 10**9))
-            return types['sensor_msgs/msg/Imu'](
-                types['std_msgs/msg/Header'](stamp, ''),
-                types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), numbers,
-                vector(0.0, 0.0, 0.0), numbers, vector(1.0 * k, 2.0 * k, 9.81), numbers)
-        return make
+def imu(stamp, *values):
+    """Return the maker of an Imu message."""
+    def make(types):
+        vector, numbers = types['geometry_msgs/msg/Vector3'], np.zeros(9)
+        time = types['builtin_interfaces/msg/Time'](*divmod(round(stamp * 1e9), 10**9))
+        return types['sensor_msgs/msg/Imu'](
+            types['std_msgs/msg/Header'](time, ''),
+            types['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0), numbers,
+            vector(0.0, 0.0, 0.0), numbers, vector(*map(float, values)), numbers)
+    return make
 
+
+def imu_bag(path, stamps):
+    """Write a bag of Imu messages whose z counts them."""
+    return write_messages(path, 'sensor_msgs/msg/Imu',
+                          [imu(stamp, 0.0, 0.0, k) for k, stamp in enumerate(stamps)])
+
+
+def test_imu_bag_with_a_lost_message(tmp_path):
     path = write_messages(tmp_path / 'bag', 'sensor_msgs/msg/Imu',
-                          [imu(k) for k in (0, 1, 2, 4, 5)], topic='imu/data')
+                          [imu(5.0 + 0.01 * k, 1.0 * k, 2.0 * k, 9.81) for k in (0, 1, 2, 4, 5)],
+                          topic='imu/data')
     topic = ('/imu/data',)
     opened = open_recording(path, sample_rate=100, channel_map=ChannelMap(vibration=topic))
     assert (opened.channel_names, opened.units[0]) == (('x', 'y', 'z'), 'm/s^2')
@@ -627,6 +636,38 @@ def test_imu_bag_with_a_lost_message(tmp_path):
     assert one.channel_names == ('z',)
     with pytest.raises(RecordingError, match='no vibration topic among /imu/data'):
         open_recording(path, sample_rate=100)
+
+
+def test_imu_bag_is_played_by_its_stamps(tmp_path, rng):
+    stamps = 100.0 + (np.arange(4000) + rng.uniform(-0.7, 0.7, 4000)) / 1000.0
+    opened = open_recording(imu_bag(tmp_path / 'jitter', stamps), sample_rate=1000.0)
+    assert (opened.samples, opened.remarks) == (4000, ())
+    stamps = 100.0 + np.delete(np.arange(5000), [2500, 2501]) / 999.5
+    opened = open_recording(imu_bag(tmp_path / 'slow', stamps), sample_rate=1000.0)
+    assert opened.remarks == ('/vibration: 2 lost samples are NaN',)
+    assert np.flatnonzero(np.isnan(opened.read()[2])).tolist() == [2500, 2501]
+
+
+@pytest.mark.parametrize('source_rate', [990.0, 1010.0])
+def test_imu_bag_of_another_rate_is_refused_with_its_rate(tmp_path, source_rate):
+    bag = imu_bag(tmp_path / 'bag', 5.0 + np.arange(3000) / source_rate)
+    with pytest.raises(RecordingError, match=f'or sample_rate is not the {source_rate:g} Hz of'):
+        open_recording(bag, sample_rate=1000.0)
+    assert open_recording(bag, sample_rate=source_rate).samples == 3000
+
+
+def test_imu_bag_whose_stamps_jump_back_is_refused(tmp_path):
+    bag = imu_bag(tmp_path / 'bag', np.concatenate([np.arange(100), np.arange(100)]) / 1000.0)
+    with pytest.raises(RecordingError, match=r'stamps jump back to 0\.0 s: a second run; split'):
+        open_recording(bag, sample_rate=1000.0)
+
+
+def test_repeats_in_an_imu_bag_are_left_out(tmp_path):
+    messages = [imu(0.01 * k, 0.0, 0.0, k) for k in (0, 1, 1, 2, 3)]
+    bag = write_messages(tmp_path / 'bag', 'sensor_msgs/msg/Imu', messages)
+    opened = open_recording(bag, sample_rate=100.0)
+    np.testing.assert_array_equal(opened.read()[2], np.arange(4.0))
+    assert opened.remarks == ('/vibration: 1 repeated samples left out',)
 
 
 def test_errors_of_the_bag_writer(recording, tmp_path):

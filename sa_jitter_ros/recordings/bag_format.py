@@ -9,16 +9,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from math import isfinite, prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.bag_limits import check_inflation
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.message_layouts import (
+    Block, BlockDecoder, decode_pulse_array, decode_pulse_reference)
 from sa_jitter_ros.recordings.recording import (
-    FloatArray, MAX_CHANNELS, MAX_PULSES, rechunk, Recording, recording_errors)
+    FloatArray, MAX_PULSES, rechunk, Recording, recording_errors)
+from sa_jitter_ros.recordings.stamp_counter import TIME_TOLERANCE
 
 FLOAT64 = 'std_msgs/msg/Float64MultiArray'
 FLOAT32 = 'std_msgs/msg/Float32MultiArray'
@@ -26,22 +28,10 @@ IMU = 'sensor_msgs/msg/Imu'
 TIME_REFERENCE = 'sensor_msgs/msg/TimeReference'
 SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
 PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
-INDEX_BASE = 1 << 24
-TIME_TOLERANCE = 0.01  # s; a clock that jumps by more starts a new run
 MAX_GAP = 3600.0  # s
 MAX_LOST = 1 << 29  # samples of all channels that a gap may hold
-_IMU_AXES = ('x', 'y', 'z')
+_IMU_AXES = 'xyz'
 _FILL = 65_536
-
-
-@dataclass(frozen=True)
-class _Block:
-    """Samples of one message: `channel` x `sample`, index and time of the first."""
-
-    samples: FloatArray
-    index: int
-    time: float
-    rate: float
 
 
 @dataclass(frozen=True)
@@ -95,7 +85,8 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
     ------
     RecordingError
         If `rosbags` is missing, the bag is broken, has no vibration, or its samples are not of one
-        run (index or clock jump back, rate or channels change).
+        run (index or clock jump back, rate or channels change, the stamps of an Imu run at another
+        rate).
 
     """
     topics = [entry for entry in channel_map.vibration if entry.startswith('/')]
@@ -120,7 +111,7 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
                 f'{extent.start_time} s: record both from the same moment')
         return channels.select(Recording(
             source, extent.rate, start_time=extent.start_time,
-            channel_names=_IMU_AXES if extent.imu else (),
+            channel_names=tuple(_IMU_AXES) if extent.imu else (),
             units=('m/s^2',) if extent.imu else (),
             tach=None if tach_extent is None else BagSource(
                 path, tach, sample_rate, tach_extent.channels, tach_extent.samples),
@@ -134,16 +125,16 @@ class _Run:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        self.first: _Block | None = None
+        self.first: Block | None = None
         self.received = self.repeated = self.lost = 0
 
-    def continuous(self, blocks: Iterator[_Block]) -> Iterator[FloatArray]:
+    def continuous(self, blocks: Iterator[Block]) -> Iterator[FloatArray]:
         """Iterate over the samples in order of their index, NaN where they were lost."""
         for block in blocks:
             first = self.first = self.first or block
             self._check(first, block)
             missing = block.index - first.index - self.received
-            if missing > min(MAX_GAP * block.rate, MAX_LOST / max(len(block.samples), 1)):
+            if missing > min(MAX_GAP * block.sample_rate, MAX_LOST / max(len(block.samples), 1)):
                 raise RecordingError(
                     f'{self.topic}: {missing} samples are missing before index {block.index}: '
                     f'more than {MAX_GAP:g} s or {MAX_LOST} values; split the bag')
@@ -161,16 +152,21 @@ class _Run:
                   (self.repeated, 'repeated samples left out'))
         return tuple(f'{self.topic}: {count} {text}' for count, text in counts if count)
 
-    def _check(self, first: _Block, block: _Block) -> None:
-        expected = first.time + (block.index - first.index) / first.rate
-        if len(block.samples) != len(first.samples) or block.rate != first.rate:
+    def _check(self, first: Block, block: Block) -> None:
+        count, passed = block.index - first.index, block.start_time - first.start_time
+        if len(block.samples) != len(first.samples) or block.sample_rate != first.sample_rate:
             raise RecordingError(
-                f'{self.topic}: {len(first.samples)} channels at {first.rate} Hz become '
-                f'{len(block.samples)} at {block.rate} Hz at index {block.index}; split the bag')
-        if block.index < first.index or not abs(block.time - expected) <= TIME_TOLERANCE:
+                f'{self.topic}: {len(first.samples)} channels at {first.sample_rate} Hz become '
+                f'{len(block.samples)} at {block.sample_rate} Hz at index {block.index}; split '
+                'the bag')
+        if count < 0 or not abs(passed - count / first.sample_rate) <= TIME_TOLERANCE:
+            pace = count / passed if passed > 0.0 else 0.0
+            drifts = 0.9 < pace / first.sample_rate < 1.1  # more is a jump
+            hint = f', or sample_rate is not the {pace:.6g} Hz of its times' if drifts else ''
             raise RecordingError(
-                f'{self.topic}: index {block.index} has time {block.time} s, expected '
-                f'{expected} s from index {first.index} on: a second run; split the bag')
+                f'{self.topic}: index {block.index} has time {block.start_time} s, expected '
+                f'{first.start_time + count / first.sample_rate} s from index {first.index} on: '
+                f'a second run; split the bag{hint}')
 
 
 @contextmanager
@@ -210,8 +206,8 @@ def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
     if run.first is None:
         raise RecordingError(f'{topic}: holds no messages')
     imu = reader.topics[topic].msgtype == IMU
-    return _Extent(len(run.first.samples), run.received, run.first.rate, run.first.time, imu,
-                   run.remarks())
+    return _Extent(len(run.first.samples), run.received, run.first.sample_rate,
+                   run.first.start_time, imu, run.remarks())
 
 
 @cache
@@ -230,65 +226,26 @@ def _messages(reader: Any, topic: str) -> Iterator[Any]:
         yield _types().deserialize_cdr(data, connection.msgtype)
 
 
-def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[_Block]:
+def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[Block]:
     """Iterate over the sample blocks of a topic as its messages hold them."""
-    kind = reader.topics[topic].msgtype
-    needs_rate = f'{topic}: its messages carry no sampling rate; give sample_rate'
-    rate = 0.0 if sample_rate is None else sample_rate
-    index, begin = 0, 0.0
+    decoder = BlockDecoder(reader.topics[topic].msgtype.replace('/msg/', '/'),
+                           sample_rate=sample_rate or 0.0, imu_axis=_IMU_AXES)
     for message in _messages(reader, topic):
-        if kind == IMU:
-            if sample_rate is None:
-                raise RecordingError(needs_rate)
-            time = _seconds(message.header.stamp)
-            begin = time if index == 0 else begin
-            # An Imu carries no index: whole sample periods that its stamp skips are losses.
-            index = max(index, round((time - begin) * rate))
-            vector = message.linear_acceleration
-            samples = np.array([[getattr(vector, axis)] for axis in _IMU_AXES])
-            yield _Block(samples, index, begin + index / rate, rate)
-            index += 1
-            continue
-        header, samples = _samples(topic, message)
-        if header.size == 3 and kind == FLOAT64:
-            time, rate, first = header.tolist()
-            if not (isfinite(time) and isfinite(rate) and rate > 0):
-                raise RecordingError(f'{topic}: header time {time} s, rate {rate} Hz')
-            yield _Block(samples, _whole(topic, first), time, rate)
-        elif sample_rate is None:
-            raise RecordingError(needs_rate)
-        elif header.size == 2 and kind == FLOAT32:
-            index = _whole(topic, header[0]) * INDEX_BASE + _whole(topic, header[1])
-            yield _Block(samples, index, index / rate, rate)
-        elif header.size == 0:
-            yield _Block(samples, index, index / rate, rate)
-            index += samples.shape[1]
-        else:
-            raise RecordingError(f'{topic}: data_offset {header.size} of a {kind}: must be '
-                                 f'{3 if kind == FLOAT64 else 2} header elements, or none')
+        with _message_errors(topic):
+            block = decoder.decode(message)
+        if decoder.restarts:
+            raise RecordingError(f'{topic}: stamps jump back to {block.start_time} s: a second '
+                                 'run; split the bag')
+        yield block
 
 
-def _samples(topic: str, message: Any) -> tuple[FloatArray, FloatArray]:
-    """Return header elements and `channel` x `sample` array of a message."""
-    layout, data = message.layout, np.asarray(message.data, dtype=np.float64)
-    header, values = data[:layout.data_offset], data[layout.data_offset:]
-    sizes = tuple(dim.size for dim in layout.dim) or (1, values.size)
-    if header.size != layout.data_offset or len(sizes) != 2 or prod(sizes) != values.size \
-            or not 1 <= sizes[0] <= MAX_CHANNELS:
-        raise RecordingError(
-            f'{topic}: dimensions {sizes} behind {layout.data_offset} header elements do not fit '
-            f'{data.size} elements of channel x sample')
-    return header, values.reshape(sizes)
-
-
-def _whole(topic: str, value: float) -> int:
-    if not (0 <= value < 2.0**53 and value == np.floor(value)):
-        raise RecordingError(f'{topic}: sample index {value} is no whole number')
-    return int(value)
-
-
-def _seconds(stamp: Any) -> float:
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
+@contextmanager
+def _message_errors(topic: str) -> Iterator[None]:
+    """Turn what is wrong with a message into what is wrong with the recording."""
+    try:
+        yield
+    except MessageError as error:
+        raise RecordingError(f'{topic}: {error}') from error
 
 
 def _pulses(reader: Any, topic: str, keyphasor: str) -> tuple[FloatArray, tuple[str, ...]]:
@@ -301,9 +258,10 @@ def _pulses(reader: Any, topic: str, keyphasor: str) -> tuple[FloatArray, tuple[
             if message.source != chosen:
                 others += 1
                 continue
-            pieces.append(np.array([_seconds(message.time_ref)]))
+            pieces.append(decode_pulse_reference(message)[0])
         else:
-            pieces.append(np.array(message.data[message.layout.data_offset:], dtype=np.float64))
+            with _message_errors(topic):
+                pieces.append(decode_pulse_array(message))
         count += pieces[-1].size
         if count > MAX_PULSES:
             raise RecordingError(f'{topic}: more than {MAX_PULSES} pulses')

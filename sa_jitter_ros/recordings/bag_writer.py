@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.bag_format import FLOAT32, FLOAT64, INDEX_BASE, TIME_REFERENCE
+from sa_jitter_ros.recordings.bag_format import FLOAT32, FLOAT64, TIME_REFERENCE
+from sa_jitter_ros.recordings.message_layouts import INDEX_BASE
 from sa_jitter_ros.recordings.recording import FloatArray, Recording
 
 _Timed = tuple[float, str, Any]
