@@ -1,5 +1,6 @@
 """Messages to arrays and back: every layout both ways, by hypothesis; what is malformed."""
 
+from dataclasses import replace
 import math
 
 from builtin_interfaces.msg import Time
@@ -16,11 +17,13 @@ from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
-SAMPLES = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=20), elements=FINITE)
+TIMES = st.floats(-1e15, 1e15)
+SAMPLES = arrays(np.float64, array_shapes(min_dims=2, max_dims=2, max_side=20),
+                 elements=st.one_of(st.floats(-1e100, 1e100), st.just(np.nan), st.just(-np.inf)))
 FLOAT64, FLOAT32, IMU = messages.SAMPLE_TYPES
 
 
-@given(SAMPLES, FINITE, st.floats(1e-3, 1e9), st.integers(0, 2**53 - 1))
+@given(SAMPLES, TIMES, st.floats(1e-12, 1e12), st.integers(0, 2**53 - 1))
 def test_samples_travel_unchanged(samples, time, rate, index):
     message = messages.encode_samples(SampleBlock(samples, time, rate, index))
     assert [dim.label for dim in message.layout.dim] == ['channel', 'sample']
@@ -59,6 +62,35 @@ def test_blocks_without_header_are_counted(sizes, named):
         assert (block.index, block.start_time) == (index, -1.0 + index / 50.0)
         index += size
     assert decoder.counted
+
+
+@pytest.mark.parametrize(('change', 'text'), [
+    ({'sample_rate': 5e-324}, r'rate in the header is 5e-324 Hz: must be from 1e-12 to 1e\+12 Hz'),
+    ({'sample_rate': 1e-13}, r'rate in the header is 1e-13 Hz'),
+    ({'sample_rate': 1.1e12}, 'rate in the header is 1100000000000.0 Hz'),
+    ({'start_time': 1e308}, r'time of the first sample is 1e\+308 s: must be within 1e\+15 s'),
+    ({'start_time': -1.1e15}, 'time of the first sample is -1100000000000000.0 s'),
+    ({'samples': np.array([[0.0, np.nan, -2e100]])}, r'sample of -2e\+100: must be within 1e\+1'),
+    ({'samples': np.array([[0.0, 1e308, 1.0]])}, r'sample of 1e\+308: must be within 1e\+100'),
+])
+def test_numbers_that_no_machine_has_are_refused(change, text):
+    block = replace(SampleBlock(np.ones((1, 2)), 0.0, 100.0, 0), **change)
+    with pytest.raises(MessageError, match=text):
+        SampleDecoder(FLOAT64, sample_rate=0.0).decode(messages.encode_samples(block))
+
+
+@pytest.mark.parametrize('rate', [5e-324, 1e308])
+@pytest.mark.parametrize('kind', [FLOAT32, IMU])
+def test_parameter_that_no_machine_has_is_refused(rate, kind):
+    message = Imu() if kind == IMU else Float32MultiArray(data=[1.0])
+    with pytest.raises(MessageError, match=r'sample_rate is .* Hz: must be from 1e-12 to'):
+        SampleDecoder(kind, sample_rate=rate).decode(message)
+
+
+def test_start_time_that_the_index_leaves_behind_is_refused():
+    message = messages.encode_samples_float32(SampleBlock(np.ones((1, 2)), 0.0, 1.0, 2**40))
+    with pytest.raises(MessageError, match='time of the first sample is'):
+        SampleDecoder(FLOAT32, sample_rate=1e-10).decode(message)
 
 
 def test_a_message_without_dimensions_is_one_channel():
@@ -189,6 +221,18 @@ def test_pulse_times_travel_to_the_nanosecond(seconds, nanoseconds):
     assert times[0] == pytest.approx(time, abs=1e-9 + 1e-15 * abs(time))
 
 
+@pytest.mark.parametrize('time', [2.0**31, 2.0**31 - 1e-10, 3.8e9, -2.0**31 - 0.5, 1e308, np.nan,
+                                  -np.inf])
+def test_pulse_beyond_the_int32_of_its_message_is_refused(time):
+    with pytest.raises(MessageError, match=r'from -2\^31 to 2\^31 s; set tach_type to std'):
+        messages.encode_pulse_reference(time, 'kp')
+
+
+def test_pulse_array_beyond_any_time_is_refused():
+    with pytest.raises(MessageError, match=r'pulse time is 1e\+16 s: must be within 1e\+15'):
+        messages.decode_pulse_array(messages.encode_pulse_array(np.array([1.0, np.nan, 1e16])))
+
+
 def test_pulse_before_the_epoch_has_a_negative_second():
     message = messages.encode_pulse_reference(-0.25, 'kp')
     assert (message.time_ref.sec, message.time_ref.nanosec) == (-1, 750_000_000)
@@ -198,7 +242,7 @@ def test_pulse_before_the_epoch_has_a_negative_second():
         TimeReference(time_ref=Time(sec=-3, nanosec=500_000_000)))[0][0] == -2.5
 
 
-@given(st.lists(FINITE, max_size=20))
+@given(st.lists(st.one_of(TIMES, st.just(np.nan)), max_size=20))
 def test_pulse_arrays_travel_unchanged(times):
     message = messages.encode_pulse_array(np.array(times))
     np.testing.assert_array_equal(messages.decode_pulse_array(message), times)

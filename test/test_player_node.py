@@ -122,6 +122,26 @@ def test_keyphasor_is_chosen(bench, recording, gone, options, wanted):
     np.testing.assert_allclose(player.pulses, times, rtol=0, atol=1e-9)
 
 
+def test_pulses_beyond_2038_are_counted_or_sent_as_arrays(bench, recording):
+    late = replace(recording, start_time=3e9, pulse_times=recording.pulse_times - 5.0 + 3e9,
+                   reference_pulse_times=None)
+    player = bench(late)
+    player.play()
+    player.samples()
+    assert player.pulses == []
+    assert player.node.counts['pulses_dropped'] == recording.pulse_times.size
+    assert player.spin(lambda: any('set tach_type to std_msgs/Float64MultiArray' in item.message
+                                   for item in player.status))
+
+
+def test_pulse_arrays_reach_beyond_2038(bench, recording):
+    late = replace(recording, start_time=3e9, pulse_times=recording.pulse_times - 5.0 + 3e9)
+    player = bench(late, pulse=Float64MultiArray, tach_type='std_msgs/Float64MultiArray')
+    player.play()
+    np.testing.assert_allclose(player.pulses, late.pulse_times[late.pulse_times < 3e9 + 2.0],
+                               rtol=0, atol=1e-6)
+
+
 def test_pulses_rounded_up_to_a_clock(bench, recording):
     player = bench(keyphasor_rate=330.0, tach='reference')
     player.play()

@@ -64,6 +64,10 @@ def test_blocks_without_samples_are_refused(recording):
     ({'ratio': -1.0}, 'ratio -1.0'),
     ({'orders': (1.0, np.inf)}, 'orders inf'),
     ({'start_time': np.inf}, 'start_time inf'),
+    ({'start_time': -1e16}, 'start_time is -1e.16 s: must be within 1e.15 s'),
+    ({'sample_rate': 5e-324}, 'sample_rate is 5e-324 Hz: must be from 1e-12 to'),
+    ({'tach_rate': 1e300}, 'tach_rate is 1e.300 Hz: must be from 1e-12 to'),
+    ({'pulse_times': np.array([1.0, 1e16])}, 'pulse_times is 1e.16 s: must be within'),
     ({'tach_rate': None}, 'without tach_rate'),
     ({'pulses_per_revolution': 0}, 'pulses_per_revolution 0'),
     ({'pulses_per_trigger': 0}, 'pulses_per_trigger 0'),
@@ -574,6 +578,9 @@ def test_a_bag_block_without_header_is_counted(tmp_path):
     (float64_block(-100), 'index of the first sample is -100.0: send a whole'),
     (float64_block(100, time=np.nan), 'time nan'),
     (float64_block(100, rate=0.0), 'rate 0.0'),
+    (float64_block(100, rate=5e-324), 'must be from 1e-12 to'),
+    (float64_block(100, time=1e308), 'must be within 1e.15 s of 0'),
+    (float64_block(1e101), 'index of the first sample is 1e.101'),
     (float64_block(100, sizes=(2, 101)), 'layout 2x101 .* does not fit'),
     (float64_block(100, sizes=(200,)), r"dimensions \['channel'\] received"),
     (float64_block(100, offset=2), 'data_offset 2 received, 3 expected'),
@@ -587,7 +594,7 @@ def test_bags_that_do_not_go_on(tmp_path, second, message):
 
 def test_a_gap_at_an_absurd_rate_is_no_gap_to_fill(tmp_path):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray', [
-        float64_block(index, time=0.0, rate=1e300) for index in (0, 2**53 - 100)])
+        float64_block(index, time=index / 1e12, rate=1e12) for index in (0, 2**53 - 100)])
     with pytest.raises(RecordingError, match='more than 3600 s or 536870912 values'):
         open_recording(path)
 
@@ -636,6 +643,27 @@ def test_imu_bag_with_a_lost_message(tmp_path):
     assert one.channel_names == ('z',)
     with pytest.raises(RecordingError, match='no vibration topic among /imu/data'):
         open_recording(path, sample_rate=100)
+
+
+def test_samples_that_no_machine_has_end_a_recording(tmp_path):
+    samples = np.ones((1, 100))
+    samples[0, [40, 50]] = np.nan, -1e200
+    write_npz(tmp_path / 'a.npz', Recording(ArraySource(samples), RATE))
+    opened = open_recording(tmp_path / 'a.npz')
+    assert next(opened.blocks(50)).shape == (1, 50)
+    with pytest.raises(RecordingError, match=r'sample of -1e\+200: must be within 1e\+100'):
+        opened.read()
+
+
+def test_pulses_beyond_2038_need_an_array(tmp_path):
+    pytest.importorskip('rosbags')
+    late = Recording(ArraySource(np.zeros((1, 1000))), RATE, start_time=3.8e9,
+                     pulse_times=3.8e9 + 0.1 * np.arange(5))
+    with pytest.raises(RecordingError, match=r'pulse time 3800000000.0 s: .* set tach_type to'):
+        write_bag(tmp_path / 'reference', late)
+    write_bag(tmp_path / 'array', late, tach_type='std_msgs/msg/Float64MultiArray')
+    opened = open_recording(tmp_path / 'array')
+    np.testing.assert_array_equal(opened.pulse_times, late.pulse_times)
 
 
 def test_imu_bag_is_played_by_its_stamps(tmp_path, rng):

@@ -168,12 +168,15 @@ decode_pulse_array = message_layouts.decode_pulse_array
 
 
 def encode_pulse_reference(time: float, source: str) -> TimeReference:
-    """Encode one pulse; header.stamp repeats its time so that tools can plot it."""
+    """
+    Encode one pulse; header.stamp repeats its time so that tools can plot it.
+
+    Raises `MessageError` for a time beyond 2^31 s, which the message cannot hold.
+    """
     message = TimeReference(source=source)
-    second = math.floor(time)
-    nanosecond = round((time - second) * 1e9)
+    second, nanosecond = message_layouts.encode_time(time)
     for stamp in (message.time_ref, message.header.stamp):
-        stamp.sec, stamp.nanosec = int(second + nanosecond // 10**9), int(nanosecond % 10**9)
+        stamp.sec, stamp.nanosec = second, nanosecond
     return message
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.timeline import SampleBlock
-from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference,
                                           encode_samples, encode_samples_float32, known_type,
@@ -218,13 +218,18 @@ class PlaybackNode(MonitoringNode):
         return True
 
     def _send_pulses(self, times: FloatArray) -> None:
-        self._sent_pulses += times.size
         if self._pulse_type is not TimeReference:
             if times.size:
                 self._pulse.publish(encode_pulse_array(times))
+            self._sent_pulses += times.size
             return
         for pulse in times.tolist():
-            self._pulse.publish(encode_pulse_reference(pulse, self._keyphasor))
+            try:
+                self._pulse.publish(encode_pulse_reference(pulse, self._keyphasor))
+                self._sent_pulses += 1
+            except MessageError as error:  # beyond what the message holds
+                self.counts['pulses_dropped'] += 1
+                self.warn(str(error))
 
     def _end(self) -> None:
         self._stream = None

@@ -2,15 +2,14 @@
 
 from collections.abc import Iterator
 from heapq import merge
-from math import floor
 import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.bag_format import FLOAT32, FLOAT64, TIME_REFERENCE
-from sa_jitter_ros.recordings.message_layouts import INDEX_BASE
+from sa_jitter_ros.recordings.message_layouts import encode_time, INDEX_BASE
 from sa_jitter_ros.recordings.recording import FloatArray, Recording
 
 _Timed = tuple[float, str, Any]
@@ -47,7 +46,8 @@ def write_bag(path: str | os.PathLike[str], recording: Recording, *, storage: st
     Raises
     ------
     RecordingError
-        If `rosbags` is missing, a type is unknown or the folder exists.
+        If `rosbags` is missing, a type is unknown, the folder exists or a pulse time is beyond
+        2^31 s, which only `FLOAT64` holds.
 
     """
     try:
@@ -81,7 +81,7 @@ def write_bag(path: str | os.PathLike[str], recording: Recording, *, storage: st
                     key=lambda item: item[0]):
                 data = store.serialize_cdr(message, streams[topic][0])
                 bag.write(connections[topic], max(0, round((time - offset) * 1e9)), data)
-    except WriterError as error:
+    except (WriterError, RecordingError) as error:
         raise RecordingError(f'{path}: {error}') from error
 
 
@@ -144,6 +144,7 @@ class _Messages:
         return self._types[kind](layout, np.concatenate([header, values.ravel()]).astype(dtype))
 
     def _stamp(self, time: float) -> Any:
-        second = floor(time)
-        carry, nanosecond = divmod(round((time - second) * 1e9), 10**9)
-        return self._types['builtin_interfaces/msg/Time'](second + carry, nanosecond)
+        try:
+            return self._types['builtin_interfaces/msg/Time'](*encode_time(time))
+        except MessageError as error:
+            raise RecordingError(str(error)) from error

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import MessageError, ParameterError
+from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.recordings.stamp_counter import StampCounter
 
 FloatArray = NDArray[np.float64]
@@ -79,6 +80,17 @@ def decode_time(seconds: int, nanoseconds: int) -> float:
     return seconds + 1e-9 * nanoseconds
 
 
+def encode_time(time: float) -> tuple[int, int]:
+    """Seconds and nanoseconds of a ROS time; `MessageError` where its int32 cannot hold it."""
+    if math.isfinite(time):
+        second = math.floor(time)
+        carry, nanosecond = divmod(round((time - second) * 1e9), 10**9)
+        if -2**31 <= second + carry < 2**31:
+            return second + carry, nanosecond
+    raise MessageError(f'pulse time {time} s: a sensor_msgs/TimeReference holds times from -2^31 '
+                       'to 2^31 s; set tach_type to std_msgs/Float64MultiArray')
+
+
 def decode_pulse_reference(message: Any) -> tuple[FloatArray, str]:
     """Pulse time (1,) in s and the keyphasor's name."""
     stamp = message.time_ref
@@ -88,8 +100,11 @@ def decode_pulse_reference(message: Any) -> tuple[FloatArray, str]:
 def decode_pulse_array(message: Any) -> FloatArray:
     """Pulse times (n,) in s."""
     if not message.layout.dim and message.layout.data_offset == 0:
-        return np.array(message.data, dtype=np.float64)
-    return decode_array(message, ('pulse',), 0)[1].astype(np.float64)
+        times = np.array(message.data, dtype=np.float64)
+    else:
+        times = decode_array(message, ('pulse',), 0)[1].astype(np.float64)
+    check_times('pulse time', times, MessageError)
+    return times
 
 
 class BlockDecoder:
@@ -124,12 +139,16 @@ class BlockDecoder:
 
     def decode(self, message: Any) -> Block:
         """Return the block that a message holds."""
-        return self._decode(message)
+        block = self._decode(message)
+        check_times('time of the first sample', block.start_time, MessageError)
+        check_samples(block.samples, MessageError)
+        return block
 
     def _known_rate(self) -> float:
         if not self._rate > 0.0:
             raise MessageError(f'sample_rate is {self._rate} Hz and the message carries none: '
                                'set the parameter sample_rate')
+        check_rate('sample_rate', self._rate, MessageError)
         return self._rate
 
     def _count(self, samples: FloatArray) -> Block:
@@ -146,6 +165,7 @@ class BlockDecoder:
         if not (math.isfinite(time) and math.isfinite(rate) and rate > 0.0):
             raise MessageError(f'header time {time} s, rate {rate} Hz: send a finite time and a '
                                'positive rate')
+        check_rate('sampling rate in the header', rate, MessageError)
         return Block(samples, time, rate, whole('index of the first sample', float(header[2])))
 
     def _float32(self, message: Any) -> Block:

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 
 FloatArray = NDArray[np.float64]
 
@@ -124,7 +125,7 @@ class Recording:
     Raises
     ------
     RecordingError
-        If rates, counts or times contradict each other.
+        If rates, counts or times contradict each other, or are beyond `limits`.
 
     """
 
@@ -153,15 +154,18 @@ class Recording:
                 f'vibration of {channels} channels x {self.vibration.samples} samples: needs 1 '
                 f'to {MAX_CHANNELS} channels and at least one sample')
         _check_positive('sample_rate', self.sample_rate)
+        check_rate('sample_rate', self.sample_rate, RecordingError)
         _check_positive('ratio', self.ratio)
         if not math.isfinite(self.start_time):
             raise RecordingError(f'start_time {self.start_time}: must be a finite time in s')
+        check_times('start_time', self.start_time, RecordingError)
         if self.tach is not None and self.tach_rate is None:
             raise RecordingError('a tach waveform without tach_rate: add its rate in Hz')
         if self.tach is not None and self.tach.channels != 1:
             raise RecordingError(f'tach of {self.tach.channels} channels: must be one waveform')
         if self.tach_rate is not None:
             _check_positive('tach_rate', self.tach_rate)
+            check_rate('tach_rate', self.tach_rate, RecordingError)
         if self.pulses_per_revolution < 1:
             raise RecordingError(
                 f'pulses_per_revolution {self.pulses_per_revolution}: must be at least 1')
@@ -267,7 +271,13 @@ def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[Fl
 def _guarded_blocks(source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
     if samples_per_block < 1:
         raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
-    return source.blocks(samples_per_block)
+    return _checked(source.blocks(samples_per_block))
+
+
+def _checked(blocks: Iterator[FloatArray]) -> Iterator[FloatArray]:
+    for block in blocks:
+        check_samples(block, RecordingError)
+        yield block
 
 
 def _check_positive(name: str, value: float) -> None:
@@ -283,6 +293,7 @@ def _check_pulse_times(name: str, times: FloatArray | None) -> None:
             f'{name} of shape {times.shape}: needs one row of at most {MAX_PULSES} times')
     if not np.isfinite(times).all():
         raise RecordingError(f'{name}: holds NaN or infinity; remove those pulses')
+    check_times(name, times, RecordingError)
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:
         k = int(backwards[0]) + 1
