@@ -419,6 +419,42 @@ def test_csv_of_a_german_spreadsheet(rng, tmp_path):
     np.testing.assert_array_equal(open_recording(path, sample_rate=RATE).read(), [a, b])
 
 
+@pytest.mark.parametrize(('rows', 'options', 'names'), [
+    ('a,b,\n1,2,\n3,4,\n', {}, ('a', 'b')),
+    ('a,b,\n1,2,\n3,4,\n', {'vibration': ('a',)}, ('a',)),
+    ('a,b,\n1,2,x\n3,4,y\n', {'vibration': ('b', 'a')}, ('b', 'a')),
+    ('time,a,b,\n0,1,2,\n0.1,3,4,\n', {}, ('a', 'b')),
+    ('time,a,b,\n0,1,2,\n0.1,3,4,\n', {'tach': 'b'}, ('a',)),
+    ('a,b,\n1,2,5\n3,4,6\n', {'vibration': ('2',), 'tach': 'a'}, ('',)),
+])
+def test_csv_column_without_name_need_not_be_numeric(tmp_path, rows, options, names):
+    (tmp_path / 'rig.csv').write_text(rows)
+    opened = open_recording(tmp_path / 'rig.csv', sample_rate=10.0,
+                            channel_map=ChannelMap(**options))
+    assert opened.channel_names == names
+    assert np.isfinite(opened.read()).all()
+
+
+@pytest.mark.parametrize(('start', 'rate', 'decimals'), [
+    (1.76e9, 25600.0, 6), (0.0, 4096.0, 5), (0.0, 300.0, 3)])
+def test_csv_with_rounded_times_has_the_rate_that_is_given(tmp_path, start, rate, decimals):
+    (tmp_path / 'rig.csv').write_text('time,a\n' + '\n'.join(
+        f'{start + k / rate:.{decimals}f},{k}' for k in range(2560)))
+    opened = open_recording(tmp_path / 'rig.csv', sample_rate=rate)
+    assert (opened.sample_rate, opened.start_time) == (rate, start)
+    np.testing.assert_array_equal(opened.read()[0], np.arange(2560))
+    with pytest.raises(RecordingError, match=r'sample_rate .* given, but the file says'):
+        open_recording(tmp_path / 'rig.csv', sample_rate=1.001 * rate)
+
+
+def test_csv_whose_times_are_not_steady_is_refused_with_the_given_rate(tmp_path):
+    times = np.arange(1000) / 100.0
+    times[500] += 0.006
+    (tmp_path / 'rig.csv').write_text('time,a\n' + '\n'.join(f'{t:.4f},1' for t in times))
+    with pytest.raises(RecordingError, match=r'row 500: time 5.006 s is no sample of a steady'):
+        open_recording(tmp_path / 'rig.csv', sample_rate=100.0).read()
+
+
 def test_csv_without_header_and_with_a_text_column(tmp_path):
     path = tmp_path / 'rig.csv'
     path.write_text('1,2\n\n3,4\n')

@@ -73,8 +73,8 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     """
     Open a `.csv` file; columns that the map leaves out need not be numeric.
 
-    The sampling rate is the mean rate of the time column, or `sample_rate` without one. Raises
-    RecordingError if there is neither, or a row is not numeric.
+    The sampling rate is `sample_rate`, which the times must agree with to half a sample, or their
+    mean rate without it. Raises RecordingError if there is neither, or a row is not numeric.
     """
     with recording_errors(path):
         with _open(path) as file:
@@ -86,8 +86,9 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             names = [str(column) for column in range(len(names))]
         channel_map = channel_map.named(names)
         time = channel_map.time or next((n for n in names if n.lower() in _TIME_NAMES), '')
-        wanted = ({*channel_map.vibration, channel_map.tach} if channel_map.vibration
-                  else {*names} - {time})
+        wanted = {*channel_map.vibration} or {*names} - {time, ''}  # none: a delimiter too many
+        if channel_map.tach:
+            wanted.add(channel_map.tach)
         columns = tuple(k for k, name in enumerate(names) if name in wanted)
         if not columns:
             raise RecordingError(f'columns {", ".join(names)} hold no vibration')
@@ -98,6 +99,11 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             if not end_time > start_time:
                 raise RecordingError(f'time runs from {start_time} to {end_time} s: must increase')
             rate = (samples - 1) / (end_time - start_time)
+            if sample_rate is not None:  # times are rounded, so it is the better of the two
+                if not abs((end_time - start_time) * sample_rate - (samples - 1)) < 1.0:
+                    raise RecordingError(f'sample_rate {sample_rate} Hz given, but the file says '
+                                         f'{rate} Hz')
+                rate = sample_rate
         if rate is None:
             raise RecordingError(
                 f'no time column among {", ".join(names)}: name it in the channel map or give '
