@@ -86,6 +86,32 @@ def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_pa
     assert str(path) in done.stderr
 
 
+@pytest.mark.parametrize('place', ['file/out', 'file'])
+def test_unusable_output_is_one_line_and_status_2_before_the_run(
+        monkeypatch, tmp_path, capsys, place):
+    monkeypatch.setattr(demo, 'Watcher', None)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    (tmp_path / 'file').touch()
+    assert demo.main(['--output', str(tmp_path / place)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert re.fullmatch(f"demo: .*{tmp_path / 'file'}.*\n", captured.err)
+
+
+def test_output_that_fails_at_the_end_is_one_line_and_status_2(monkeypatch, tmp_path, capsys):
+    def report(*arguments):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(demo, 'Watcher', lambda **node_kwargs: demo.rclpy.create_node(
+        'watcher', **node_kwargs))
+    monkeypatch.setattr(demo, 'processes', lambda plan, live=False: {})
+    monkeypatch.setattr(demo, 'watch', lambda *arguments, **options: None)
+    monkeypatch.setattr(demo, 'report', report)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    assert demo.main(['--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == 'demo: [Errno 28] No space left on device\n'
+
+
 @pytest.mark.parametrize('name', ['gear0_gearbox', 'motor_30V_100kHz'])
 def test_measured_recordings_give_averages_whose_loss_is_known(
         name, shared_data, process_environment, tmp_path):

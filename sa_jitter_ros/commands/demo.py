@@ -128,7 +128,7 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo; 0, or 2 with one line on unusable input."""
+    """Run the demo; 0, or 2 with one line on unusable input or output."""
     parser = argparse.ArgumentParser(
         prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
@@ -148,6 +148,7 @@ def main(args: Sequence[str] | None = None) -> int:
         plan = SIMULATED
         if options.recording:
             plan = plan_recording(options.recording, keyphasor_rate=options.keyphasor_rate)
+        options.output.mkdir(parents=True, exist_ok=True)  # before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')
         if not options.live:
@@ -164,7 +165,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.live:
             print('the page stays until Ctrl-C', flush=True)
             executor.spin()
-    except SaJitterError as error:
+    except (SaJitterError, OSError) as error:
         print(f'demo: {error}', file=sys.stderr)
         return 2
     except KeyboardInterrupt:
