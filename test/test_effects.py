@@ -78,6 +78,19 @@ def test_no_effect_is_the_prediction_itself():
     assert predict_with(MODEL).mean_attenuation == pytest.approx(predict(MODEL).mean_attenuation)
 
 
+@pytest.mark.parametrize('cycles', [3, 20])
+@pytest.mark.parametrize(('name', 'values'), [
+    ('excess_jitter', {}), ('correlated_jitter', {}), ('phase_wander', {}),
+    ('speed_fluctuation', {}), ('amplitude_modulation', {}), ('clock_skew', {}),
+    ('target_geometry', {'pulse_angles': (0.0, 0.0)}), ('missing_pulses', {}),
+    ('additive_noise', {}), ('interfering_tone', {})])
+def test_effects_of_no_size_leave_the_prediction_as_it_is(name, values, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
+    plain, after = predict(model), predict_with(model, [make_effect(name, **values)])
+    for figure in ('mean_attenuation', 'standard_deviation', 'quantile_05', 'quantile_95'):
+        np.testing.assert_array_equal(getattr(after, figure), getattr(plain, figure))
+
+
 def test_excess_jitter_is_independent_normal(rng):
     errors = declared_errors(rng, 20_000)
     errors = errors + rng.normal(0.0, 5e-5, errors.shape)

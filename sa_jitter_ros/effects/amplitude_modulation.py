@@ -51,6 +51,8 @@ class AmplitudeModulation(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[Any]:
         """Return the gain, band-limited below half the trigger rate."""
+        if self.std == 0.0:
+            return ()
         length = min(_MEMORY, model.trigger_cycles)
         processes: Sequence[AngleErrorProcess] = (SlowGain(self.std**2, length, self.band),)
         return processes

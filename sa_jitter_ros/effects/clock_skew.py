@@ -23,6 +23,8 @@ class ClockSkew(Effect):
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the delay that grows through an average."""
+        if self.skew == 0.0:
+            return None
         return (self.skew * model.trigger_period
                 * np.arange(model.trigger_cycles + 1.0))[None, :]
 

@@ -31,6 +31,8 @@ class CorrelatedJitter(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the first-order autoregressive pulse errors, seen through the angle law."""
+        if self.std == 0.0:
+            return ()
         variance = (self.std * model.fundamental_frequency) ** 2
         rho = abs(self.correlation)
         memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))

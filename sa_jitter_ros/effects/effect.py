@@ -129,14 +129,19 @@ class Effect:
         return ''
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
-        """Return random angle errors, or random gains, that are stationary over the cycles."""
+        """
+        Return random angle errors, or random gains, that are stationary over the cycles.
+
+        None of them where they have no size: the prediction is then the one without the effect.
+        """
         return ()
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """
         Return equally likely pulse errors (scenario, N_t + 1) in s of an average.
 
-        They are what is known of the pulses up to a few numbers that nobody knows in advance.
+        They are what is known of the pulses up to a few numbers that nobody knows in advance. None
+        where nothing is known, or all errors are 0.
         """
         return None
 

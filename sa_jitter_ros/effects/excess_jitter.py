@@ -30,6 +30,8 @@ class ExcessJitter(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the independent pulse errors."""
+        if self.std == 0.0:
+            return ()
         return (IndependentPulseJitter(
             Normal(self.std), model.fundamental_frequency, model.weights),)
 

@@ -39,6 +39,8 @@ class PhaseWander(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the wander, band-limited below half the trigger rate."""
+        if self.std == 0.0:
+            return ()
         variance = (self.std / (2.0 * np.pi)) ** 2
 
         def covariance(u: Array, v: Array, lag: int) -> Array:

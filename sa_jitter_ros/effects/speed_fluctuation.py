@@ -36,6 +36,8 @@ class SpeedFluctuation(Effect):
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the error of the angle law."""
+        if self.acceleration_std == 0.0:
+            return ()
         size = _cycles(model, self.acceleration_std) * model.trigger_period**2
         variance = (size * model.cycle_length) ** 2
         return (GaussianAngleError(_left_by(model.weights, variance),

@@ -34,7 +34,7 @@ class TargetGeometry(Effect):
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the errors for every mark that an average may begin with."""
-        if not self.pulse_angles:
+        if not any(self.pulse_angles):
             return None
         first = np.arange(len(self.pulse_angles))[:, None]
         return self._at(model, first + np.arange(model.trigger_cycles + 1))
