@@ -11,6 +11,7 @@ from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from scipy.signal import lfilter
+from scipy.stats import kstest
 
 MODEL = DeclaredModel(keyphasor_rate=10_000.0, trigger_speed=25.0, trigger_cycles=20,
                       orders=(10.0, 20.0, 40.0), sample_rate=20_000.0)
@@ -104,6 +105,44 @@ def test_correlated_jitter_is_autoregressive(rng, correlation):
     slow = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)[:, 60:]
     effect = make_effect('correlated_jitter', std=5e-5, correlation=correlation)
     check(predict_with(MODEL, [effect]), average_of(errors + slow))
+
+
+@pytest.mark.parametrize(('correlation', 'cycles'), [
+    (0.99, 40), (0.9, 10), (0.5, 1), (-0.9, 40)])
+def test_cycles_that_remember_each_other_count_as_fewer(rng, correlation, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
+    errors = rng.uniform(-5e-5, 5e-5, (20_000, cycles + 1))
+    white = rng.normal(0.0, 5e-5, errors.shape)
+    white[:, 1:] *= np.sqrt(1.0 - correlation**2)
+    errors = errors + lfilter([1.0], [1.0, -correlation], white)
+    effect = make_effect('correlated_jitter', std=5e-5, correlation=correlation)
+    prediction, drawn = predict_with(model, [effect]), average_of(errors)
+    check(prediction, drawn)
+    for i in range(3):
+        assert kstest(drawn[:, i], lambda x, i=i: prediction.law.cdf(x)[i]).statistic < (
+            0.005 + 1.95 * np.sqrt(1.0 / len(drawn) + 1.0 / 4096))
+
+
+def bands(rng, draws, cycles, band, u):
+    """Return a unit motion (draw, cycle, u) of frequencies spread evenly over a band."""
+    frequency = band[0] + (band[1] - band[0]) * (np.arange(16) + rng.uniform(size=16)) / 16.0
+    turns = 2.0 * np.pi * np.multiply.outer(frequency, (np.arange(cycles)[:, None] + u).ravel())
+    parts = rng.normal(size=(2, draws, 16)) / 4.0
+    return (parts[0] @ np.cos(turns) + parts[1] @ np.sin(turns)).reshape(draws, cycles, u.size)
+
+
+@pytest.mark.parametrize('cycles', [1, 3])
+def test_slow_motion_over_few_cycles_is_sampled(rng, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
+    effects = [make_effect('phase_wander', std=0.02, bandwidth=0.1),
+               make_effect('amplitude_modulation', std=0.2)]
+    u = (np.arange(8) + 0.5) / 8.0
+    errors = 25.0 * rng.uniform(-5e-5, 5e-5, (10_000, cycles + 1))
+    angle = (errors[:, :-1, None] * (1.0 - u) + errors[:, 1:, None] * u
+             + 0.02 / (2.0 * np.pi) * bands(rng, 10_000, cycles, (0.02, 0.1), u))
+    gain = 1.0 + 0.2 * bands(rng, 10_000, cycles, (0.02, 0.4), u)
+    check(predict_with(model, effects), np.abs(np.stack([
+        (gain * np.exp(2j * np.pi * g * angle)).mean(axis=(1, 2)) for g in MODEL.orders], 1)))
 
 
 def test_quantisation_is_rounding_up_to_the_clock(rng):

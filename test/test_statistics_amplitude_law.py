@@ -110,7 +110,8 @@ def test_bent_averages_keep_their_mean_square_in_noise():
 def test_sampled_law_is_the_law_of_few_cycles(cycles):
     law, order, noise = Triangular(0.25), 0.7, 0.02
     moments, _ = jittered(law, order, cycles)
-    sampled = sampled_law([order], law, cycles, moments.with_noise(noise), line_variance=noise)
+    sampled = sampled_law([order], [IndependentPulseJitter(law)], cycles,
+                          moments.with_noise(noise), line_variance=noise)
     signal = AveragedSignal(cycles, 0.4137, order)
     draws = np.abs(monte_carlo(signal.whole_trigger_cycles, law, cycles, 60_000, seed=5,
                                line_variance=noise))
@@ -122,7 +123,8 @@ def test_sampled_law_is_the_law_of_few_cycles(cycles):
 
 def test_quantiles_need_probabilities():
     law = normal_law(moments_of(1.0, 0.1, 0.1))
-    sampled = sampled_law([0.1], Uniform(1.0), 2, moments_of(1.0, 0.1, 0.1))
+    sampled = sampled_law([0.1], [IndependentPulseJitter(Uniform(1.0))], 2,
+                          moments_of(1.0, 0.1, 0.1))
     for bad in (0.0, 1.0, -0.1, np.nan):
         for either in (law, sampled):
             with pytest.raises(ParameterError, match='between 0 and 1'):

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, unit_nodes
+from sa_jitter_ros.statistics.angle_error import (
+    AngleErrorProcess, drawn_normal, unit_nodes)
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
@@ -37,6 +38,14 @@ class SlowGain:
                 lag = (m + np.asarray(v)) - (k + np.asarray(u))
                 total = total + self.variance * flat_band_correlation(lag, self.band)
         return np.asarray(total)
+
+    def draw_gain(self, rng: np.random.Generator, cycles: int, u: Array, count: int) -> Array:
+        """Return `count` gains (cycle, u, draw)."""
+        def covariance(u: Array, v: Array, lag: int) -> Array:
+            return self.variance * flat_band_correlation(lag + v - u, self.band)
+
+        return np.asarray(1.0 + drawn_normal(rng, covariance, min(
+            self.correlation_length, cycles - 1), cycles, u, count))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
     fit_memory, goodness_of_fit, memory_p_value)
 from sa_jitter_ros.effects.slope_test import require_tach_side
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianPulseJitter
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _FORGOTTEN = 1e-3
@@ -36,10 +36,10 @@ class CorrelatedJitter(Effect):
         variance = (self.std * model.fundamental_frequency) ** 2
         rho = abs(self.correlation)
         memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))
-        covariance = model.weights.covariance(
-            lambda lags: variance * self.correlation ** np.abs(lags))
         reach = memory + model.weights.pulses - 2
-        return (GaussianAngleError(covariance, min(reach, model.trigger_cycles)),)
+        return (GaussianPulseJitter.through(
+            model.weights, lambda lags: variance * self.correlation ** np.abs(lags),
+            min(reach, model.trigger_cycles)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return std^2 correlation^|lag|."""

@@ -10,9 +10,12 @@ follows from the joint characteristic functions of that error,
 and those of independent errors MULTIPLY. So an effect is one class with one method, and the
 moments of any combination are integrals of a product (`moments`). A random gain ``a_k(u)`` fits
 too: it contributes E prod_i a_{k_i}(u_i).
+
+A process that can be drawn has one of the methods `draw_pulses`, `draw_angle` and `draw_gain`;
+then the law of averages of few cycles is sampled (`sampled_law`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -24,6 +27,8 @@ from sa_jitter_ros.statistics.distributions import PulseErrorDistribution
 from sa_jitter_ros.statistics.pulse_weights import Covariance, LINEAR, PulseWeights
 
 Array = NDArray[Any]
+
+_RANK = 1e-9  # variance of what is left out of drawn processes, over the largest component's
 
 
 class AngleErrorProcess(Protocol):
@@ -80,6 +85,10 @@ class IndependentPulseJitter:
             product = product * self.distribution.characteristic_function(weight)
         return product
 
+    def draw_pulses(self, rng: np.random.Generator, shape: tuple[int, int]) -> Array:
+        """Return independent pulse errors (pulse, draw) in fundamental cycles."""
+        return self.frequency * self.distribution.draw(rng, shape)
+
 
 @dataclass(frozen=True)
 class GaussianAngleError:
@@ -92,6 +101,11 @@ class GaussianAngleError:
 
     covariance: Covariance
     correlation_length: int
+
+    def draw_angle(self, rng: np.random.Generator, cycles: int, u: Array, count: int) -> Array:
+        """Return `count` angle errors (cycle, u, draw) in fundamental cycles, single precision."""
+        return drawn_normal(rng, self.covariance, min(self.correlation_length, cycles - 1),
+                            cycles, u, count)
 
     def characteristic(
         self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
@@ -111,9 +125,53 @@ class GaussianAngleError:
         return np.asarray(np.exp(-2.0 * np.pi**2 * variance))
 
 
+@dataclass(frozen=True)
+class GaussianPulseJitter(GaussianAngleError):
+    """
+    The Gaussian angle error that correlated normal pulse errors make through an angle law.
+
+    ``autocovariance(lags)`` = Cov[eps_k, eps_{k+lag}] in fundamental cycles squared.
+    """
+
+    autocovariance: Callable[[Array], Array]
+
+    @classmethod
+    def through(cls, weights: PulseWeights, autocovariance: Callable[[Array], Array],
+                correlation_length: int) -> 'GaussianPulseJitter':
+        """Return the angle error behind the `weights` of a law."""
+        return cls(weights.covariance(autocovariance), correlation_length, autocovariance)
+
+    def draw_pulses(self, rng: np.random.Generator, shape: tuple[int, int]) -> Array:
+        """Return pulse errors (pulse, draw) in fundamental cycles, single precision."""
+        pulses, count = shape
+
+        def covariance(u: Array, v: Array, lag: int) -> Array:
+            return self.autocovariance(np.full(np.broadcast(u, v).shape, lag))
+
+        return drawn_normal(rng, covariance, pulses - 1, pulses, np.zeros(1), count)[:, 0]
+
+
+def drawn_normal(
+    rng: np.random.Generator, covariance: Covariance, length: int, cycles: int, u: Array,
+    count: int,
+) -> Array:
+    """Return `count` draws (cycle, u, draw) of a stationary normal process, single precision."""
+    blocks = np.zeros((cycles, u.size, u.size))
+    for lag in range(length + 1):
+        blocks[lag] = covariance(u[:, None], u, lag)
+    lags = np.arange(cycles) - np.arange(cycles)[:, None]
+    both = np.concatenate((blocks, blocks[:0:-1].transpose(0, 2, 1)))  # negative lags count back
+    matrix = both[lags].transpose(0, 2, 1, 3).reshape(cycles * u.size, -1)
+    size, axes = np.linalg.eigh(matrix)
+    kept = size > _RANK * size[-1]
+    factor = (axes[:, kept] * np.sqrt(size[kept])).astype(np.float32)
+    z = rng.standard_normal((factor.shape[1], count), np.float32)
+    return np.asarray((factor @ z).reshape(cycles, u.size, count))
+
+
 def gaussian_pulse_jitter(
     autocovariance: Sequence[float], *, weights: PulseWeights = LINEAR,
-) -> GaussianAngleError:
+) -> GaussianPulseJitter:
     """
     Return correlated normal pulse errors seen through an angle law, by default the linear one.
 
@@ -131,9 +189,9 @@ def gaussian_pulse_jitter(
         raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no '
                          'random sequence has a negative one; lower the correlations')
 
-    covariance = weights.covariance(
-        lambda lags: np.append(table, 0.0)[np.minimum(np.abs(lags), table.size)])
-    return GaussianAngleError(covariance, table.size + weights.pulses - 2)
+    return GaussianPulseJitter.through(
+        weights, lambda lags: np.append(table, 0.0)[np.minimum(np.abs(lags), table.size)],
+        table.size + weights.pulses - 2)
 
 
 def joint_characteristic(

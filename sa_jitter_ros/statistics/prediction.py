@@ -22,7 +22,6 @@ from sa_jitter_ros.statistics.distributions import (
     Empirical,
     Normal,
     PulseErrorDistribution,
-    Sum,
     Triangular,
     Uniform,
 )
@@ -30,13 +29,14 @@ from sa_jitter_ros.statistics.moments import (
     AngleOffset,
     AverageMoments,
     cycle_moments,
+    CycleMoments,
     noise_line_variance,
     offset_moments,
     require_cycles,
     require_orders,
 )
 from sa_jitter_ros.statistics.pulse_weights import pulse_weights, PulseWeights
-from sa_jitter_ros.statistics.sampled_law import sampled_law
+from sa_jitter_ros.statistics.sampled_law import can_be_sampled, sampled_law
 
 Array = NDArray[Any]
 
@@ -46,6 +46,8 @@ DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 # Up to here the law is sampled; with one more cycle the curved law is up to 0.015 off in its CDF,
 # and 0.04 off for jitter as skewed as an exponential law.
 _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
+# Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
+_FEW_ALONG, _FEW_ACROSS, _NOTHING = 8.0, 5.0, 1e-12
 
 
 class AmplitudeDistribution(Protocol):
@@ -212,7 +214,7 @@ def predict(
     predicted one by one and combined with `mixture.mixed`.
 
     Mean square and complex moments are exact for any of them. The law itself is sampled (fixed
-    seed) for few trigger cycles of independent jitter, normal under an offset, curved otherwise.
+    seed) for few trigger cycles, normal under an offset, curved otherwise.
     """
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
@@ -237,12 +239,37 @@ def predict(
     g = np.asarray(gain)
     equal, mixed = average_cumulants(orders, everything, count, cycles)
     curved = curved_law(moments, equal * g**3, mixed * g * np.abs(g) ** 2)
-    lopsided = np.max(np.abs(curved.skew)) > _LOPSIDED
-    if plain and count <= (_FEW_LOPSIDED_CYCLES if lopsided else _FEW_CYCLES):
+    if few_cycles(cycles, count, plain, curved.skew) and can_be_sampled(
+            everything, count, orders.size):
         return prediction_of_law(model, moments, sampled_law(
-            orders * frequency, Sum(*jitters), count, moments, gain=gain, line_variance=noise,
+            orders, everything, count, moments, gain=gain, line_variance=noise,
             weights=model.weights))
     return prediction_of_law(model, moments, curved)
+
+
+def few_cycles(
+    cycles: CycleMoments, trigger_cycles: int, plain: bool, skew: Array,
+) -> bool:
+    """
+    Tell whether an average holds too few cycles for a limit theorem, so that its law is sampled.
+
+    Cycles that remember each other count as fewer: as the variance of one over that of the average
+    says. `plain` are independent errors alone, `skew` the skewness of the curved law.
+    """
+    lopsided = np.max(np.abs(skew)) > _LOPSIDED
+    if trigger_cycles <= (_FEW_LOPSIDED_CYCLES if plain and lopsided else _FEW_CYCLES):
+        return True
+    if plain:
+        return False
+    power = np.abs(cycles.mean) ** 2
+    turn = np.exp(-2j * np.angle(cycles.mean))
+    pairs = [(m.variance, np.real(m.pseudo_variance * turn))
+             for m in (cycles.lag(0), cycles.averaged(trigger_cycles))]
+    for side, fewest in ((1.0, _FEW_ALONG), (-1.0, _FEW_ACROSS)):  # the mean phasor
+        single, average = (variance + side * pseudo for variance, pseudo in pairs)
+        if np.any((single < fewest * average) & (average > _NOTHING * power)):
+            return True
+    return False
 
 
 def prediction_of_law(

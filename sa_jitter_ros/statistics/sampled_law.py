@@ -5,6 +5,7 @@ The draws are the same for every order and every call (fixed seed), so a predict
 of its model. The mean square is not sampled: it is exact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.statistics.angle_error import unit_nodes
-from sa_jitter_ros.statistics.distributions import PulseErrorDistribution
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, unit_nodes
 from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.pulse_weights import LINEAR, PulseWeights
 
@@ -22,7 +22,9 @@ Array = NDArray[Any]
 _SEED = 20190215
 _BUDGET = 3_000_000  # phasors in one law
 _FEWEST, _MOST = 4096, 65536
-_RULE = unit_nodes(12)
+_WORK, _COARSEST = 50_000_000, 1024  # phasors at most, about a second; fewest draws then
+_MOST_POINTS = 1000  # of a process drawn at once
+_LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
 
 
 @dataclass(frozen=True)
@@ -62,45 +64,77 @@ class SampledLaw:
         return np.asarray((1.0 - part) * self.draws[:, index] + part * self.draws[:, index + 1])
 
 
+def can_be_sampled(
+    processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int,
+) -> bool:
+    """Tell whether averages of all processes can be drawn, and in about a second."""
+    pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
+    points = trigger_cycles * (1 if pulsed else _LINEAR_RULE[0].size)
+    return points <= _MOST_POINTS and points * orders * _COARSEST <= _WORK and all(
+        any(hasattr(process, f'draw_{what}') for what in ('pulses', 'angle', 'gain'))
+        for process in processes)
+
+
 def sampled_law(
-    frequencies: ArrayLike, distribution: PulseErrorDistribution, trigger_cycles: int,
-    moments: AverageMoments, *, gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0,
-    weights: PulseWeights = LINEAR,
+    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, moments: AverageMoments, *,
+    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
+    known: Array | None = None,
 ) -> SampledLaw:
     """
-    Return the law of the average of `trigger_cycles` cycles at the orders' `frequencies` in Hz.
+    Return the law of the average of `trigger_cycles` cycles.
 
-    `moments` are the exact ones with gain and noise; `line_variance` is E|n|^2 of the noise;
-    `weights` are those of the angle law.
+    `processes` `can_be_sampled`; `moments` are the exact ones with gain and noise; `line_variance`
+    is E|n|^2 of the noise; `weights` are those of the angle law. `known` (scenario, n) are pulse
+    errors in fundamental cycles that come on top, in equally likely scenarios: of all
+    N_t - 1 + weights.pulses pulses or of the average's own N_t + 1.
     """
-    f = np.asarray(frequencies, float)
-    phasors = f.size * (trigger_cycles + 3) * (1 if weights is LINEAR else _RULE[0].size)
+    g = np.asarray(orders, float)
+    pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
+    inside = [process for process in processes if process not in pulsed]
+    bare = weights is LINEAR and not inside
+    u, w = _LINEAR_RULE if weights is LINEAR else _BENT_RULE
+    w = w.astype(np.float32)
+    phasors = g.size * (trigger_cycles + 3) * (1 if bare else u.size)
     count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
+    count = max(_COARSEST, min(count, _WORK // phasors))
     rng = np.random.default_rng(_SEED)
-    errors = distribution.draw(rng, (trigger_cycles + weights.pulses - 1, count))
+    shape = (trigger_cycles + weights.pulses - 1, count)
+    errors: Array = np.zeros(shape)
+    for process in pulsed:
+        errors = errors + process.draw_pulses(rng, shape)
     noise = rng.normal(0.0, np.sqrt(0.5), (2, count)).astype(np.float32)
-    gains = np.broadcast_to(np.abs(np.asarray(gain)), f.shape)
-    scales = np.broadcast_to(np.sqrt(np.asarray(line_variance, float)), f.shape)
-    draws = np.empty((f.size, count), np.float32)
-    for row, order, g, scale in zip(draws, f, gains, scales):
-        real, imag = cycle_amplitudes((order * errors).astype(np.float32), weights)
-        row[:] = np.hypot(g * real.mean(axis=0) + scale * noise[0],
-                          g * imag.mean(axis=0) + scale * noise[1])
+    if known is not None:
+        beside = [(0, 0), (weights.before, weights.after)]
+        known = known if known.shape[1] == len(errors) else np.pad(known, beside, mode='edge')
+        errors = errors + known[np.arange(count) % len(known)].T
+    extra = [process.draw_angle(rng, trigger_cycles, u, count) for process in inside
+             if hasattr(process, 'draw_angle')]
+    gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
+             if hasattr(process, 'draw_gain')]
+    angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
+                            + sum(extra))).astype(np.float32) if not bare else errors
+    swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
+    factors = np.broadcast_to(np.abs(np.asarray(gain)), g.shape)
+    scales = np.broadcast_to(np.sqrt(np.asarray(line_variance, float)), g.shape)
+    draws = np.empty((g.size, count), np.float32)
+    for row, order, factor, scale in zip(draws, g, factors, scales):
+        if bare:
+            real, imag = cycle_amplitudes((order * errors).astype(np.float32))
+        else:
+            turned = np.float32(order) * angle
+            real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
+        row[:] = np.hypot(factor * real.mean(axis=0) + scale * noise[0],
+                          factor * imag.mean(axis=0) + scale * noise[1])
     draws.sort(axis=1)
     return SampledLaw(draws, moments.mean_square)
 
 
-def cycle_amplitudes(errors: Array, weights: PulseWeights = LINEAR) -> tuple[Array, Array]:
+def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
     """
-    Return real and imaginary part of int_0^1 exp(j 2 pi e_k(u)) du, cycles on axis 0.
+    Return real and imaginary part of int_0^1 exp(j 2 pi e_k(u)) du, cycles on axis 0, linear law.
 
     `errors` are pulse errors in cycles of the order, pulses on axis 0; the precision is theirs.
     """
-    if weights is not LINEAR:
-        u, w = (2.0 * np.pi * weights.at(_RULE[0])).astype(errors.dtype), _RULE[1]
-        angles = [u.T @ errors[k:k + weights.pulses]
-                  for k in range(len(errors) + 1 - weights.pulses)]
-        return np.array([w @ np.cos(a) for a in angles]), np.array([w @ np.sin(a) for a in angles])
     middle = np.pi * (errors[1:] + errors[:-1])
     half = np.pi * np.diff(errors, axis=0)
     half[half == 0.0] = np.finfo(half.dtype).tiny
