@@ -1,5 +1,7 @@
 """The forward model of every effect, against closed forms, quadrature and Monte Carlo."""
 
+import time
+
 import numpy as np
 import pytest
 
@@ -43,9 +45,13 @@ def declared_errors(rng, draws):
     return rng.uniform(-5e-5, 5e-5, (draws, MODEL.trigger_cycles + 1))
 
 
-def check(prediction, amplitudes):
-    """Compare mean and standard deviation with draws (draw, order) within 4.5 standard errors."""
-    count = len(amplitudes)
+def check(prediction, amplitudes, sampled=10**9):
+    """
+    Compare mean and standard deviation with draws (draw, order) within 4.5 standard errors.
+
+    `sampled` is the number of draws behind a mean that is not exact.
+    """
+    count = 1.0 / (1.0 / len(amplitudes) + 1.0 / sampled)
     spread = amplitudes.std(axis=0)
     assert prediction.mean_attenuation == pytest.approx(
         amplitudes.mean(axis=0), abs=float(4.5 * spread.max() / np.sqrt(count) + 2e-5))
@@ -153,9 +159,7 @@ def test_quantisation_is_rounding_up_to_the_clock(rng):
     assert effect.replaces_jitter(MODEL)
     prediction = predict_with(MODEL, [effect])
     drawn = average_of(np.ceil(times * clock) / clock - times)
-    # 128 paths stand for all: their own standard error on top of that of the draws
-    assert prediction.mean_attenuation == pytest.approx(
-        drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(128)))
+    check(prediction, drawn, 40_000)
 
 
 def test_clock_of_another_rate_comes_on_top():
@@ -247,7 +251,62 @@ def test_missing_pulses_are_counted_angle_that_lacks(rng):
     drawn = average_of(behind)
     prediction = predict_with(quiet, [make_effect('missing_pulses', probability=0.02)])
     assert prediction.mean_attenuation == pytest.approx(
-        drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(256)))
+        drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(len(drawn))))
+
+
+@pytest.mark.parametrize(('probability', 'ratio', 'cycles'), [
+    (0.05, 1.0, 20), (0.3, 0.4137, 5), (0.6, 2.40789, 40)])
+def test_moments_with_missing_pulses_are_exact(rng, probability, ratio, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'ratio': ratio, 'trigger_cycles': cycles,
+                             'orders': (0.5, 10.3, 40.7)})
+    lost = rng.geometric(1.0 - probability, (40_000, cycles)) - 1
+    behind = np.pad(np.cumsum(lost, axis=1), ((0, 0), (1, 0))) * ratio
+    errors = behind + model.fundamental_frequency * rng.uniform(-5e-5, 5e-5, behind.shape)
+    moments = predict_with(
+        model, [make_effect('missing_pulses', probability=probability)]).moments
+    for i, g in enumerate(model.orders):
+        e = g * errors
+        x = np.mean(np.exp(1j * np.pi * (e[:, 1:] + e[:, :-1])) * np.sinc(np.diff(e)), axis=1)
+        for value, draws in ((moments.mean[i], x), (moments.mean_square[i], np.abs(x) ** 2),
+                             (moments.pseudo_variance[i] + moments.mean[i] ** 2, x**2)):
+            assert abs(value - draws.mean()) < 4.5 * draws.std() / np.sqrt(len(draws))
+
+
+@pytest.mark.parametrize('angles', [(0.0, 0.05, -0.05), (0.02, -0.02)])
+@pytest.mark.parametrize('cycles', [1, 3, 10, 40])
+def test_geometry_has_the_law_of_drawn_averages(rng, angles, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
+    pattern = np.array(angles) / (2.0 * np.pi * 25.0)
+    index = rng.integers(0, len(angles), (20_000, 1)) + np.arange(cycles + 1)
+    drawn = average_of(rng.uniform(-5e-5, 5e-5, index.shape) + pattern[index % len(angles)])
+    prediction = predict_with(model, [make_effect('target_geometry', pulse_angles=angles)])
+    check(prediction, drawn)
+    for i in range(3):
+        assert kstest(drawn[:, i], lambda x, i=i: prediction.law.cdf(x)[i]).statistic < 0.025
+
+
+@pytest.mark.parametrize('name', ['target_geometry', 'clock_skew', 'missing_pulses',
+                                  'keyphasor_quantisation'])
+@pytest.mark.parametrize('cycles', [10_000, 1_000_000])
+def test_long_averages_with_known_errors_take_a_bounded_time_or_are_refused(name, cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles, 'orders': (2.0, 3.0)})
+    values = {**SMALL[name], 'skew': 1e-7} if name == 'clock_skew' else SMALL[name]
+    effects = [make_effect(name, **values)]
+    if cycles > 20_000 and name in ('missing_pulses', 'keyphasor_quantisation'):
+        with pytest.raises(ModelError, match=r'is 1000000 with 2 orders.* at most 20000 cycles'):
+            predict_with(model, effects)
+        return
+    begin = time.process_time()
+    prediction = predict_with(model, effects)
+    assert time.process_time() - begin < 20.0  # 2 s on an idle machine
+    assert np.all((prediction.mean_attenuation > 0.0) & (prediction.mean_attenuation < 1.0))
+
+
+def test_known_errors_of_too_many_orders_and_cycles_are_refused():
+    model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': 10**6,
+                             'orders': tuple(np.arange(1.0, 65.0))})
+    with pytest.raises(ModelError, match=r'is 1000000 with 64 orders.* predict fewer'):
+        predict_with(model, [make_effect('clock_skew', skew=1e-7)])
 
 
 def test_interpolation_loss_is_the_gain_of_the_interpolator():

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
+from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 if TYPE_CHECKING:
     from sa_jitter_ros.effects.evidence import Evidence, Finding
 
 Array = NDArray[Any]
+
+_MOST_ERRORS = 4_000_000  # of pulses in all scenarios
 
 
 @dataclass(frozen=True)
@@ -98,6 +101,11 @@ def mean_period(times: Array, missing: Array | None) -> float:
     return float((times[-1] - times[0]) / (len(times) - 1 + lost))
 
 
+def most_scenarios(model: DeclaredModel, wanted: int) -> int:
+    """Return how many scenarios of a model's averages to list: fewer where averages are long."""
+    return int(np.clip(_MOST_ERRORS // model.trigger_cycles, 1, wanted))
+
+
 class Effect:
     """
     An effect that does nothing: the base of all.
@@ -143,6 +151,15 @@ class Effect:
         They are what is known of the pulses up to a few numbers that nobody knows in advance. None
         where nothing is known, or all errors are 0.
         """
+        return None
+
+    def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array | None:
+        """Return random scenarios (count, N_t + 1) in s where no few hold all, None elsewhere."""
+        return None
+
+    def exact_moments(self, model: DeclaredModel, processes: Sequence[AngleErrorProcess]
+                      ) -> AverageMoments | None:
+        """Return the moments over all scenarios with random `processes`, where they are known."""
         return None
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:

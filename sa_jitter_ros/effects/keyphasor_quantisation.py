@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.effect import Array, Effect, most_scenarios, parameter, Pulses
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
@@ -37,12 +37,18 @@ class KeyphasorQuantisation(Effect):
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the errors for evenly spread phases of the first pulse on the grid."""
+        return self.drawn_scenarios(model, most_scenarios(model, _PHASES))
+
+    def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array:
+        """Return the errors for as many evenly spread phases."""
         rng = np.random.default_rng(_SEED)
-        periods = model.trigger_period + self.period_std * rng.standard_normal(
-            (_PHASES, model.trigger_cycles))
-        ticks = self.clock_rate * np.concatenate(
-            (np.zeros((_PHASES, 1)), np.cumsum(periods, axis=1)), axis=1)
-        ticks += (np.arange(_PHASES)[:, None] + 0.5) / _PHASES
+        ticks = np.zeros((count, model.trigger_cycles + 1))
+        ticks[:, 1:] = model.trigger_period
+        if self.period_std:
+            ticks[:, 1:] += self.period_std * rng.standard_normal((count, model.trigger_cycles))
+        np.cumsum(ticks, axis=1, out=ticks)
+        ticks *= self.clock_rate
+        ticks += (rng.permutation(count)[:, None] + 0.5) / count
         return np.asarray((np.ceil(ticks) - ticks - 0.5) / self.clock_rate)
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:

@@ -1,11 +1,16 @@
 """Missing pulses that nobody repairs: from each one on the angle is short of a trigger cycle."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, mean_period, parameter, Pulses
+from sa_jitter_ros.effects.effect import (
+    Array, Effect, mean_period, most_scenarios, parameter, Pulses)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.loss_moments import loss_moments
+from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
+from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _SCENARIOS, _SEED = 256, 4
@@ -33,10 +38,21 @@ class MissingPulses(Effect):
         """Return how far the counted angle is behind, as a delay, for some draws of losses."""
         if self.probability == 0.0:
             return None
+        return self.drawn_scenarios(model, most_scenarios(model, _SCENARIOS))
+
+    def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array:
+        """Return the delays for as many draws of losses."""
         rng = np.random.default_rng(_SEED)
-        lost = rng.geometric(1.0 - self.probability, (_SCENARIOS, model.trigger_cycles)) - 1
+        lost = rng.geometric(1.0 - self.probability, (count, model.trigger_cycles)) - 1
         return np.asarray(model.trigger_period * np.concatenate(
-            (np.zeros((_SCENARIOS, 1)), np.cumsum(lost, axis=1)), axis=1))
+            (np.zeros((count, 1)), np.cumsum(lost, axis=1)), axis=1))
+
+    def exact_moments(self, model: DeclaredModel, processes: Sequence[AngleErrorProcess]
+                      ) -> AverageMoments:
+        """Return the moments over all losses."""
+        orders = np.asarray(model.orders)
+        return loss_moments(orders, orders * model.cycle_length, self.probability, processes,
+                            model.trigger_cycles)
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
         """Return how far the counted angle is behind in the average at hand."""

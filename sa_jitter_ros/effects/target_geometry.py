@@ -5,7 +5,7 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
+from sa_jitter_ros.effects.effect import Array, Effect, most_scenarios, parameter, Pulses
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
@@ -36,7 +36,8 @@ class TargetGeometry(Effect):
         """Return the errors for every mark that an average may begin with."""
         if not any(self.pulse_angles):
             return None
-        first = np.arange(len(self.pulse_angles))[:, None]
+        kept = most_scenarios(model, len(self.pulse_angles))
+        first = (np.arange(kept) * len(self.pulse_angles) // kept)[:, None]
         return self._at(model, first + np.arange(model.trigger_cycles + 1))
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:

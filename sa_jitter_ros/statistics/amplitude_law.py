@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.statistics.angle_error import unit_nodes
 from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.sampled_law import require_probabilities
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
 Array = NDArray[Any]
 
@@ -30,6 +30,7 @@ _HERMITE_PAIRS = (np.multiply.outer(_HERMITE_WEIGHTS, _HERMITE_WEIGHTS)
                   / _HERMITE_WEIGHTS.sum() ** 2)
 _UNIT, _UNIT_WEIGHTS = unit_nodes(64)
 _MAXIMAL_SKEW = 2.0
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _ROOT_STEPS = 60
 _ROOT_TOLERANCE = 1e-9  # of probability
 
@@ -105,6 +106,14 @@ class AmplitudeLaw:
         """
         p, low, high = quantile_bracket(self.mean, self.variance, probability)
         return increasing_root(lambda y: self.cdf(y) - p, low, high)
+
+    def spread(self, count: int) -> Array:
+        """Return evenly spread, equally likely values of |X|, shape (orders, count)."""
+        index = np.arange(count)  # a lattice of the golden ratio
+        z = ndtri(np.array([(index + 0.5) / count, (0.5 + index * _GOLDEN) % 1.0]))
+        across = self.mean_across[:, None] + self.std_across[:, None] * z[0]
+        along = self.std_along[:, None] * _lopsided(z[1], self.skew[:, None])
+        return np.asarray(np.hypot(self._ridge(across) + along, across))
 
     def _rows(self, mask: Array) -> 'AmplitudeLaw':
         """Return the law of some of the orders."""

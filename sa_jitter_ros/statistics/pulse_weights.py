@@ -52,11 +52,16 @@ class PulseWeights:
         `errors` (..., n) are those of all pulses that the law reads, n = cycles - 1 + pulses, or
         of the average's own, n = cycles + 1: then those beside err as the first and the last one.
         """
-        if errors.shape[-1] == cycles + 1:
-            beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
-            errors = np.pad(errors, beside, mode='edge')
-        windows = np.lib.stride_tricks.sliding_window_view(errors, self.pulses, axis=-1)
+        windows = np.lib.stride_tricks.sliding_window_view(
+            self.padded(errors, cycles), self.pulses, axis=-1)
         return np.asarray(windows @ self.at(u))
+
+    def padded(self, errors: Array, cycles: int) -> Array:
+        """Return the errors (..., n) of all pulses that the law reads, see `path`."""
+        if errors.shape[-1] != cycles + 1:
+            return errors
+        beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
+        return np.pad(errors, beside, mode='edge')
 
     def covariance(self, autocovariance: Callable[[Array], Array]) -> Covariance:
         """Return the covariance of the angle for pulses with Cov[eps_k, eps_{k+i}] at lag i."""

@@ -5,8 +5,9 @@ The draws are the same for every order and every call (fixed seed), so a predict
 of its model. The mean square is not sampled: it is exact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,14 @@ from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.pulse_weights import LINEAR, PulseWeights
 
 Array = NDArray[Any]
+#: ``known(count)``: pulse errors (count, pulse) in fundamental cycles of as many averages.
+KnownErrors = Callable[[int], Array]
 
 _SEED = 20190215
 _BUDGET = 3_000_000  # phasors in one law
 _FEWEST, _MOST = 4096, 65536
-_WORK, _COARSEST = 50_000_000, 1024  # phasors at most, about a second; fewest draws then
+_COARSEST = 512  # fewest draws of long averages
+LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
 _MOST_POINTS = 1000  # of a process drawn at once
 _LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
 
@@ -70,7 +74,9 @@ def can_be_sampled(
     """Tell whether averages of all processes can be drawn, and in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
     points = trigger_cycles * (1 if pulsed else _LINEAR_RULE[0].size)
-    return points <= _MOST_POINTS and points * orders * _COARSEST <= _WORK and all(
+    drawn = _MOST_POINTS if any(hasattr(item, 'draw_angle') or hasattr(item, 'draw_gain')
+                                for item in processes) else math.inf
+    return points <= min(drawn, LONGEST) and points * orders <= MOST_PHASORS and all(
         any(hasattr(process, f'draw_{what}') for what in ('pulses', 'angle', 'gain'))
         for process in processes)
 
@@ -78,15 +84,30 @@ def can_be_sampled(
 def sampled_law(
     orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, moments: AverageMoments, *,
     gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
-    known: Array | None = None,
+    known: KnownErrors | None = None,
 ) -> SampledLaw:
     """
-    Return the law of the average of `trigger_cycles` cycles.
+    Return the law of the average of `trigger_cycles` cycles; parameters as of `drawn_averages`.
 
-    `processes` `can_be_sampled`; `moments` are the exact ones with gain and noise; `line_variance`
-    is E|n|^2 of the noise; `weights` are those of the angle law. `known` (scenario, n) are pulse
-    errors in fundamental cycles that come on top, in equally likely scenarios: of all
-    N_t - 1 + weights.pulses pulses or of the average's own N_t + 1.
+    `moments` are the exact ones with gain and noise.
+    """
+    draws = drawn_averages(orders, processes, trigger_cycles, gain=gain,
+                           line_variance=line_variance, weights=weights, known=known)
+    return SampledLaw(np.sort(np.abs(draws), axis=1), moments.mean_square)
+
+
+def drawn_averages(
+    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
+    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
+    known: KnownErrors | None = None,
+) -> Array:
+    """
+    Return complex averages (order, draw) of `trigger_cycles` cycles, single precision.
+
+    `processes` `can_be_sampled`; `line_variance` is E|n|^2 of the noise; `weights` are those of
+    the angle law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come
+    on top of the random ones, of all N_t - 1 + weights.pulses pulses or of the average's
+    own N_t + 1.
     """
     g = np.asarray(orders, float)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
@@ -96,7 +117,8 @@ def sampled_law(
     w = w.astype(np.float32)
     phasors = g.size * (trigger_cycles + 3) * (1 if bare else u.size)
     count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
-    count = max(_COARSEST, min(count, _WORK // phasors))
+    most = min(MOST_PHASORS, LONGEST * g.size)
+    count = max(_COARSEST, min(count, _COARSEST * most // phasors))
     rng = np.random.default_rng(_SEED)
     shape = (trigger_cycles + weights.pulses - 1, count)
     errors: Array = np.zeros(shape)
@@ -104,9 +126,7 @@ def sampled_law(
         errors = errors + process.draw_pulses(rng, shape)
     noise = rng.normal(0.0, np.sqrt(0.5), (2, count)).astype(np.float32)
     if known is not None:
-        beside = [(0, 0), (weights.before, weights.after)]
-        known = known if known.shape[1] == len(errors) else np.pad(known, beside, mode='edge')
-        errors = errors + known[np.arange(count) % len(known)].T
+        errors = errors + weights.padded(known(count), trigger_cycles).T
     extra = [process.draw_angle(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_angle')]
     gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
@@ -114,19 +134,25 @@ def sampled_law(
     angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
                             + sum(extra))).astype(np.float32) if not bare else errors
     swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
-    factors = np.broadcast_to(np.abs(np.asarray(gain)), g.shape)
+    factors = np.broadcast_to(np.asarray(gain), g.shape)
     scales = np.broadcast_to(np.sqrt(np.asarray(line_variance, float)), g.shape)
-    draws = np.empty((g.size, count), np.float32)
+    noise = noise[0] + 1j * noise[1]
+    draws = np.empty((g.size, count), np.complex64)
     for row, order, factor, scale in zip(draws, g, factors, scales):
         if bare:
             real, imag = cycle_amplitudes((order * errors).astype(np.float32))
         else:
             turned = np.float32(order) * angle
             real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
-        row[:] = np.hypot(factor * real.mean(axis=0) + scale * noise[0],
-                          factor * imag.mean(axis=0) + scale * noise[1])
-    draws.sort(axis=1)
-    return SampledLaw(draws, moments.mean_square)
+        row[:] = factor * (real.mean(axis=0) + 1j * imag.mean(axis=0)) + scale * noise
+    return draws
+
+
+def moments_of(draws: Array) -> AverageMoments:
+    """Return the moments of complex draws (order, draw)."""
+    mean = draws.mean(axis=1, dtype=complex)
+    off = draws - mean[:, None]
+    return AverageMoments(mean, np.mean(np.abs(off) ** 2, axis=1), np.mean(off**2, axis=1))
 
 
 def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
