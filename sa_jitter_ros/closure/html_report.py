@@ -79,6 +79,7 @@ def html(content: Mapping[str, Json], figures: Sequence[Illustration],
     parts = [
         '<h1>Measured against predicted attenuation</h1>',
         f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
+        *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
         *_effects(content['missing_effects']),
         '<h2>Error of held-out acquisitions</h2>', _error_table(content),
         '<h2>What the residual changes with</h2>', _dependence_table(content['dependence']),

@@ -145,7 +145,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     if not starts:
         raise RecordingError(
             f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
-            'trigger cycles inside the vibration: lower trigger_cycles or record longer')
+            'trigger cycles inside the vibration: lower trigger_cycles or record longer'
+            + ''.join(f' ({remark})' for remark in pulses.remarks))
     rows = tuple(range(samples.shape[1]))
     orders = np.array(sources if len(sources) else [
         *once, *other_sources(reader, pulses, model, starts, rows)])
@@ -191,7 +192,10 @@ def together(observations: Sequence[Observation]) -> Observation:
                              'machines or loads; run the loop on each by itself')
     pulses = TriggerPulses(
         np.concatenate([item.pulses.times for item in observations]),
-        np.concatenate([item.pulses.missing for item in observations]), None)
+        np.concatenate([item.pulses.missing for item in observations]), None,
+        np.concatenate([item.pulses.doubtful for item in observations]),
+        tuple(f'{item.name or "a recording"}: {remark}' for item in observations
+              for remark in item.pulses.remarks))
     return replace(first, acquisitions=tuple(
         acquisition for item in observations for acquisition in item.acquisitions),
         pulses=pulses if len(observations) > 1 else first.pulses)
@@ -215,15 +219,16 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
 
 
 def _starts(pulses: TriggerPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
-    """Return the first pulse of every acquisition of which vibration and pulses are there."""
+    """Return the first pulse of every acquisition whose vibration and pulses can be believed."""
     times, reference = pulses.times, pulses.reference
     found, first = [], law.before
     while first + cycles + law.after < times.size:
         part = slice(first, first + cycles + 1)
-        whole = reader.inside(times[part])
+        read = slice(first - law.before, first + cycles + 1 + law.after)
+        whole = reader.inside(times[part]) and not pulses.doubtful[read].any()
         if reference is not None:
-            read = reference[first - law.before:first + cycles + 1 + law.after]
-            whole = whole and bool(np.all(np.isfinite(read))) and reader.inside(reference[part])
+            whole = (whole and bool(np.all(np.isfinite(reference[read])))
+                     and reader.inside(reference[part]))
         if whole:
             found.append(first)
             first += cycles

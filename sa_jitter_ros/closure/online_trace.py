@@ -126,7 +126,8 @@ def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observati
     return Observation(
         replace(model, trigger_speed=speed, orders=tuple(orders.tolist())), tuple(found), orders,
         orders, tuple(f'channel {k}' for k in range(len(averages[0].raw))),
-        TriggerPulses(record, np.zeros(record.size - 1, np.int64), None), model.sample_rate, False)
+        TriggerPulses(record, np.zeros(record.size - 1, np.int64), None,
+                      np.zeros(record.size, np.bool_)), model.sample_rate, False)
 
 
 def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:

@@ -31,6 +31,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'declared': {**asdict(observation.model), 'effects': {
             effect.name: effect.values for effect in trace.declared}},
         'recordings': list(recordings),
+        'remarks': observation.pulses.remarks,
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
         'against': 'reference keyphasor' if observation.against_reference else 'vibration',
@@ -60,7 +61,7 @@ def errors(item: Residual) -> Mapping[str, Json]:
 def summary(content: Mapping[str, Json]) -> str:
     """Return the report in a few lines of text."""
     before, after = content['error_before'], content['error_after']
-    text = [f'verdict: {content["verdict"]}']
+    text = [f'verdict: {content["verdict"]}', *content['remarks']]
     for effect in content['missing_effects']:
         values = ', '.join(f'{name} = {_number(item["value"])} {item["unit"]}'
                            for name, item in effect['parameters'].items())

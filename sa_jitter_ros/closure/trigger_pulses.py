@@ -12,9 +12,13 @@ from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
 
 _SPEED_TOLERANCE = 0.1
 _NEIGHBOURHOOD = 15
+# Two intervals that last less than this part of what two usually do hold a pulse too many.
+_TOO_SHORT = 0.75
+_MOST_SPURIOUS = 0.05
 
 
 @dataclass(frozen=True)
@@ -24,17 +28,20 @@ class TriggerPulses:
 
     `times` (n,) in s; `missing` (n - 1,) is how many trigger pulses lack in each interval;
     `reference` (n,) are the times of the same pulses on a better keyphasor (NaN where it has
-    none), None without one.
+    none), None without one. `doubtful` (n,) pulses stand beside a spurious one that was dropped,
+    and may be the spurious one themselves; `remarks` say what was done to the pulses.
     """
 
     times: FloatArray
     missing: IntArray
     reference: FloatArray | None
+    doubtful: BoolArray
+    remarks: tuple[str, ...] = ()
 
 
 def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
     """
-    Return the trigger pulses of a recording, unrepaired.
+    Return the trigger pulses of a recording: spurious ones are dropped, missing ones stay missing.
 
     Raises ModelError where the recording contradicts the declared model and RecordingError where
     it has no usable pulses.
@@ -46,13 +53,17 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
         raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
                          f'the recording says {recording.pulses_per_revolution}')
     step = model.pulses_per_trigger or model.pulses_per_revolution
-    times = _pulse_times(recording)
+    measured = _pulse_times(recording)
+    times, doubtful = without_spurious(measured)
     missing = missing_pulses(times)
     better = recording.reference_pulse_times
+    if better is not None:
+        better, _ = without_spurious(better)
     reference = None if better is None or better.size < 0.6 * times.size else _matched(
         times, missing, better)
+    spurious = measured.size - times.size
     chosen, missing = _every(missing, step)
-    times = times[chosen]
+    times, doubtful = times[chosen], doubtful[chosen]
     if reference is not None:
         reference = reference[chosen]
     elif better is not None:  # one pulse a trigger cycle
@@ -65,7 +76,38 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {speed:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
-    return TriggerPulses(times, missing, reference)
+    remarks = () if not spurious else (
+        f'{spurious} of {measured.size} pulses are spurious (double): they were dropped, and the '
+        f'trigger cycles of the {np.count_nonzero(doubtful)} trigger pulses beside them left out',)
+    return TriggerPulses(times, missing, reference, doubtful, remarks)
+
+
+def without_spurious(times: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """
+    Return the pulses (n,) without spurious ones, and which of them stood beside one.
+
+    A pulse is spurious (bounce, glitch) where the intervals on both sides of it together are one
+    interval rather than two; of neighbours of which that holds it is the one for which they are
+    so best. Raises RecordingError where more than 5 % are spurious.
+    """
+    kept = np.ones(times.size, np.bool_)
+    doubtful = np.zeros(times.size, np.bool_)
+    while kept.sum() > _NEIGHBOURHOOD:
+        index = np.flatnonzero(kept)
+        around = times[index[2:]] - times[index[:-2]]  # of pulse 1, 2, ...
+        share = around / _usual(around)
+        short = np.flatnonzero(share < _TOO_SHORT)
+        if short.size == 0:
+            break
+        for cluster in np.split(short, np.flatnonzero(np.diff(short) > 1) + 1):
+            best = cluster[np.argmin(np.abs(share[cluster] - 0.5))]
+            kept[index[best + 1]] = False
+            doubtful[index[best:best + 3]] = True
+        if kept.sum() < (1.0 - _MOST_SPURIOUS) * times.size:
+            raise RecordingError(
+                f'{times.size - kept.sum()} of {times.size} pulses are spurious, more than '
+                f'{_MOST_SPURIOUS:.0%}: give the trigger more hysteresis or drop double pulses')
+    return times[kept], doubtful[kept]
 
 
 def missing_pulses(times: FloatArray) -> IntArray:
@@ -75,10 +117,15 @@ def missing_pulses(times: FloatArray) -> IntArray:
         return np.zeros(0, np.int64)
     if np.any(intervals <= 0.0):
         raise RecordingError('pulse times do not increase: sort them and drop repeated ones')
+    return np.asarray(np.maximum(np.rint(intervals / _usual(intervals)) - 1.0, 0.0), np.int64)
+
+
+def _usual(durations: FloatArray) -> FloatArray:
+    """Return the median of each and those around it (n,)."""
     half = _NEIGHBOURHOOD // 2
-    around = np.pad(intervals, half, mode='symmetric' if intervals.size >= half else 'edge')
-    usual = np.median(np.lib.stride_tricks.sliding_window_view(around, 2 * half + 1), axis=1)
-    return np.asarray(np.maximum(np.rint(intervals / usual) - 1.0, 0.0), np.int64)
+    around = np.pad(durations, half, mode='symmetric' if durations.size >= half else 'edge')
+    return np.asarray(np.median(
+        np.lib.stride_tricks.sliding_window_view(around, 2 * half + 1), axis=1))
 
 
 def with_added_jitter(recording: Recording, law: PulseErrorDistribution, *, seed: int

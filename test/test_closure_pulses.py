@@ -1,0 +1,72 @@
+"""The pulses that the loop works with: spurious, lost, of a flat tach, declared otherwise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sa_jitter_ros.closure.observation import observe
+from sa_jitter_ros.closure.report import report, summary
+from sa_jitter_ros.closure.trace import trace
+from sa_jitter_ros.closure.trigger_pulses import without_spurious
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, make_effects, mesh
+from sa_jitter_ros.statistics.prediction import DeclaredModel
+
+RATE, SPEED, CYCLES, NOISE = 5000.0, 25.0, 20, 0.05
+MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                      orders=(8.0, 16.0, 24.0), noise_std=NOISE, sample_rate=RATE)
+
+
+def simulated(*, acquisitions=12, seed=4, **effects):
+    """Return a machine of the declared jitter and noise, and of effects that nobody declares."""
+    machine = Gearbox(
+        mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6), channel_gains=(1.0, 0.7), seed=seed), RATE,
+        speed=((0.0, SPEED),), seed=seed,
+        effects=(AdditiveNoise(NOISE), DeclaredJitter('uniform', 1.0 / np.sqrt(12.0) / 5000.0),
+                 *make_effects(effects)))
+    seconds = (acquisitions * CYCLES + 3) / SPEED
+    return Recording(ArraySource(machine.vibration(0, round(seconds * RATE))), RATE,
+                     pulse_times=machine.pulses(0.0, seconds).times)
+
+
+def traced(recording, model=MODEL):
+    """Trace a recording."""
+    return trace([observe(recording, model)], [recording])
+
+
+@pytest.mark.parametrize('marks', [1, 4])
+def test_spurious_pulses_are_dropped_and_their_cycles_left_out(rng, marks):
+    """Wherever in its interval, of a target with uneven marks and beside lost pulses."""
+    late = np.resize([0.0, 0.1, -0.08, 0.04][:marks], 1200)
+    true = (np.arange(1200) + late + rng.normal(0.0, 0.01, 1200)) * 0.04 / marks
+    true = np.delete(true, [300, 700])
+    place = rng.choice(np.arange(10, 1180, 12), 30, replace=False)
+    extra = true[place] + rng.uniform(0.03, 0.97, 30) * np.diff(true)[place]
+    given = np.sort(np.append(true, extra))
+    kept, doubtful = without_spurious(given)
+    wrong = np.setdiff1d(kept, true)
+    assert kept.size == true.size
+    assert np.all(np.isin(wrong, kept[doubtful]))  # beside a pulse it can hardly be told from
+    assert wrong.size <= 3
+    assert doubtful.sum() == 60
+    alone, none = without_spurious(true)
+    assert alone.size == true.size
+    assert not none.any()
+    with pytest.raises(RecordingError, match='pulses are spurious, more than 5%'):
+        without_spurious(np.sort(np.append(true, true[10::12] + 0.01 / marks)))
+
+
+def test_double_pulses_are_no_effect():
+    """They take acquisitions, not the verdict."""
+    recording = simulated(acquisitions=18)
+    times = recording.pulse_times
+    double = np.sort(np.append(times, times[[60, 200, 350]] + np.array([0.013, 0.002, 0.031])))
+    found = traced(replace(recording, pulse_times=double))
+    content = report(found)
+    assert found.verdict == 'none'
+    assert content['missing_effects'] == []
+    assert len(found.observation.acquisitions) >= 13
+    (remark,) = content['remarks']
+    assert remark.startswith(f'3 of {double.size} pulses are spurious')
+    assert remark in summary(content)
