@@ -70,3 +70,14 @@ def test_double_pulses_are_no_effect():
     (remark,) = content['remarks']
     assert remark.startswith(f'3 of {double.size} pulses are spurious')
     assert remark in summary(content)
+
+
+@pytest.mark.parametrize('level', [0.0, 2.5])
+def test_flat_tach_is_refused(level):
+    flat = replace(simulated(acquisitions=2), pulse_times=None, tach_rate=5000.0,
+                   tach=ArraySource(np.full((1, 8000), level)))
+    with pytest.raises(RecordingError, match='0 keyphasor pulses, at least 3'):
+        observe(flat, MODEL)
+    few = replace(simulated(acquisitions=2), pulse_times=np.array([0.1, 0.14, 0.18]))
+    with pytest.raises(RecordingError, match='1 trigger pulses of 3'):
+        observe(few, replace(MODEL, pulses_per_revolution=4))

@@ -19,6 +19,7 @@ _NEIGHBOURHOOD = 15
 # Two intervals that last less than this part of what two usually do hold a pulse too many.
 _TOO_SHORT = 0.75
 _MOST_SPURIOUS = 0.05
+_FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,9 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
                          f'the recording says {recording.pulses_per_revolution}')
     step = model.pulses_per_trigger or model.pulses_per_revolution
     measured = _pulse_times(recording)
+    if measured.size < _FEWEST:
+        raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
+                             'look at the tach, its level may never cross the threshold')
     times, doubtful = without_spurious(measured)
     missing = missing_pulses(times)
     better = recording.reference_pulse_times
@@ -68,9 +72,9 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
         reference = reference[chosen]
     elif better is not None:  # one pulse a trigger cycle
         reference = _matched(times, missing, better)
-    if times.size < 3:
-        raise RecordingError(f'{times.size} trigger pulses: a trigger cycle needs two, the loop '
-                             'several acquisitions')
+    if times.size < _FEWEST or not np.any(missing == 0):
+        raise RecordingError(f'{times.size} trigger pulses of {measured.size} keyphasor pulses: '
+                             f'the loop needs {_FEWEST} in a row; record longer')
     speed = model.trigger_revolutions / float(np.median(np.diff(times)[missing == 0]))
     if abs(speed / model.trigger_speed - 1.0) > _SPEED_TOLERANCE:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
