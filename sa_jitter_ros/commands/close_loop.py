@@ -13,23 +13,15 @@ import os
 from pathlib import Path
 import sys
 import tempfile
-from typing import NoReturn
 
 from sa_jitter_ros.closure.html_report import report_files
 from sa_jitter_ros.closure.observation import Observation, observe
 from sa_jitter_ros.closure.report import summary
 from sa_jitter_ros.closure.trace import Trace, trace
 from sa_jitter_ros.commands.declaration import read_declaration
+from sa_jitter_ros.commands.parser import Parser
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.recordings import open_recording
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print what is wrong and exit with status 2."""
-        self.exit(2, f'{self.prog}: {message}\n')
 
 
 def make_parser() -> Parser:

@@ -10,11 +10,11 @@ from dataclasses import replace
 import math
 from pathlib import Path
 import sys
-from typing import NoReturn
 
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter
 import numpy as np
+from sa_jitter_ros.commands.parser import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.statistics.design import (
     assess, Assessment, design_grid, required_keyphasor_rate, required_trigger_cycles)
@@ -33,14 +33,6 @@ _ANY_RATE = 1e12  # Hz; stands for the rate until it is chosen
 _ANY_CYCLES = 100
 _STEPS = np.array([1.0, 2.0, 5.0])
 _KEPT = '#d9ead3'
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line."""
-
-    def error(self, message: str) -> NoReturn:
-        """Print what is wrong and exit with status 2."""
-        self.exit(2, f'{self.prog}: {message}\n')
 
 
 def make_parser() -> Parser:
