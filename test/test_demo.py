@@ -53,6 +53,22 @@ def test_orders_and_averages_are_chosen_from_the_recording(recording):
     assert plan.keyphasor_rate == CLOCK
 
 
+def test_trigger_cycles_are_those_of_the_recording(tmp_path):
+    time = np.arange(round(RATE * SECONDS)) / RATE
+    path = tmp_path / 'wheel.npz'
+    write_npz(path, Recording(
+        ArraySource(np.cos(2.0 * np.pi * 6.0 * SPEED * time)[None]), RATE,
+        pulse_times=np.arange(0.1, SECONDS, 0.25 / SPEED), pulses_per_revolution=4,
+        pulses_per_trigger=2, ratio=2.0))
+    plan = plan_recording(path)
+    assert plan.speed == pytest.approx(SPEED, rel=1e-6)
+    assert plan.trigger_cycles == 2.0 * SPEED * SECONDS // 8
+    assert 3.0 in plan.orders
+    nodes = demo.processes(plan)
+    for name in ('synchronous_averager', 'jitter_predictor'):
+        assert (nodes[name]['pulses_per_revolution'], nodes[name]['pulses_per_trigger']) == (4, 2)
+
+
 def test_recording_without_keyphasor_is_refused(machine, tmp_path):
     path = tmp_path / 'mute.npz'
     write_npz(path, Recording(ArraySource(machine.vibration(0, 20000)), RATE))

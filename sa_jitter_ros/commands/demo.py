@@ -5,7 +5,6 @@ Plays a recording, or a simulated gearbox without one, through tach detector, av
 predictor, and compares what comes out with what was predicted.
 """
 
-import argparse
 from collections.abc import Sequence
 import os
 from pathlib import Path
@@ -19,6 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.commands.demo_watcher import Watcher
+from sa_jitter_ros.commands.parser import Parser
 from sa_jitter_ros.errors import SaJitterError
 
 START_TIMEOUT = 30.0  # s for discovery
@@ -43,12 +43,14 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
     nodes: dict[str, dict[str, object]] = {
         'synchronous_averager': {
             'pulses_per_revolution': plan.pulses_per_revolution,
+            'pulses_per_trigger': plan.pulses_per_trigger,
             'trigger_cycles': plan.trigger_cycles, 'shaft.ratio': plan.ratio,
             'shaft.orders': plan.orders, 'correct_jitter': True,
             'keyphasor_rate': plan.keyphasor_rate},
         'jitter_predictor': {
             'keyphasor_rate': plan.keyphasor_rate, 'trigger_speed': plan.speed,
             'pulses_per_revolution': plan.pulses_per_revolution,
+            'pulses_per_trigger': plan.pulses_per_trigger,
             'trigger_cycles': plan.trigger_cycles, 'ratio': plan.ratio, 'orders': plan.orders,
             'follow_shaft_speed': True},
         plan.source: {**plan.source_parameters, 'playing': False}}
@@ -129,7 +131,7 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run the demo; 0, or 2 with one line on unusable input or output."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
                         help='.npz, .mat, .wav, .csv or rosbag2; a simulated gearbox without')

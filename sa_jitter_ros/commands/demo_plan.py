@@ -20,7 +20,6 @@ FloatArray = NDArray[np.float64]
 LOOK = 10.0  # s of a recording that are looked at before it is played
 ORDERS = 6
 AVERAGES = 8  # that a recording should give
-BLOCK = 16384
 
 
 @dataclass(frozen=True)
@@ -29,8 +28,8 @@ class Plan:
     How a source is played, averaged and predicted.
 
     `source` is the node that plays it, with `source_parameters`; `seconds` it lasts, `speed` of
-    the tach shaft and `keyphasor_rate` in Hz; `waveform` tells that pulses come from a tach
-    waveform; `note` is a remark for the user.
+    the tach shaft and `keyphasor_rate` in Hz; `pulses_per_trigger` is 0 for all of a revolution;
+    `waveform` tells that pulses come from a tach waveform; `note` is a remark for the user.
     """
 
     source: str
@@ -46,6 +45,7 @@ class Plan:
     trigger_cycles: int
     orders: tuple[float, ...]
     waveform: bool = False
+    pulses_per_trigger: int = 0
     note: str = ''
 
 
@@ -72,15 +72,13 @@ def plan_recording(path: Path, *, keyphasor_rate: float = 0.0) -> Plan:
     """
     recording = open_recording(path)
     first, pulses = _pulses(recording)
-    validator = PulseValidator(pulses_per_revolution=recording.pulses_per_revolution)
-    triggers = validator.update(pulses)
+    triggers = _validator(recording).update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
     if len(cycles) < 4:
         raise RecordingError(f'{len(pulses)} pulses give {len(cycles)} trigger cycles in '
                              f'the first {LOOK:g} s: at least 4 are needed')
     period = float(np.median(cycles))
-    revolutions = recording.vibration.samples / recording.sample_rate / period
-    trigger_cycles = int(np.clip(revolutions // AVERAGES, 2, 100))
+    trigger_cycles = int(np.clip(recording.duration / period // AVERAGES, 2, 100))
     waveform = recording.pulse_times is None and recording.tach is not None
     if keyphasor_rate and waveform:
         raise RecordingError('a tach waveform has the rate at which it was sampled: leave '
@@ -92,19 +90,30 @@ def plan_recording(path: Path, *, keyphasor_rate: float = 0.0) -> Plan:
     return Plan(
         source='recording_player',
         source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate},
-        title=path.name, seconds=recording.vibration.samples / recording.sample_rate,
+        title=path.name, seconds=recording.duration,
         channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
-        speed=1.0 / period, keyphasor_rate=rate,
+        speed=_share(recording) / period, keyphasor_rate=rate,
         pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
         trigger_cycles=trigger_cycles,
         orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
-        waveform=waveform, note=note)
+        waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0, note=note)
+
+
+def _validator(recording: Recording) -> PulseValidator:
+    return PulseValidator(pulses_per_revolution=recording.pulses_per_revolution,
+                          pulses_per_trigger=recording.pulses_per_trigger)
+
+
+def _share(recording: Recording) -> float:
+    """Revolutions of the tach shaft in a trigger cycle."""
+    return (recording.pulses_per_trigger or recording.pulses_per_revolution
+            ) / recording.pulses_per_revolution
 
 
 def _pulses(recording: Recording) -> tuple[SampleBlock, FloatArray]:
     """Vibration and pulse times of the first seconds."""
     count = round(LOOK * recording.sample_rate)
-    samples = next(recording.vibration.blocks(count))
+    samples = next(recording.blocks(count))
     block = SampleBlock(samples, recording.start_time, recording.sample_rate, 0)
     end = recording.start_time + samples.shape[1] / recording.sample_rate
     times = recording.pulse_times
@@ -115,7 +124,7 @@ def _pulses(recording: Recording) -> tuple[SampleBlock, FloatArray]:
     if recording.tach is None or recording.tach_rate is None:
         raise RecordingError('no keyphasor: neither pulse times nor a tach waveform; averaging '
                              'needs one')
-    waveform = next(recording.tach.blocks(math.ceil(LOOK * recording.tach_rate)))
+    waveform = next(recording.tach_blocks(math.ceil(LOOK * recording.tach_rate)))
     detector = KeyphasorDetector()
     found = detector.update(waveform[0], recording.start_time, recording.tach_rate)
     return block, np.concatenate((found, detector.flush()))
@@ -125,8 +134,9 @@ def _strongest_orders(recording: Recording, block: SampleBlock, pulses: FloatArr
                       trigger_cycles: int) -> tuple[float, ...]:
     """Orders that stand out most in the first average."""
     averager = StreamingAverager(
-        {'shaft': AverageSettings(cycles=recording.ratio, trigger_cycles=trigger_cycles)},
-        validator=PulseValidator(pulses_per_revolution=recording.pulses_per_revolution),
+        {'shaft': AverageSettings(cycles=recording.ratio * _share(recording),
+                                  trigger_cycles=trigger_cycles)},
+        validator=_validator(recording),
         timeline=VibrationTimeline(buffer_seconds=2.0 * LOOK))
     averages = averager.add_pulses(pulses) + averager.add_samples(block)
     if not averages:
