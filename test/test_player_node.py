@@ -13,7 +13,7 @@ from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.nodes import messages, recording_player
 from sa_jitter_ros.nodes.playback import Pacer
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
-from sa_jitter_ros.recordings import ArraySource, Recording, write_npz
+from sa_jitter_ros.recordings import ArraySource, Recording, write_bag, write_npz
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
@@ -140,6 +140,17 @@ def test_pulse_arrays_reach_beyond_2038(bench, recording):
     player.play()
     np.testing.assert_allclose(player.pulses, late.pulse_times[late.pulse_times < 3e9 + 2.0],
                                rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(('chosen', 'played'), [('', True), ('kp', True), ('other', False)])
+def test_keyphasor_of_a_bag_is_chosen(
+        ros_context, executor_for, tmp_path, recording, chosen, played):
+    pytest.importorskip('rosbags')
+    write_bag(tmp_path / 'bag', recording, keyphasor='kp')
+    player = Bench(ros_context, executor_for, tmp_path / 'bag', tach='pulses',
+                   recorded_keyphasor=chosen)
+    player.play()
+    assert len(player.pulses) == played * np.count_nonzero(recording.pulse_times < 7.0)
 
 
 def test_pulses_rounded_up_to_a_clock(bench, recording):

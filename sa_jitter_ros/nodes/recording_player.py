@@ -24,6 +24,8 @@ PARAMETERS = (
     Parameter('keyphasor_rate', 0.0, 'clock to which pulse times are rounded up, as if the '
               'keyphasor had been sampled; 0 for times as recorded', unit='Hz', minimum=0.0,
               read_only=True),
+    Parameter('recorded_keyphasor', '', 'which keyphasor to play, of a bag that holds several; '
+              'empty for the first', read_only=True),
     Parameter('acquisition', 0, 'which acquisition, of a file that holds several', minimum=0,
               read_only=True),
     Parameter('sample_rate', 0.0, 'sampling rate where the file does not say it, else 0',
@@ -47,7 +49,7 @@ class RecordingPlayer(PlaybackNode):
                                  'recording:=rig.npz')
         self._recording = recording = open_recording(
             values['recording'], acquisition=values['acquisition'],
-            sample_rate=values['sample_rate'] or None,
+            sample_rate=values['sample_rate'] or None, keyphasor=values['recorded_keyphasor'],
             channel_map=ChannelMap(tuple(values['vibration_channels']), values['tach_channel'],
                                    values['time_column']))
         for remark in recording.remarks:
