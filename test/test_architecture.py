@@ -18,7 +18,7 @@ CORE = {
     'averaging': SCIENCE | {'angle', 'errors'},
     'statistics': SCIENCE | {'errors'},
     'effects': SCIENCE | {'angle', 'errors', 'statistics'},
-    'recordings': SCIENCE | {'errors', 'rosbags'},
+    'recordings': SCIENCE | {'angle', 'errors', 'rosbags'},
     'simulation': SCIENCE | {'errors'},
     'reproduction': SCIENCE | {
         'angle', 'averaging', 'errors', 'matplotlib', 'simulation', 'statistics'},

@@ -154,7 +154,24 @@ def test_rows_with_a_tach_each_are_acquisitions(rng, tmp_path):
 def test_a_revolution_counter_becomes_pulses(tmp_path):
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE, start_time=2.0,
                 tach_count=np.array([7, 7, 8, 8, 8, 10, 10]), tach_rate=10.0)
-    np.testing.assert_allclose(open_recording(path).pulse_times, [2.2, 2.5])
+    np.testing.assert_allclose(open_recording(path).pulse_times, [2.2, 2.45, 2.5])
+
+
+@pytest.mark.parametrize('kind', [np.uint8, np.int64, np.float64])
+def test_a_revolution_counter_that_is_reset_goes_on(tmp_path, kind):
+    path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
+                tach_count=np.array([254, 255, 0, 1, 1, 2]).astype(kind), tach_rate=10.0)
+    np.testing.assert_allclose(open_recording(path).pulse_times, [0.1, 0.3, 0.5])
+
+
+@pytest.mark.parametrize(('counts', 'message'), [
+    ([0.0, 0.5, 1.0], 'fractions'), ([0.0, np.nan], 'NaN'), ([0.0, 1e17], '2.53'),
+    ([0, 2**40], 'counts 1099511627776 pulses: at most'), ([[0, 1], [0, 1]], 'one row')])
+def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, message):
+    path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
+                tach_count=np.array(counts), tach_rate=10.0)
+    with pytest.raises(RecordingError, match=message):
+        open_recording(path)
 
 
 @pytest.mark.parametrize(('fields', 'message'), [

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.angle.keyphasor import counter_pulses
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
 
@@ -34,7 +35,7 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
 
     A two-dimensional `tach` has a row for every row of `vibration`: then each row is a separate
     acquisition, and `acquisition` picks one. `tach_count`, a revolution counter sampled at
-    `tach_rate`, stands for pulses at the samples where it increases.
+    `tach_rate`, stands for as many pulses as it increases by.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     if 'tach_count' in names and tach is None and 'pulse_times' not in names:
         if tach_rate is None or not tach_rate > 0:
             raise RecordingError('tach_count without a positive tach_rate: add its rate in Hz')
-        pulse_times['pulse_times'] = start_time + _increments(load('tach_count')) / tach_rate
+        pulse_times['pulse_times'] = _counted_pulses(load('tach_count'), start_time, tach_rate)
     return Recording(
         ArraySource(vibration), number('sample_rate', 0.0), channel_names=labels, units=units,
         start_time=start_time, tach=None if tach is None else ArraySource(tach),
@@ -148,8 +149,16 @@ def _strings(name: str, array: RawArray) -> tuple[str, ...]:
     return tuple(item.strip() for item in array.reshape(-1).tolist())
 
 
-def _increments(counter: RawArray) -> FloatArray:
+def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatArray:
+    """Pulse times (s) of a revolution counter; where it falls it was reset."""
     values = _samples('tach_count', counter)
     if len(values) != 1:
         raise RecordingError(f'tach_count of shape {counter.shape}: must be one row')
-    return np.flatnonzero(values[0, 1:] > values[0, :-1]).astype(np.float64) + 1
+    counts = values[0].astype(np.float64)
+    if not np.all((counts == np.floor(counts)) & (abs(counts) < 2.0**53)):
+        raise RecordingError('tach_count holds fractions, NaN or more than 2^53: must be counts')
+    rises = np.maximum(np.diff(counts), 0.0)
+    if rises.sum() > MAX_PULSES:
+        raise RecordingError(f'tach_count counts {rises.sum():.0f} pulses: at most {MAX_PULSES}')
+    return counter_pulses(np.append(0.0, np.cumsum(rises)).astype(np.int64),
+                          start_time=start_time, sample_rate=rate)
