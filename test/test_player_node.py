@@ -40,14 +40,12 @@ class Bench:
             Parameter(name, value=value) for name, value in values.items()])
         self.bench = Node('bench', context=context)
         self.blocks, self.waveform, self.pulses, self.status = [], [], [], []
-        decoder = messages.SampleDecoder(
-            'std_msgs/Float64MultiArray' if vibration is Float64MultiArray
-            else 'std_msgs/Float32MultiArray', sample_rate=RATE, start_time=5.0)
-        other = messages.SampleDecoder('std_msgs/Float64MultiArray', sample_rate=0.0)
+        kind = next(name for name, item in messages.SAMPLE_TYPES.items() if item is vibration)
+        decoder = messages.SampleDecoder(kind, sample_rate=RATE, start_time=5.0)
+        other = messages.SampleDecoder(kind, sample_rate=3 * RATE, start_time=5.0)
         for kind, topic, callback in (
                 (vibration, 'vibration', lambda m: self.blocks.append(decoder.decode(m))),
-                (Float64MultiArray, 'tach_waveform',
-                 lambda m: self.waveform.append(other.decode(m))),
+                (vibration, 'tach_waveform', lambda m: self.waveform.append(other.decode(m))),
                 (pulse, 'tach_pulse', self._on_pulse),
                 (DiagnosticArray, '/diagnostics', lambda m: self.status.append(m.status[0]))):
             self.bench.create_subscription(kind, topic, callback, BENCH_QOS)
@@ -107,6 +105,17 @@ def test_waveform_and_pulses_together(bench, recording):
     assert player.waveform[7].start_time == pytest.approx(
         5.0 + player.waveform[7].index / (3 * RATE), abs=1e-12)
     assert len(player.pulses) > 40
+
+
+def test_waveform_has_the_type_of_the_vibration(bench, recording):
+    player = bench(vibration=Float32MultiArray, vibration_type='std_msgs/Float32MultiArray',
+                   tach='waveform')
+    player.play()
+    np.testing.assert_array_equal(player.samples(), recording.read().astype(np.float32))
+    waveform = np.concatenate([block.samples[0] for block in player.waveform])
+    np.testing.assert_array_equal(waveform, recording.read_tach().astype(np.float32))
+    assert player.waveform[7].start_time == pytest.approx(
+        5.0 + player.waveform[7].index / (3 * RATE), abs=1e-12)
 
 
 @pytest.mark.parametrize(('gone', 'options', 'wanted'), [

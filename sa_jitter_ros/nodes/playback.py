@@ -33,8 +33,9 @@ PLAYBACK_PARAMETERS = (
               unit='s', minimum=0.001, maximum=1.0, read_only=True),
     Parameter('wait_seconds', 3.0, 'how long to wait for subscribers before starting', unit='s',
               minimum=0.0, maximum=60.0, read_only=True),
-    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration: '
-              'std_msgs/Float64MultiArray or std_msgs/Float32MultiArray', read_only=True),
+    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
+              'tach_waveform: std_msgs/Float64MultiArray or std_msgs/Float32MultiArray',
+              read_only=True),
     Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
               'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses',
@@ -96,7 +97,8 @@ class PlaybackNode(MonitoringNode):
         kind = known_type('vibration_type', values['vibration_type'], _WRITTEN_TYPES)
         self._encode = (encode_samples if SAMPLE_TYPES[kind] is Float64MultiArray
                         else encode_samples_float32)
-        self._vibration = self.create_output(SAMPLE_TYPES[kind], 'vibration', INPUT_QOS)
+        self._sample_type = SAMPLE_TYPES[kind]
+        self._vibration = self.create_output(self._sample_type, 'vibration', INPUT_QOS)
         self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._keyphasor = values['keyphasor']
         self._pulse: Any = None  # publishers, where there is something to publish
@@ -138,7 +140,7 @@ class PlaybackNode(MonitoringNode):
         if pulses:
             self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
         if waveform:
-            self._waveform = self.create_output(Float64MultiArray, 'tach_waveform', INPUT_QOS)
+            self._waveform = self.create_output(self._sample_type, 'tach_waveform', INPUT_QOS)
         self._portion_seconds, self._portion_bytes = portion_seconds, portion_bytes
         self._stream = self.portions()
         self._timer = self.create_steady_timer(self._period(self._pacer.rate), self._tick)
@@ -212,7 +214,7 @@ class PlaybackNode(MonitoringNode):
         for block in portion.vibration:
             self._vibration.publish(self._encode(block))
         for block in portion.waveform:
-            self._waveform.publish(encode_samples(block))
+            self._waveform.publish(self._encode(block))
         self._send_pulses(portion.pulses)
         self._sent += portion.seconds
         return True
