@@ -302,6 +302,18 @@ def test_long_averages_with_known_errors_take_a_bounded_time_or_are_refused(name
     assert np.all((prediction.mean_attenuation > 0.0) & (prediction.mean_attenuation < 1.0))
 
 
+@pytest.mark.parametrize(('name', 'values'), [
+    ('excess_jitter', {'std': 1e300}), ('correlated_jitter', {'std': 1e300}),
+    ('phase_wander', {'std': 1e300}), ('speed_fluctuation', {'acceleration_std': 1e300}),
+    ('target_geometry', {'pulse_angles': (0.0, 1e300)}), ('additive_noise', {'std': 1e300}),
+    ('keyphasor_quantisation', {'period_std': 1e300}),
+    ('keyphasor_quantisation', {'clock_rate': 1e-300}),
+    ('interfering_tone', {'amplitude': 1e300}), ('excess_jitter', {'std': 0.01})])
+def test_effects_beyond_what_is_sensible_are_refused(name, values):
+    with pytest.raises(ModelError, match=r'not below .*: '):
+        predict_with(MODEL, [make_effect(name, **values)])
+
+
 def test_known_errors_of_too_many_orders_and_cycles_are_refused():
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': 10**6,
                              'orders': tuple(np.arange(1.0, 65.0))})
@@ -369,6 +381,7 @@ def test_parameters_become_effects():
     ('keyphasor_quantisation', {'clock_rate': 0.0}, 'more than 0'),
     ('target_geometry', {'pulse_angles': [0.0, float('inf')]}, 'finite'),
     ('missing_pulses', {'probability': 1.0}, 'at most 0.9'),
+    ('target_geometry', {'pulse_angles': 3.0}, 'give a list of angles'),
     ('interpolation_loss', {'method': 'nearest'}, 'band_limited, linear, cubic, spline'),
 ])
 def test_bad_parameters_are_refused(name, values, text):

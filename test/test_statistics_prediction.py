@@ -213,6 +213,14 @@ def test_a_mixture_of_scenarios_is_the_law_of_a_random_one(rng):
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'keyphasor_rate': 0.0}, 'keyphasor_rate is 0.0: it must be finite and above 0'),
+    ({'keyphasor_rate': 'fast'}, 'keyphasor_rate is fast: it must be finite and above 0'),
+    ({'keyphasor_rate': None}, 'keyphasor_rate is None'),
+    ({'trigger_cycles': float('inf')}, 'trigger_cycles is inf: an average holds a whole number'),
+    ({'trigger_cycles': '3'}, 'trigger_cycles is 3: an average holds a whole number'),
+    ({'trigger_cycles': None}, 'trigger_cycles is None'),
+    ({'orders': ('first',)}, 'orders hold a value that is no number'),
+    ({'pulses_per_revolution': 1.5}, 'pulses_per_revolution is 1.5: it must be finite and whole'),
+    ({'jitter_table': None}, 'jitter_table is None: give a list of pulse errors in s'),
     ({'keyphasor_rate': float('nan')}, 'keyphasor_rate is nan'),
     ({'trigger_speed': -3.0}, 'trigger_speed is -3.0'),
     ({'ratio': float('inf')}, 'ratio is inf'),
@@ -234,6 +242,21 @@ def test_a_mixture_of_scenarios_is_the_law_of_a_random_one(rng):
 def test_models_that_make_no_sense_are_refused(changes, message):
     with pytest.raises(ModelError, match=message):
         replace(MODEL, **changes)
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ({'gain': np.nan}, 'gain is nan: it must be finite'),
+    ({'gain': np.ones(2)}, r'gain has the shape \(2,\): give one value, or 3'),
+    ({'line_variance': -1.0}, 'line_variance is -1.0: it must be finite and at least 0')])
+def test_gain_and_noise_that_are_none_are_refused(arguments, message):
+    with pytest.raises(ModelError, match=message):
+        predict(MODEL, **arguments)
+
+
+def test_distribution_function_of_nothing_is_nothing():
+    for cycles in (3, 41):
+        below = predict(replace(MODEL, trigger_cycles=cycles)).law.cdf([-1.0, np.nan, np.inf])
+        np.testing.assert_allclose(below, np.tile([0.0, np.nan, 1.0], (3, 1)), atol=1e-8)
 
 
 @pytest.mark.parametrize('law', ['uniform', 'normal', 'triangular'])
@@ -325,6 +348,10 @@ def test_equal_states_are_detected_at_the_false_alarm_rate_and_jitter_hides_faul
      'no keyphasor rate changes the jitter'),
     (lambda: required_trigger_cycles(replace(MODEL, noise_std=5e4, sample_rate=5e4), 1e-3),
      ModelError, 'more than 1000000 trigger cycles'),
+    (lambda: detectability(MODEL, 'twice', [0.1]), ParameterError, 'amplitude_ratio is twice'),
+    (lambda: design_grid(MODEL, [5000.0], [3.7]), ModelError, 'trigger_cycles is 3.7'),
+    (lambda: Normal('wide'), ModelError, 'std is wide s: it must be finite'),
+    (lambda: predict(MODEL).law.ppf('half'), ParameterError, 'must be numbers between 0 and 1'),
     (lambda: design_grid(MODEL, [-5.0], [3]), ModelError, 'keyphasor_rates hold -5.0'),
     (lambda: detectability(MODEL, -1.0, [0.1]), ParameterError, 'amplitude_ratio is -1.0'),
     (lambda: detectability(MODEL, 1.1, [0.0]), ParameterError, 'between 0 and 1'),

@@ -6,12 +6,13 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
     fit_memory, goodness_of_fit, memory_p_value)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianPulseJitter
+from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _FORGOTTEN = 1e-3
@@ -33,6 +34,7 @@ class CorrelatedJitter(Effect):
         """Return the first-order autoregressive pulse errors, seen through the angle law."""
         if self.std == 0.0:
             return ()
+        require_in_turn('the spread of correlated_jitter.std', Normal(self.std).width, model)
         variance = (self.std * model.fundamental_frequency) ** 2
         rho = abs(self.correlation)
         memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
 from sa_jitter_ros.statistics.moments import AverageMoments
 from sa_jitter_ros.statistics.prediction import DeclaredModel
@@ -104,6 +104,18 @@ def mean_period(times: Array, missing: Array | None) -> float:
 def most_scenarios(model: DeclaredModel, wanted: int) -> int:
     """Return how many scenarios of a model's averages to list: fewer where averages are long."""
     return int(np.clip(_MOST_ERRORS // model.trigger_cycles, 1, wanted))
+
+
+def require_below(name: str, value: float, limit: float, unit: str, why: str) -> None:
+    """Raise ModelError unless a value is below a limit; `why` says the reason and the remedy."""
+    if not value < limit:
+        raise ModelError(f'{name} is {value:.6g} {unit}, not below {limit:.6g} {unit}: {why}')
+
+
+def require_in_turn(name: str, spread: float, model: DeclaredModel) -> None:
+    """Raise ModelError for pulse errors that spread over `spread` s, so that pulses could swap."""
+    require_below(name, spread, model.trigger_period, 's',
+                  'pulses could swap in a trigger cycle that short; lower it, or trigger_speed')
 
 
 class Effect:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
     fit_covariance, goodness_of_fit, memory_p_value, white)
@@ -32,8 +32,10 @@ class ExcessJitter(Effect):
         """Return the independent pulse errors."""
         if self.std == 0.0:
             return ()
+        law = Normal(self.std)
+        require_in_turn('the spread of excess_jitter.std', law.width, model)
         return (IndependentPulseJitter(
-            Normal(self.std), model.fundamental_frequency, model.weights),)
+            law, model.fundamental_frequency, model.weights),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return std^2 at lag 0."""

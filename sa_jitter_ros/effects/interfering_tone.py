@@ -4,11 +4,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 _SIGNIFICANT = 1e-4
+_MOST = 1e6
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,8 @@ class InterferingTone(Effect):
 
     def line_variance(self, model: DeclaredModel) -> Array:
         """Return the power that the comb filter of the average passes (Eq. 8)."""
+        require_below('interfering_tone.amplitude', self.amplitude, _MOST, 'components',
+                      'nothing of a component is seen beside it; lower it')
         line = np.asarray(model.orders) * model.fundamental_frequency
         passed = (np.sinc((self.frequency - line) * model.duration) ** 2
                   + np.sinc((self.frequency + line) * model.duration) ** 2)

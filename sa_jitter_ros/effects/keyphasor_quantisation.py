@@ -11,8 +11,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, most_scenarios, parameter, Pulses
+from sa_jitter_ros.effects.effect import (
+    Array, Effect, most_scenarios, parameter, Pulses, require_in_turn)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.statistics.distributions import Normal
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
@@ -37,6 +39,10 @@ class KeyphasorQuantisation(Effect):
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the errors for evenly spread phases of the first pulse on the grid."""
+        require_in_turn('the tick of keyphasor_quantisation.clock_rate', 1.0 / self.clock_rate,
+                        model)
+        require_in_turn('the spread of keyphasor_quantisation.period_std',
+                        Normal(self.period_std).width, model)
         return self.drawn_scenarios(model, most_scenarios(model, _PHASES))
 
     def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array:

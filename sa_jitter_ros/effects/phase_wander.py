@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import flat_band_correlation, recovered_correlation, SLOW_BAND
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
 from sa_jitter_ros.effects.slope_test import slope_test
@@ -41,6 +41,8 @@ class PhaseWander(Effect):
         """Return the wander, band-limited below half the trigger rate."""
         if self.std == 0.0:
             return ()
+        require_below('phase_wander.std', self.std, 2.0 * np.pi, 'rad', 'a source that turns '
+                      'freely against the shaft has no orders of it; lower it')
         variance = (self.std / (2.0 * np.pi)) ** 2
 
         def covariance(u: Array, v: Array, lag: int) -> Array:

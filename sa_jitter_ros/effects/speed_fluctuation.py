@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import ACCELERATION_BAND, ripple_of_acceleration
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import (
     AngleErrorProcess, GaussianAngleError, unit_nodes)
@@ -39,6 +39,9 @@ class SpeedFluctuation(Effect):
         if self.acceleration_std == 0.0:
             return ()
         size = _cycles(model, self.acceleration_std) * model.trigger_period**2
+        require_below('speed_fluctuation.acceleration_std times the trigger period', size, 1.0,
+                      'trigger speeds', 'the shaft would stop; lower it, or use more '
+                      'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
         return (GaussianAngleError(_left_by(model.weights, variance),
                                    min(_MEMORY, model.trigger_cycles)),)

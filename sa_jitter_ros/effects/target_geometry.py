@@ -5,8 +5,10 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, most_scenarios, parameter, Pulses
+from sa_jitter_ros.effects.effect import (
+    Array, Effect, most_scenarios, parameter, Pulses, require_in_turn)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
@@ -26,6 +28,13 @@ class TargetGeometry(Effect):
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')
 
+    def __post_init__(self) -> None:
+        """Check every angle."""
+        if not isinstance(self.pulse_angles, tuple):
+            raise ParameterError(f'target_geometry.pulse_angles is {self.pulse_angles}: give a '
+                                 'list of angles in rad, one for each mark')
+        super().__post_init__()
+
     def _at(self, model: DeclaredModel, index: Array) -> Array:
         """Return the errors in s of the trigger pulses `index`."""
         step = model.pulses_per_trigger or model.pulses_per_revolution
@@ -36,6 +45,9 @@ class TargetGeometry(Effect):
         """Return the errors for every mark that an average may begin with."""
         if not any(self.pulse_angles):
             return None
+        require_in_turn('the spread of target_geometry.pulse_angles', (
+            max(self.pulse_angles) - min(self.pulse_angles)) / (2.0 * np.pi * model.trigger_speed),
+            model)
         kept = most_scenarios(model, len(self.pulse_angles))
         first = (np.arange(kept) * len(self.pulse_angles) // kept)[:, None]
         return self._at(model, first + np.arange(model.trigger_cycles + 1))

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.angle_error import IndependentPulseJitter
-from sa_jitter_ros.statistics.moments import cycle_moments
+from sa_jitter_ros.statistics.moments import cycle_moments, require_cycles
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from scipy.optimize import brentq
 
@@ -137,6 +137,8 @@ def design_grid(
     """Return the highest (worst) order's figures over rates (Hz) and numbers of trigger cycles."""
     worst = replace(model, orders=(max(model.orders),))
     cycles = np.atleast_1d(np.asarray(trigger_cycles))
+    for count in cycles.tolist():
+        require_cycles(count)
     rates = np.atleast_1d(np.asarray(keyphasor_rates, float))
     figures = np.full((2, rates.size, cycles.size), np.nan)
     for i, at_rate in enumerate(_at_rates(worst, rates)):

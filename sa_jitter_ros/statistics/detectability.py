@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.statistics.distributions import is_number
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 
 Array = NDArray[Any]
@@ -46,7 +47,8 @@ def detectability(
     negative or infinite ratio or a false alarm rate outside (0, 1).
     """
     rate = np.atleast_1d(np.asarray(false_alarm, float))
-    if not (np.isfinite(amplitude_ratio) and amplitude_ratio >= 0.0):
+    if not (is_number(amplitude_ratio) and np.isfinite(amplitude_ratio)
+            and amplitude_ratio >= 0.0):
         raise ParameterError(f'amplitude_ratio is {amplitude_ratio}: it must be finite and not '
                              'negative')
     if not np.all((rate > 0.0) & (rate < 1.0)):

@@ -8,6 +8,7 @@ Where errors are given in fundamental cycles, the argument is simply the order.
 
 from dataclasses import dataclass, field
 import math
+from numbers import Real
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -245,6 +246,11 @@ class Sum:
         return total
 
 
+def is_number(value: object) -> bool:
+    """Tell whether a value is a real number, and neither text nor truth."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def _require_scale(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value >= 0.0):
+    if not (is_number(value) and math.isfinite(value) and value >= 0.0):
         raise ModelError(f'{name} is {value} s: it must be finite and not negative')

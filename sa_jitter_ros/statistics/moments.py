@@ -23,6 +23,7 @@ from sa_jitter_ros.statistics.angle_error import (
     joint_characteristic,
     unit_nodes,
 )
+from sa_jitter_ros.statistics.distributions import is_number
 from scipy.special import erf, sici
 
 Array = NDArray[Any]
@@ -31,6 +32,7 @@ AngleOffset = Callable[[Array], Array]
 
 NODES = 64
 _MOST_TURNS = 300.0
+_MOST_NOISE = 1e9
 
 
 @dataclass(frozen=True)
@@ -240,9 +242,14 @@ def noise_line_variance(noise_std: float, sample_rate: float, duration: float) -
     Return E|n|^2 of white noise in the PEAK amplitude of one order of an average of `duration` s.
 
     `noise_std` is per sample at `sample_rate` Hz: 4 noise_std^2 / (sample_rate duration), half of
-    it on each of real and imaginary part (what Eqs. 49 and 50 become in sampled data).
+    it on each of real and imaginary part (what Eqs. 49 and 50 become in sampled data). Raises
+    ModelError for noise that buries every component.
     """
-    return 4.0 * noise_std**2 / (sample_rate * duration)
+    size = 2.0 * noise_std / math.sqrt(sample_rate * duration)
+    if not size < _MOST_NOISE:
+        raise ModelError(f'noise of {noise_std:.6g} per sample leaves {size:.3g} in each line, '
+                         f'not below {_MOST_NOISE:g} components: lower it, or average longer')
+    return size**2
 
 
 def correlation_length(processes: Sequence[AngleErrorProcess]) -> int:
@@ -252,7 +259,11 @@ def correlation_length(processes: Sequence[AngleErrorProcess]) -> int:
 
 def require_orders(orders: ArrayLike) -> Array:
     """Return the orders as floats of shape (n,); raise ModelError unless finite and positive."""
-    g = np.atleast_1d(np.asarray(orders, float))
+    try:
+        g = np.atleast_1d(np.asarray(orders, float))
+    except (TypeError, ValueError) as error:
+        raise ModelError(f'orders hold a value that is no number ({error}): give a list of finite '
+                         'orders above 0') from error
     bad = ~(np.isfinite(g) & (g > 0.0))
     if g.ndim != 1 or g.size == 0 or np.any(bad):
         what = f'orders hold {g[bad][0]}' if np.any(bad) else f'orders have the shape {g.shape}'
@@ -262,6 +273,7 @@ def require_orders(orders: ArrayLike) -> Array:
 
 def require_cycles(trigger_cycles: int) -> None:
     """Raise ModelError unless an average holds at least one trigger cycle."""
-    if not (trigger_cycles >= 1 and int(trigger_cycles) == trigger_cycles):
+    if not (is_number(trigger_cycles) and trigger_cycles >= 1
+            and float(trigger_cycles).is_integer()):
         raise ModelError(f'trigger_cycles is {trigger_cycles}: an average holds a whole number of '
                          'at least 1')

@@ -6,7 +6,7 @@ component for every order. Effects that the declared model lacks enter through t
 arguments of `predict` and know nothing of this module.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 import math
 from typing import Any, Protocol
@@ -20,6 +20,7 @@ from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentP
 from sa_jitter_ros.statistics.cumulants import average_cumulants
 from sa_jitter_ros.statistics.distributions import (
     Empirical,
+    is_number,
     Normal,
     PulseErrorDistribution,
     Triangular,
@@ -98,16 +99,20 @@ class DeclaredModel:
     def __post_init__(self) -> None:
         """Check every value and every combination."""
         for name in ('keyphasor_rate', 'trigger_speed', 'ratio'):
-            _require(name, getattr(self, name), getattr(self, name) > 0.0, 'above 0')
+            _require(name, getattr(self, name), lambda value: value > 0.0, 'above 0')
         for name in ('jitter_std', 'noise_std', 'sample_rate'):
-            _require(name, getattr(self, name), getattr(self, name) >= 0.0, '0 (unset) or above')
+            _require(name, getattr(self, name), lambda value: value >= 0.0, '0 (unset) or above')
         _require('pulses_per_revolution', self.pulses_per_revolution,
-                 self.pulses_per_revolution >= 1, 'at least 1')
+                 lambda value: value >= 1 and float(value).is_integer(), 'whole, at least 1')
         _require('pulses_per_trigger', self.pulses_per_trigger,
-                 self.pulses_per_trigger >= 0, '0 (all of a revolution) or above')
+                 lambda value: value >= 0 and float(value).is_integer(),
+                 'whole, 0 (all of a revolution) or above')
         require_cycles(self.trigger_cycles)
         object.__setattr__(self, 'trigger_cycles', int(self.trigger_cycles))
         object.__setattr__(self, 'orders', tuple(require_orders(self.orders).tolist()))
+        if not isinstance(self.jitter_table, Iterable):
+            raise ModelError(f'jitter_table is {self.jitter_table}: give a list of pulse errors '
+                             'in s')
         object.__setattr__(self, 'jitter_table', tuple(self.jitter_table))
         if self.jitter_distribution not in DISTRIBUTIONS:
             raise ModelError(f'jitter_distribution is {self.jitter_distribution!r}: choose one of '
@@ -216,6 +221,7 @@ def predict(
     Mean square and complex moments are exact for any of them. The law itself is sampled (fixed
     seed) for few trigger cycles, normal under an offset, curved otherwise.
     """
+    _require_effects(model, gain, line_variance)
     orders = np.asarray(model.orders)
     frequency = model.fundamental_frequency
     declared = (IndependentPulseJitter(model.distribution, frequency, model.weights),)
@@ -284,6 +290,17 @@ def prediction_of_law(
         quantile_50=quantiles[:, 1], quantile_95=quantiles[:, 2], moments=moments, law=law)
 
 
-def _require(name: str, value: float, holds: bool, limit: str) -> None:
-    if not (holds and math.isfinite(value)):
+def _require_effects(model: DeclaredModel, gain: ArrayLike, line_variance: ArrayLike) -> None:
+    """Raise ModelError for a gain or noise that is none, or not one for each order."""
+    for name, value, least in (('gain', gain, -np.inf), ('line_variance', line_variance, 0.0)):
+        given = np.asarray(value)
+        if given.shape not in ((), (1,), (len(model.orders),)):
+            raise ModelError(f'{name} has the shape {given.shape}: give one value, or '
+                             f'{len(model.orders)}, as many as orders')
+        if not (np.all(np.isfinite(given)) and np.all(given.real >= least)):
+            raise ModelError(f'{name} is {given}: it must be finite and at least {least:g}')
+
+
+def _require(name: str, value: float, holds: Callable[[float], bool], limit: str) -> None:
+    if not (is_number(value) and math.isfinite(value) and holds(value)):
         raise ModelError(f'{name} is {value}: it must be finite and {limit}')

@@ -53,7 +53,7 @@ class SampledLaw:
         y = np.atleast_2d(np.asarray(amplitude, float))
         y = np.broadcast_to(y, (self.draws.shape[0], y.shape[-1]))
         counts = [np.searchsorted(row, at, side='right') for row, at in zip(self.draws, y)]
-        return np.asarray(np.array(counts) / self.draws.shape[1])
+        return np.where(np.isnan(y), np.nan, np.array(counts) / self.draws.shape[1])
 
     def ppf(self, probability: ArrayLike) -> Array:
         """
@@ -170,7 +170,11 @@ def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
 
 def require_probabilities(probability: ArrayLike) -> Array:
     """Return probabilities of shape (k,); raise ParameterError for one outside (0, 1)."""
-    p = np.atleast_1d(np.asarray(probability, float))
+    try:
+        p = np.atleast_1d(np.asarray(probability, float))
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f'probabilities {probability!r} must be numbers between 0 and 1') from error
     if not np.all((p > 0.0) & (p < 1.0)):
         raise ParameterError(f'probabilities {p} must lie between 0 and 1, both excluded')
     return p
