@@ -81,3 +81,53 @@ def test_flat_tach_is_refused(level):
     few = replace(simulated(acquisitions=2), pulse_times=np.array([0.1, 0.14, 0.18]))
     with pytest.raises(RecordingError, match='1 trigger pulses of 3'):
         observe(few, replace(MODEL, pulses_per_revolution=4))
+
+
+def geared(marks, step):
+    """Return the machine with a target that turns once in `marks` / `step` cycles."""
+    model = replace(MODEL, pulses_per_revolution=marks, pulses_per_trigger=step,
+                    trigger_speed=SPEED * step / marks, ratio=marks / step)
+    recording = simulated(acquisitions=16)
+    times = recording.pulse_times
+    count = step * (times.size - 1) + 1
+    return replace(recording, pulse_times=np.interp(
+        np.arange(count) / step, np.arange(times.size), times)), model
+
+
+def delayed(recording, late):
+    """Return the recording with pulses late by what `late` (s) repeats."""
+    times = recording.pulse_times
+    return replace(recording, pulse_times=times + np.resize(late, times.size))
+
+
+@pytest.mark.parametrize(('marks', 'step', 'target'), [
+    (1, 1, 'a target with 1 mark'), (4, 4, 'a target with 4 marks'),
+    (4, 1, 'a target of 4 marks')])
+def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step, target):
+    """They are a hum's, say, and the reader sees that they repeat."""
+    recording, model = geared(marks, step)
+    hum = 2e-4 * np.sin(2.0 * np.pi * (np.arange(5 * step) / step + 0.2) / 5.0)
+    found = traced(delayed(recording, hum), model)
+    (why,) = (item.rejected_because for item in found.candidates
+              if item.name == 'target_geometry')
+    assert found.verdict == 'unexplained'
+    assert not found.findings
+    assert 'repeat every 5 trigger pulses' in why
+    assert f'which no mark of {target}' in why
+
+
+def test_errors_that_repeat_with_the_revolution_are_a_target():
+    recording, model = geared(4, 1)
+    truth = np.array([2e-4, -1e-4, 0.0, -1e-4])
+    (finding,) = traced(delayed(recording, truth), model).findings
+    rad = 2.0 * np.pi * model.trigger_speed
+    off = np.array(finding.effect.pulse_angles) - rad * truth
+    assert np.abs(off).max() < 4.0 * finding.standard_errors['pulse_angles'][0]
+
+
+def test_nothing_is_known_of_marks_that_begin_no_cycle():
+    recording, model = geared(4, 2)
+    (finding,) = traced(delayed(recording, [2e-4, 0.0, -2e-4, 0.0]), model).findings
+    assert np.flatnonzero(finding.effect.pulse_angles).tolist() == [0, 2]
+    assert np.isnan(finding.standard_errors['pulse_angles']).tolist() == [False, True] * 2
+    assert '2 of the 4 marks' in finding.evidence

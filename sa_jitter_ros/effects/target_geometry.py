@@ -1,5 +1,11 @@
-"""Target geometry: marks off their even places, an error that repeats with the pulse index."""
+"""
+Target geometry: marks off their even places, an error that repeats with the revolution.
 
+Which mark begins a trigger cycle repeats with a period that the declared marks and pulses per
+trigger make. Errors that repeat with another one are no target's, but a hum's, say.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 import math
 from typing import ClassVar
@@ -14,8 +20,7 @@ from scipy import stats
 
 _LONGEST = 24
 _SIGNIFICANT = 1e-4
-# In favour of the number of marks that the target has.
-_KNOWN = 10.0
+_FEWEST = 3  # acquisitions
 
 
 @dataclass(frozen=True)
@@ -58,56 +63,95 @@ class TargetGeometry(Effect):
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
-        """Fold the pulse errors by the pulse index, with every period that fits several times."""
+        """Fold the pulse errors by the marks that begin trigger cycles: a revolution repeats."""
         model = evidence.model
         count = evidence.errors.shape[1]
         marks = model.pulses_per_revolution
         step = model.pulses_per_trigger or marks
         own = marks // math.gcd(marks, step)
-        periods = {own, *range(2, min(_LONGEST, count // 2) + 1)} & set(range(2, count - 2))
-        if len(evidence.errors) < 3 or not periods:
-            return absent(cls.name, 'too few pulses to fold by the pulse index')
-        folds = {p: _folded(evidence, p) for p in sorted(periods)}
-        best = min(folds, key=lambda p: folds[p][3] - (_KNOWN if p == own else 0.0))
-        mean, log_p_value, error, _ = folds[best]
-        choices = 1 if best == own else len(folds)
-        p_value = min(1.0, math.exp(max(log_p_value, -690.0)) * choices)
-        size = float(np.sqrt(np.mean(mean**2)))
-        text = (f'the pulse errors repeat every {best} trigger pulses with {size:.3g} s, '
-                f'p = {p_value:.2g}')
-        if p_value > _SIGNIFICANT:
-            return absent(cls.name, 'the pulse errors do not repeat with the pulse index: best '
-                          f'period {best}, p = {p_value:.2g}', p_value=p_value)
-        length = marks if best == own and own * step >= marks and marks > 1 else best * step
-        angles, errors = np.zeros(length), np.zeros(length)
-        places = (np.arange(best) * step) % length
-        angles[places] = 2.0 * np.pi * model.trigger_speed * mean
-        errors[places] = 2.0 * np.pi * model.trigger_speed * error
+        fold = _folded(evidence, own) if 1 < own < count - 2 else None
+        if own > 1 and fold is None:
+            return absent(cls.name, f'too few pulses to fold by the {own} marks that begin '
+                          f'trigger cycles: {_FEWEST} acquisitions of {own + 2} cycles are needed')
+        if fold is None or fold.log_p_value > math.log(_SIGNIFICANT):
+            others = [p for p in range(2, min(_LONGEST, count // 2) + 1) if own % p]
+            return cls._absent({p: found for p in others if (found := _folded(evidence, p))},
+                               own, marks)
+        p_value = math.exp(max(fold.log_p_value, -690.0))
+        angles, errors = np.zeros(marks), np.full(marks, np.nan)
+        places = (np.arange(own) * step) % marks
+        angles[places] = 2.0 * np.pi * model.trigger_speed * fold.mean
+        errors[places] = 2.0 * np.pi * model.trigger_speed * fold.error
+        text = (f'the pulse errors repeat every {own} trigger pulses, as the marks do, with '
+                f'{fold.size:.3g} s, p = {p_value:.2g}')
+        if own < marks:
+            text += (f'; {own} of the {marks} marks begin trigger cycles, nothing is known of '
+                     'the others (0 rad)')
         return Finding(cls.name, cls(tuple(angles.tolist())),
                        {'pulse_angles': errors.tolist()}, p_value, text)
 
+    @classmethod
+    def _absent(cls, folds: Mapping[int, '_Fold'], own: int, marks: int) -> Finding:
+        """Say with what period the errors repeat that is none of the target's."""
+        if not folds:
+            return absent(cls.name, 'the pulse errors do not repeat with the pulse index')
+        best = min(folds, key=lambda p: folds[p].criterion)
+        p_value = min(1.0, math.exp(max(folds[best].log_p_value, -690.0)) * len(folds))
+        if p_value > _SIGNIFICANT:
+            return absent(cls.name, 'the pulse errors do not repeat with the pulse index: best '
+                          f'period {best}, p = {p_value:.2g}', p_value=p_value)
+        target = (f'a target of {marks} marks, {own} of which begin trigger cycles,' if own > 1
+                  else f'a target with {marks} mark{"s" * (marks > 1)}, the same every time,')
+        return absent(cls.name, f'the pulse errors repeat every {best} trigger pulses with '
+                      f'{folds[best].size:.3g} s, p = {p_value:.2g}, which no mark of {target} '
+                      'does', p_value=p_value)
 
-def _folded(evidence: Evidence, period: int) -> tuple[Array, float, float, float]:
-    """
-    Return each phase's mean error, log p value of their repeating, standard error, and BIC.
 
-    The p value comes from how acquisitions agree, which any memory of the errors leaves valid; the
-    Bayesian information criterion compares periods. Errors at the ends are rough and left out.
+@dataclass(frozen=True)
+class _Fold:
     """
-    table, phases = [], []
-    for row, pulses in zip(evidence.errors, evidence.pulses):
+    Pulse errors folded by the pulse index: `mean` (phase,) and its standard `error` in s.
+
+    The p value of their repeating comes from how acquisitions agree, which any memory of the
+    errors leaves valid; the Bayesian information `criterion` compares periods.
+    """
+
+    mean: Array
+    error: float
+    log_p_value: float
+    criterion: float
+
+    @property
+    def size(self) -> float:
+        """Return the root mean square of what repeats, in s."""
+        return float(np.sqrt(np.mean(self.mean**2)))
+
+
+def _folded(evidence: Evidence, period: int) -> _Fold | None:
+    """
+    Return the errors folded by the index; None where too few acquisitions hold all phases.
+
+    Errors at the ends are rough and left out.
+    """
+    table, phases, errors = [], [], []
+    for row, pulses in zip(evidence.errors[:, 1:-1], evidence.pulses):
         phase = pulses.index[1:-1] % period
-        folded = np.bincount(phase, row[1:-1], period) / np.bincount(phase, minlength=period)
-        table.append(folded - folded.mean())
-        phases.append(phase)
+        often = np.bincount(phase, minlength=period)
+        if np.all(often > 0):  # a gap may hide one
+            folded = np.bincount(phase, row, period) / often
+            table.append(folded - folded.mean())
+            phases.append(phase)
+            errors.append(row)
+    count = len(table)
+    if count < _FEWEST:
+        return None
     rows = np.array(table)
-    count = len(rows)
     mean = rows.mean(axis=0)
     between = np.sum((rows - mean) ** 2) / ((count - 1) * (period - 1))
     ratio = count * np.sum(mean**2) / (period - 1) / max(between, 1e-300)
     log_p_value = float(stats.f.logsf(ratio, period - 1, (count - 1) * (period - 1)))
-    left = evidence.errors[:, 1:-1] - mean[np.array(phases)]
+    left = np.array(errors) - mean[np.array(phases)]
     left = left - left.mean(axis=1, keepdims=True)
     criterion = left.size * math.log(float(np.mean(left**2))) + period * math.log(left.size)
     error = float(np.sqrt(between * (period - 1) / period / count))
-    return mean, log_p_value, error, criterion
+    return _Fold(mean, error, log_p_value, criterion)
