@@ -7,8 +7,8 @@ import pytest
 from sa_jitter_ros.closure.observation import observe
 from sa_jitter_ros.closure.report import report, summary
 from sa_jitter_ros.closure.trace import trace
-from sa_jitter_ros.closure.trigger_pulses import without_spurious
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, without_spurious
+from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, make_effects, mesh
 from sa_jitter_ros.statistics.prediction import DeclaredModel
@@ -131,3 +131,21 @@ def test_nothing_is_known_of_marks_that_begin_no_cycle():
     assert np.flatnonzero(finding.effect.pulse_angles).tolist() == [0, 2]
     assert np.isnan(finding.standard_errors['pulse_angles']).tolist() == [False, True] * 2
     assert '2 of the 4 marks' in finding.evidence
+
+
+def test_declared_ratio_may_be_written_with_six_digits():
+    """The recording has all digits."""
+    recording = replace(simulated(), ratio=183 / 76)
+    model = replace(MODEL, ratio=2.407895)
+    assert trigger_pulses(recording, model).times.size == recording.pulse_times.size
+    with pytest.raises(ModelError, match=r'declared as 2\.408 but the recording says 2\.40789474'):
+        trigger_pulses(replace(recording, ratio=183 / 76), replace(MODEL, ratio=2.408))
+
+
+@pytest.mark.parametrize(('rate', 'said'), [(10_000.0, True), (5_000.0, False), (5_040.0, False)])
+def test_another_rate_of_the_tach_is_remarked(rate, said):
+    recording = replace(simulated(), tach_rate=5_000.0)
+    content = report(traced(recording, replace(MODEL, keyphasor_rate=rate)))
+    text = ("keyphasor_rate is declared as 10000 Hz but the recording's tach was sampled at "
+            '5000 Hz: declare 5000')
+    assert (text in content['remarks']) == (text in summary(content)) == said

@@ -20,6 +20,8 @@ _NEIGHBOURHOOD = 15
 _TOO_SHORT = 0.75
 _MOST_SPURIOUS = 0.05
 _FEWEST = 3
+_SAME_RATIO = 1e-5  # six digits, as people write them
+_SAME_RATE = 0.01
 
 
 @dataclass(frozen=True)
@@ -47,9 +49,9 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
     Raises ModelError where the recording contradicts the declared model and RecordingError where
     it has no usable pulses.
     """
-    if abs(recording.ratio / model.ratio - 1.0) > 1e-6 and recording.ratio != 1.0:
-        raise ModelError(f'ratio is declared as {model.ratio:g} but the recording says '
-                         f'{recording.ratio:g}: declare the ratio of this machine')
+    if abs(recording.ratio / model.ratio - 1.0) > _SAME_RATIO and recording.ratio != 1.0:
+        raise ModelError(f'ratio is declared as {model.ratio:.9g} but the recording says '
+                         f'{recording.ratio:.9g}: declare the ratio of this machine')
     if recording.pulses_per_revolution not in (1, model.pulses_per_revolution):
         raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
                          f'the recording says {recording.pulses_per_revolution}')
@@ -80,10 +82,17 @@ def trigger_pulses(recording: Recording, model: DeclaredModel) -> TriggerPulses:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {speed:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
-    remarks = () if not spurious else (
-        f'{spurious} of {measured.size} pulses are spurious (double): they were dropped, and the '
-        f'trigger cycles of the {np.count_nonzero(doubtful)} trigger pulses beside them left out',)
-    return TriggerPulses(times, missing, reference, doubtful, remarks)
+    remarks = []
+    if spurious:
+        remarks.append(f'{spurious} of {measured.size} pulses are spurious (double): they were '
+                       f'dropped, and the trigger cycles of the {np.count_nonzero(doubtful)} '
+                       'trigger pulses beside them left out')
+    tach_rate = recording.tach_rate
+    if tach_rate and abs(model.keyphasor_rate / tach_rate - 1.0) > _SAME_RATE:
+        remarks.append(f'keyphasor_rate is declared as {model.keyphasor_rate:.6g} Hz but the '
+                       f"recording's tach was sampled at {tach_rate:.6g} Hz: declare "
+                       f'{tach_rate:.6g}')
+    return TriggerPulses(times, missing, reference, doubtful, tuple(remarks))
 
 
 def without_spurious(times: FloatArray) -> tuple[FloatArray, BoolArray]:
