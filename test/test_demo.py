@@ -10,10 +10,11 @@ import pytest
 from sa_jitter_ros.commands import demo
 from sa_jitter_ros.commands.demo_plan import plan_recording
 from sa_jitter_ros.errors import RecordingError, SaJitterError
-from sa_jitter_ros.recordings import Recording
+from sa_jitter_ros.recordings import open_recording, Recording
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource
 from sa_jitter_ros.simulation import Gearbox, make_effects, mesh
+from scipy.io import wavfile
 
 CLOCK, RATE, SPEED, SECONDS = 4000.0, 20000.0, 31.7, 6.0
 
@@ -46,7 +47,7 @@ def recording(machine, tmp_path):
 
 
 def test_orders_and_averages_are_chosen_from_the_recording(recording):
-    plan = plan_recording(recording)
+    plan = plan_recording(recording, open_recording(recording))
     assert {23.0, 46.0, 69.0} < set(plan.orders)
     assert plan.trigger_cycles == SECONDS * SPEED // 8
     assert plan.speed == pytest.approx(SPEED, rel=0.01)
@@ -60,7 +61,7 @@ def test_trigger_cycles_are_those_of_the_recording(tmp_path):
         ArraySource(np.cos(2.0 * np.pi * 6.0 * SPEED * time)[None]), RATE,
         pulse_times=np.arange(0.1, SECONDS, 0.25 / SPEED), pulses_per_revolution=4,
         pulses_per_trigger=2, ratio=2.0))
-    plan = plan_recording(path)
+    plan = plan_recording(path, open_recording(path))
     assert plan.speed == pytest.approx(SPEED, rel=1e-6)
     assert plan.trigger_cycles == 2.0 * SPEED * SECONDS // 8
     assert 3.0 in plan.orders
@@ -73,7 +74,7 @@ def test_recording_without_keyphasor_is_refused(machine, tmp_path):
     path = tmp_path / 'mute.npz'
     write_npz(path, Recording(ArraySource(machine.vibration(0, 20000)), RATE))
     with pytest.raises(RecordingError, match='no keyphasor'):
-        plan_recording(path)
+        plan_recording(path, open_recording(path))
 
 
 def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environment, tmp_path):
@@ -90,6 +91,22 @@ def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environm
         assert 0.0 < float(predicted) < 1.0
     for name in ('waveform.png', 'orders.png'):
         assert (tmp_path / 'out' / name).read_bytes().startswith(b'\x89PNG')
+
+
+def test_demo_plays_a_wav_whose_tach_channel_it_is_told(machine, process_environment, tmp_path):
+    count = round(RATE * SECONDS)
+    turns = np.interp(np.arange(count) / RATE, machine.pulses(0.0, SECONDS).times,
+                      np.arange(len(machine.pulses(0.0, SECONDS).times)), left=-1.0)
+    both = np.stack((machine.vibration(0, count)[0] / 10.0, (turns % 1.0 < 0.1) - 0.5))
+    wavfile.write(tmp_path / 'rig.wav', round(RATE), both.T.astype(np.float32))
+    done = run_demo(process_environment, str(tmp_path / 'rig.wav'), '--tach-channel', '1',
+                    '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert '1 channels' in done.stdout
+    assert re.search(r'^ +23 ', done.stdout, re.MULTILINE), done.stdout
+    without = run_demo(process_environment, str(tmp_path / 'rig.wav'))
+    assert without.returncode == 2
+    assert 'give --tach-channel' in without.stderr
 
 
 def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_path):

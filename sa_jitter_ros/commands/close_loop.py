@@ -20,8 +20,8 @@ from sa_jitter_ros.closure.report import summary
 from sa_jitter_ros.closure.trace import Trace, trace
 from sa_jitter_ros.commands.declaration import read_declaration
 from sa_jitter_ros.commands.parser import Parser
+from sa_jitter_ros.commands.recording_options import add_recording_options, open_with
 from sa_jitter_ros.errors import SaJitterError
-from sa_jitter_ros.recordings import open_recording
 
 
 def make_parser() -> Parser:
@@ -35,6 +35,7 @@ def make_parser() -> Parser:
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for report.json, report.html and the figures')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_recording_options(parser)
     return parser
 
 
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> Trace:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
-    recordings = [open_recording(path) for path in options.recordings]
+    recordings = [open_with(options, path) for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
     for name in declaration.unknown:
         print(f'close_loop: {options.declared}: {name} is no parameter of jitter_predictor, '

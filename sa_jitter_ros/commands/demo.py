@@ -19,6 +19,8 @@ from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.commands.demo_watcher import Watcher
 from sa_jitter_ros.commands.parser import Parser
+from sa_jitter_ros.commands.recording_options import (
+    add_recording_options, open_with, player_parameters)
 from sa_jitter_ros.errors import SaJitterError
 
 START_TIMEOUT = 30.0  # s for discovery
@@ -141,6 +143,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--live', action='store_true',
                         help='show everything live on a page for a web browser, until Ctrl-C')
     parser.add_argument('--output', type=Path, default=Path('out'), help='folder for the figures')
+    add_recording_options(parser)
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
     context = rclpy.Context()
@@ -149,7 +152,9 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         plan = SIMULATED
         if options.recording:
-            plan = plan_recording(options.recording, keyphasor_rate=options.keyphasor_rate)
+            plan = plan_recording(
+                options.recording, open_with(options, options.recording),
+                keyphasor_rate=options.keyphasor_rate, parameters=player_parameters(options))
         options.output.mkdir(parents=True, exist_ok=True)  # before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')

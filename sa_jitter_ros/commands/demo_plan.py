@@ -13,7 +13,7 @@ from sa_jitter_ros.averaging.shaft import AverageSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings import open_recording, Recording
+from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
 
@@ -63,14 +63,15 @@ SIMULATED = Plan(
     orders=(18.0, 19.0, 20.0, 37.0, 38.0, 39.0, 57.0))
 
 
-def plan_recording(path: Path, *, keyphasor_rate: float = 0.0) -> Plan:
+def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,
+                   parameters: Mapping[str, object] | None = None) -> Plan:
     """
     Look at the first seconds of a recording.
 
-    With `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if the
-    keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
+    `parameters` are those with which `recording_player` opens its file, at `path`, as it is opened
+    here. With `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if
+    the keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
     """
-    recording = open_recording(path)
     first, pulses = _pulses(recording)
     triggers = _validator(recording).update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
@@ -89,7 +90,8 @@ def plan_recording(path: Path, *, keyphasor_rate: float = 0.0) -> Plan:
         'vibration is assumed')
     return Plan(
         source='recording_player',
-        source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate},
+        source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate,
+                           **(parameters or {})},
         title=path.name, seconds=recording.duration,
         channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
         speed=_share(recording) / period, keyphasor_rate=rate,
@@ -123,7 +125,7 @@ def _pulses(recording: Recording) -> tuple[SampleBlock, FloatArray]:
         return block, times[times <= end]
     if recording.tach is None or recording.tach_rate is None:
         raise RecordingError('no keyphasor: neither pulse times nor a tach waveform; averaging '
-                             'needs one')
+                             'needs one (of a .wav or .csv give --tach-channel)')
     waveform = next(recording.tach_blocks(math.ceil(LOOK * recording.tach_rate)))
     detector = KeyphasorDetector()
     found = detector.update(waveform[0], recording.start_time, recording.tach_rate)
