@@ -13,7 +13,7 @@ from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from scipy.signal import lfilter
-from scipy.stats import kstest
+from scipy.stats import kstest, norm
 
 MODEL = DeclaredModel(keyphasor_rate=10_000.0, trigger_speed=25.0, trigger_cycles=20,
                       orders=(10.0, 20.0, 40.0), sample_rate=20_000.0)
@@ -347,6 +347,29 @@ def test_modulation_leaves_the_mean_and_widens_all_orders_alike():
     assert after.moments.mean == pytest.approx(plain.moments.mean)
     spread = np.sqrt(after.moments.variance - plain.moments.variance) / np.abs(after.moments.mean)
     assert spread == pytest.approx(np.full(3, spread[0]), rel=0.04)
+
+
+@pytest.mark.parametrize('cycles', [40, 200, 1000])
+def test_slow_motions_keep_their_spectrum_in_long_averages(cycles):
+    model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e12, 'trigger_cycles': cycles,
+                             'orders': (1.0,)})
+    x, w = np.polynomial.legendre.leggauss(4000)
+    for band, effect in (((0.02, 0.4), make_effect('amplitude_modulation', std=0.1)),
+                         ((0.02, 0.1), make_effect('phase_wander', std=1e-3, bandwidth=0.1))):
+        frequency = band[0] + (band[1] - band[0]) * 0.5 * (x + 1.0)
+        exact = effect.std**2 * 0.5 * (w @ np.sinc(cycles * frequency) ** 2)
+        # Beyond 200 cycles the spectrum is blurred; a correlation cut off was 90 % off at 200.
+        assert predict_with(model, [effect]).moments.variance[0] == pytest.approx(
+            exact, rel=3e-4 if cycles <= 200 else 0.05)
+
+
+@pytest.mark.parametrize('std', [0.1, 0.5])
+def test_a_normal_gain_alone_is_normal(std):
+    model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e12})
+    prediction = predict_with(model, [make_effect('amplitude_modulation', std=std)])
+    z = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    levels = 1.0 + np.sqrt(prediction.moments.variance[0]) * z
+    np.testing.assert_allclose(prediction.law.cdf(levels)[0], norm.cdf(z), atol=1e-4)
 
 
 def test_effects_combine(rng):

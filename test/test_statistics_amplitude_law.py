@@ -7,7 +7,7 @@ from sa_jitter_ros.statistics.amplitude_law import curved_law, normal_law
 from sa_jitter_ros.statistics.analytic import (
     approximate_cycle_moments, inversion_cdf, laguerre_law, squared_amplitude_cumulants)
 from sa_jitter_ros.statistics.angle_error import IndependentPulseJitter
-from sa_jitter_ros.statistics.cumulants import third_cumulants
+from sa_jitter_ros.statistics.cumulants import average_cumulants, third_cumulants
 from sa_jitter_ros.statistics.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.statistics.moments import AverageMoments, cycle_moments, uniform_mean
 from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
@@ -93,6 +93,15 @@ def test_curved_law_agrees_with_simulated_averages(law, order, cycles, bias):
     assert normal > distance
     assert curved.mean_square[0] == pytest.approx(moments.mean_square[0], rel=1e-12)
     assert np.sqrt(curved.variance[0]) == pytest.approx(draws.std(), rel=0.025)
+
+
+def test_third_cumulants_of_wide_tables_have_the_nodes_they_need():
+    jitter = [IndependentPulseJitter(Empirical(np.array([-1.0, 1.0]) / np.sqrt(12.0)))]
+    orders = np.array([0.4, 1.5, 2.5, 4.0])
+    cycles = cycle_moments(orders, jitter, nodes=160)
+    found = average_cumulants(orders, jitter, 100, cycles)
+    exact = third_cumulants(orders, jitter, 100, cycles, nodes=32)
+    np.testing.assert_allclose(found, exact, atol=1e-7)  # 1e-4 off with the nodes of small errors
 
 
 def test_bent_averages_keep_their_mean_square_in_noise():

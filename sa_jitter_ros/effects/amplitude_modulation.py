@@ -7,7 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sa_jitter_ros.effects.band import flat_band_correlation, SLOW_BAND
+from sa_jitter_ros.effects.band import (
+    fading, flat_band_correlation, SLOW_BAND, slow_memory)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import (
@@ -15,7 +16,6 @@ from sa_jitter_ros.statistics.angle_error import (
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy import stats
 
-_MEMORY = 60
 _SIGNIFICANT = 1e-3
 
 
@@ -24,8 +24,19 @@ class SlowGain:
     """A slow normal gain of mean 1 and variance `variance`, as a factor of the component."""
 
     variance: float
-    correlation_length: int
+    trigger_cycles: int
     band: tuple[float, float] = SLOW_BAND
+
+    @property
+    def correlation_length(self) -> int:
+        """Return the memory in cycles."""
+        return slow_memory(self.trigger_cycles)
+
+    def covariance(self, u: Array, v: Array, lag: int) -> Array:
+        """Return Cov[a_k(u), a_{k+lag}(v)]."""
+        apart = lag + v - u
+        return np.asarray(self.variance * fading(apart, self.trigger_cycles)
+                          * flat_band_correlation(apart, self.band))
 
     def characteristic(
         self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
@@ -35,16 +46,12 @@ class SlowGain:
         total: Array = np.ones(())
         for (u, k), (v, m) in combinations(zip(positions, cycles), 2):
             if abs(m - k) <= self.correlation_length:
-                lag = (m + np.asarray(v)) - (k + np.asarray(u))
-                total = total + self.variance * flat_band_correlation(lag, self.band)
+                total = total + self.covariance(np.asarray(u), np.asarray(v), m - k)
         return np.asarray(total)
 
     def draw_gain(self, rng: np.random.Generator, cycles: int, u: Array, count: int) -> Array:
         """Return `count` gains (cycle, u, draw)."""
-        def covariance(u: Array, v: Array, lag: int) -> Array:
-            return self.variance * flat_band_correlation(lag + v - u, self.band)
-
-        return np.asarray(1.0 + drawn_normal(rng, covariance, min(
+        return np.asarray(1.0 + drawn_normal(rng, self.covariance, min(
             self.correlation_length, cycles - 1), cycles, u, count))
 
 
@@ -62,8 +69,8 @@ class AmplitudeModulation(Effect):
         """Return the gain, band-limited below half the trigger rate."""
         if self.std == 0.0:
             return ()
-        length = min(_MEMORY, model.trigger_cycles)
-        processes: Sequence[AngleErrorProcess] = (SlowGain(self.std**2, length, self.band),)
+        processes: Sequence[AngleErrorProcess] = (
+            SlowGain(self.std**2, model.trigger_cycles, self.band),)
         return processes
 
     @classmethod

@@ -17,7 +17,26 @@ SLOW_BAND = (0.02, 0.4)
 #: Of an acceleration, which is nearly constant within a trigger cycle.
 ACCELERATION_BAND = (0.05, 0.2)
 
+_LONGEST = 200  # cycles
 _RULE = unit_nodes(256)  # enough for the turns of some hundred lags
+
+
+def slow_memory(trigger_cycles: int) -> int:
+    """Return the number of cycles over which slow motions are followed."""
+    return min(_LONGEST, trigger_cycles)
+
+
+def fading(lag: ArrayLike, trigger_cycles: int) -> Array:
+    """
+    Return the factor on correlations at `lag` that lets them end with the memory.
+
+    1 where an average is no longer than the memory, so that they are exact. To cut them off would
+    leave power at frequency 0, which no length of an average takes out; to fade them blurs the
+    spectrum by 1/300 of the trigger rate, less than its lowest frequencies.
+    """
+    if trigger_cycles <= _LONGEST:
+        return np.ones(np.shape(lag))
+    return np.asarray(np.exp(-0.5 * (4.0 * np.asarray(lag) / _LONGEST) ** 2))
 
 
 def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:

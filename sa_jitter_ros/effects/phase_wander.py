@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.band import flat_band_correlation, recovered_correlation, SLOW_BAND
+from sa_jitter_ros.effects.band import (
+    fading, flat_band_correlation, recovered_correlation, SLOW_BAND, slow_memory)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
@@ -13,7 +14,6 @@ from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 
-_MEMORY = 40
 _NARROW = 0.05
 _SIGNIFICANT = 1e-3
 _MOST_BESIDE = 4.0  # variance of independent errors beside that of the wander
@@ -46,9 +46,11 @@ class PhaseWander(Effect):
         variance = (self.std / (2.0 * np.pi)) ** 2
 
         def covariance(u: Array, v: Array, lag: int) -> Array:
-            return np.asarray(variance * flat_band_correlation(lag + v - u, _band(self.bandwidth)))
+            apart = lag + v - u
+            return np.asarray(variance * fading(apart, model.trigger_cycles)
+                              * flat_band_correlation(apart, _band(self.bandwidth)))
 
-        return (GaussianAngleError(covariance, min(_MEMORY, model.trigger_cycles)),)
+        return (GaussianAngleError(covariance, slow_memory(model.trigger_cycles)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return what the wander looks like when it is taken for pulse errors."""

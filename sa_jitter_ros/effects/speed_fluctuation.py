@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.band import ACCELERATION_BAND, ripple_of_acceleration
+from sa_jitter_ros.effects.band import (
+    ACCELERATION_BAND, fading, ripple_of_acceleration, slow_memory)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.statistics.angle_error import (
@@ -15,8 +16,7 @@ from sa_jitter_ros.statistics.pulse_weights import Covariance, PulseWeights
 from scipy import stats
 
 _SIGNIFICANT = 1e-4
-_MEMORY = 20
-_FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(32)  # enough for `_MEMORY` cycles of the band
+_FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(128)  # enough for the memory of slow motions
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,12 @@ class SpeedFluctuation(Effect):
                       'trigger speeds', 'the shaft would stop; lower it, or use more '
                       'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
-        return (GaussianAngleError(_left_by(model.weights, variance),
-                                   min(_MEMORY, model.trigger_cycles)),)
+        covariance = _left_by(model.weights, variance)
+
+        def faded(u: Array, v: Array, lag: int) -> Array:
+            return covariance(u, v, lag) * fading(lag + v - u, model.trigger_cycles)
+
+        return (GaussianAngleError(faded, slow_memory(model.trigger_cycles)),)
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

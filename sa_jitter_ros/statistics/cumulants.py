@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import permutations
+from itertools import pairwise, permutations
 import math
 from typing import Any
 
@@ -16,6 +16,7 @@ from sa_jitter_ros.statistics.angle_error import (
     joint_characteristic,
     unit_nodes,
 )
+from sa_jitter_ros.statistics.distributions import Empirical
 from sa_jitter_ros.statistics.moments import (
     correlation_length,
     cycle_moments,
@@ -28,6 +29,8 @@ Array = NDArray[Any]
 
 _REACH = 3  # correlation in cycles up to which triple moments are integrated
 _NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
+# Of tables, whose values do not smear what wide errors do, and their spreads in cycles.
+_TABLE_NODES, _SPREADS = (_NODES, 12, 24), (0.4, 0.75)
 _CLEAR = 8.0  # variance of a cycle over its squared mean
 _MOST_BLOCKS = 64
 _PAIR_NODES = 32
@@ -97,11 +100,14 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Arr
     steps = np.arange(1 - block, block)
     lags = block * np.arange(count)[:, None] + steps
     weight = (block - np.abs(steps)) / block**2 * (np.abs(lags) < len(cycles.variance))
-    known = np.minimum(np.abs(lags), len(cycles.variance) - 1)
-    backward = (lags < 0)[:, :, None]
-    p = np.einsum('ld,ldo->ol', weight, cycles.pseudo_variance[known] / m**2)
-    j = np.einsum('ld,ldo->ol', weight, np.where(
-        backward, np.conj(cycles.variance[known]), cycles.variance[known]) / np.abs(m) ** 2)
+    first, last = 1 - len(cycles.variance), len(cycles.variance) - 1
+    by_lag = np.zeros((count, last - first + 1))  # weights of the lags that are remembered
+    row, column = np.nonzero(weight)
+    by_lag[row, lags[row, column] - first] = weight[row, column]
+    known = np.arange(first, last + 1)
+    p = (by_lag @ cycles.pseudo_variance[np.abs(known)]).T / m[:, None] ** 2
+    both = cycles.variance[np.abs(known)]
+    j = (by_lag @ np.where(known[:, None] < 0, both.conj(), both)).T / size[:, None] ** 2
     distance = np.subtract.outer(np.arange(count), np.arange(count))
     p, j = p[:, np.abs(distance)], j[:, np.abs(distance)]
     j = np.where(distance > 0, j.conj(), j)
@@ -120,26 +126,52 @@ def average_cumulants(
     """
     Return k(X, X, X) and k(X, X, conj X): integrated where the memory is short, else superposed.
 
-    With both kinds of processes the superposition is corrected by its error for the short ones.
+    Normal gains have no third cumulants; what their superposition makes of them is taken out. With
+    both kinds of processes the superposition is corrected by its error for the short ones.
     Independent jitter seen through a law that reads many pulses counts as seen through its `near`
     law, which moves the distribution function of |X| by less than 0.02.
     """
     near = [_near(process) for process in processes]
     if all(one is other and one.correlation_length <= _REACH
            for one, other in zip(near, processes)):
-        return third_cumulants(orders, processes, trigger_cycles, cycles)
+        return _integrated(orders, processes, trigger_cycles, cycles)
+    gains = [process for process in processes if hasattr(process, 'draw_gain')]
+    spurious = (0.0, 0.0)
+    if gains:
+        own = superposed_cumulants(cycle_moments(orders, gains, nodes=_PAIR_NODES), trigger_cycles)
+        spurious = own[0] * cycles.mean**3, own[1] * cycles.mean * np.abs(cycles.mean) ** 2
     short = [process for process in near if process.correlation_length <= _REACH]
     if not short:
-        return superposed_cumulants(cycles, trigger_cycles)
+        every = superposed_cumulants(cycles, trigger_cycles)
+        return every[0] - spurious[0], every[1] - spurious[1]
     alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
-    plain, mixed = third_cumulants(orders, short, trigger_cycles, alone)
+    plain, mixed = _integrated(orders, short, trigger_cycles, alone)
     gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
     if len(short) == len(near):
         return plain * gain**3, mixed * gain * np.abs(gain) ** 2
     every = superposed_cumulants(cycles, trigger_cycles)
     close = superposed_cumulants(alone, trigger_cycles)
-    return (every[0] + (plain - close[0]) * gain**3,
-            every[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
+    return (every[0] - spurious[0] + (plain - close[0]) * gain**3,
+            every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
+
+
+def _integrated(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments,
+) -> tuple[Array, Array]:
+    """Return `third_cumulants` with as many nodes as the spread of a table asks for."""
+    g = np.asarray(orders, float)
+    tables = [process for process in processes if isinstance(process, IndependentPulseJitter)
+              and isinstance(process.distribution, Empirical)]
+    spread = g * math.sqrt(sum(item.frequency**2 * item.distribution.variance for item in tables))
+    found = np.zeros((2, g.size), complex)
+    for (low, high), nodes in zip(pairwise((-1.0, *_SPREADS, np.inf)), _TABLE_NODES):
+        some = (spread > low) & (spread <= high)
+        if some.any():
+            part = CycleMoments(cycles.mean[some], cycles.variance[:, some],
+                                cycles.pseudo_variance[:, some])
+            found[:, some] = third_cumulants(g[some], processes, trigger_cycles, part, nodes=nodes)
+    return found[0], found[1]
 
 
 def _near(process: AngleErrorProcess) -> AngleErrorProcess:

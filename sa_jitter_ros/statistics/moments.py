@@ -31,6 +31,7 @@ Array = NDArray[Any]
 AngleOffset = Callable[[Array], Array]
 
 NODES = 64
+_NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
 _MOST_TURNS = 300.0
 _MOST_NOISE = 1e9
 
@@ -124,12 +125,16 @@ def cycle_moments(
     first = joint_characteristic(processes, [g[:, None]], [u], [0])
     mean = first @ w
     variance, pseudo = [], []
+    fine = (u, w, mean)
+    rule = unit_nodes(min(nodes, max(_FAR_NODES, nodes // 4)))
+    far = (*rule, joint_characteristic(processes, [g[:, None]], [rule[0]], [0]) @ rule[1])
     length = correlation_length(processes)
     for lag in range((length if lags is None else min(lags, length)) + 1):
+        u, w, own = fine if lag <= _NEAR else far
         points = ([u[:, None], u], [0, lag])
         variance.append(joint_characteristic(processes, [plane, -plane], *points) @ w @ w
-                        - np.abs(mean) ** 2)
-        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - mean**2)
+                        - np.abs(own) ** 2)
+        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - own**2)
     return CycleMoments(mean, np.array(variance), np.array(pseudo))
 
 
