@@ -389,3 +389,8 @@ def test_every_pulse_is_counted_once(seed):
     assert pulses.size == sum((
         counts.accepted, counts.doubles, counts.early, counts.out_of_order, counts.non_finite,
         counts.unlocked))
+
+
+def test_denormal_intervals_are_no_overflow():
+    tiny = np.arange(8.0) * 5e-324
+    validate(np.concatenate((tiny, 1.0 + np.arange(10.0) / 30.0)))

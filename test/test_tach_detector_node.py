@@ -221,3 +221,14 @@ def test_silence_is_not_a_keyphasor(bench, rng):
     play(b, 0.01 * rng.standard_normal(10000))
     assert len(pulses(b)) == 0
     assert b.diagnostics()[1] == 'learning the state levels'
+
+
+def test_times_that_a_reference_cannot_hold_are_counted_and_named(bench):
+    b = bench()
+    play(b, waveform(1.0), start=3.8e9)
+    assert len(pulses(b)) == 0
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'std_msgs/Float64MultiArray' in text
+    found = KeyphasorDetector().update(waveform(1.0), 0.0, RATE)
+    assert int(values['pulses_dropped']) == len(found)

@@ -28,6 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 _CALM = 4  # regular pulses in a row after which they may come in chunks
 _AGREEING = 4
 _LOST = 8
+_STANDSTILL = 1e9  # intervals; the ratio of a gap to denormal ones is infinite
 
 
 class IntervalJudge:
@@ -146,7 +147,7 @@ class IntervalJudge:
             self._lose(pulse)
             return
         number = gap / min(self._expected(), key=lambda interval: abs(gap / step - interval))
-        missing = round(number) - step
+        missing = round(min(number, _STANDSTILL)) - step
         if number < DOUBLE:
             self.counts['doubles'] += 1
         elif number < step:

@@ -56,7 +56,8 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
         return np.full(cycles.shape[1:], np.nan)
     mean = cycles.mean(axis=0)
     size = np.abs(mean)
-    turn = np.where(size > 0.0, mean, 1.0) / np.where(size > 0.0, size, 1.0)
+    known = size > np.finfo(np.float64).tiny
+    turn = np.where(known, mean, 1.0) / np.where(known, size, 1.0)
     radial = (cycles * np.conj(turn)).real
     lines = (count - 1) // 2
     if lines < _MEDIAN_FROM:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
-from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.errors import MessageError, SignalError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode, run_node, UNCOUNTED
 from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference, known_type,
                                           PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
@@ -85,7 +85,7 @@ class TachDetector(MonitoringNode):
         self._detector = detector_of(values)
         self._rate = 0.0  # of the run that the detector follows
         self._epoch = 0
-        self._pulses = 0
+        self._pulses = self._unsent = 0
         self._too_close = self._unused = 0  # of detectors before
         self._waiting: deque[float] = deque()
         self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
@@ -140,7 +140,13 @@ class TachDetector(MonitoringNode):
     def _send_waiting(self) -> None:
         count = max(BURST, len(self._waiting) // 100)
         for _ in range(min(count, len(self._waiting))):
-            self._pulse.publish(encode_pulse_reference(self._waiting.popleft(), self._keyphasor))
+            try:
+                pulse = encode_pulse_reference(self._waiting.popleft(), self._keyphasor)
+            except MessageError as error:
+                self._unsent += 1
+                self.warn(f'tach_pulse: {error}')
+                continue
+            self._pulse.publish(pulse)
 
     def update_counts(self) -> None:
         """Gather the counts of the core."""
@@ -149,7 +155,7 @@ class TachDetector(MonitoringNode):
         samples, state = self._timeline.counts, self._detector.state
         self.counts.update(
             samples_dropped=samples.samples_dropped + self._unused,
-            pulses_dropped=self._too_close + state.too_close,
+            pulses_dropped=self._too_close + state.too_close + self._unsent,
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
             samples_lost=samples.samples_lost)
