@@ -48,7 +48,7 @@ DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 # and 0.04 off for jitter as skewed as an exponential law.
 _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
-_FEW_ALONG, _FEW_ACROSS, _NOTHING = 8.0, 5.0, 1e-12
+_FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
 
 
 class AmplitudeDistribution(Protocol):
