@@ -149,3 +149,18 @@ def test_another_rate_of_the_tach_is_remarked(rate, said):
     text = ("keyphasor_rate is declared as 10000 Hz but the recording's tach was sampled at "
             '5000 Hz: declare 5000')
     assert (text in content['remarks']) == (text in summary(content)) == said
+
+
+def test_declared_speed_does_not_enter_what_is_fitted():
+    """Fit and prediction share the measured speed; the report keeps the declared one."""
+    recording, model = geared(4, 1)
+    late = delayed(recording, [2e-4, -1e-4, 0.0, -1e-4])
+    right, *others = (traced(late, replace(model, trigger_speed=share * model.trigger_speed))
+                      for share in (1.0, 1.08, 0.92))
+    for share, found in zip((1.08, 0.92), others):
+        (finding,), (expected,) = found.findings, right.findings
+        np.testing.assert_allclose(finding.effect.pulse_angles, expected.effect.pulse_angles)
+        assert found.after.rms == pytest.approx(right.after.rms)
+        content = report(found)
+        assert content['declared']['trigger_speed'] == share * SPEED / 4
+        assert content['measured_speed'] == pytest.approx(SPEED / 4, rel=1e-4)

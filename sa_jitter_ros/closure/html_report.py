@@ -141,7 +141,8 @@ def _line_table(lines: Sequence[Mapping[str, Json]]) -> str:
 
 def _declared_table(content: Mapping[str, Json]) -> str:
     rows = [(key, _number(value)) for key, value in content['declared'].items()]
-    rows += [('recordings', ', '.join(content['recordings'])),
+    rows += [('measured trigger_speed', _number(content['measured_speed'])),
+             ('recordings', ', '.join(content['recordings'])),
              ('attenuation measured against', content['against']),
              ('acquisitions fitted', content['acquisitions']['fit']),
              ('acquisitions held out', content['acquisitions']['held_out'])]

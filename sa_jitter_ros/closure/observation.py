@@ -21,6 +21,7 @@ from sa_jitter_ros.closure.cycle_reader import (
     amplitudes, CycleReader, noise_floor, recover, repaired, ripple_error, separated)
 from sa_jitter_ros.closure.other_sources import other_sources
 from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, TriggerPulses
+from sa_jitter_ros.effects.effect import mean_period
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
 from sa_jitter_ros.recordings.recording import Recording
 from sa_jitter_ros.statistics.prediction import DeclaredModel
@@ -97,7 +98,8 @@ class Observation:
     All acquisitions of one recording; `orders` as declared, `sources` those that may leak in.
 
     The amplitudes of an acquisition are those of `sources`, of which the first `len(orders)` are
-    the declared orders.
+    the declared orders. The trigger_speed of `model` is the measured mean, which fits and
+    predictions share; `declared_speed` (Hz) is what was declared.
     """
 
     model: DeclaredModel
@@ -108,6 +110,7 @@ class Observation:
     pulses: TriggerPulses
     sample_rate: float
     against_reference: bool
+    declared_speed: float
     name: str = ''
 
     def stacked(self, field: str) -> NDArray[Any]:
@@ -134,8 +137,9 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
                          f'has {recording.sample_rate:g} Hz')
     once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each leaks into others only
-    model = replace(model, sample_rate=recording.sample_rate, orders=once)
-    pulses = trigger_pulses(recording, model)
+    pulses, declared_speed = trigger_pulses(recording, model), model.trigger_speed
+    speed = model.trigger_revolutions / mean_period(pulses.times, pulses.missing)
+    model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
     samples = np.ascontiguousarray(recording.read().T)
     if not np.all(np.isfinite(samples)):
         raise RecordingError('vibration holds NaN or infinity: cut the recording at its gaps')
@@ -166,7 +170,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
                               f'{reason}; give reference_pulse_times or orders above the noise')
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
-        recording.sample_rate, pulses.reference is not None, recording.description)
+        recording.sample_rate, pulses.reference is not None, declared_speed,
+        recording.description)
 
 
 def together(observations: Sequence[Observation]) -> Observation:
@@ -196,9 +201,13 @@ def together(observations: Sequence[Observation]) -> Observation:
         np.concatenate([item.pulses.doubtful for item in observations]),
         tuple(f'{item.name or "a recording"}: {remark}' for item in observations
               for remark in item.pulses.remarks))
-    return replace(first, acquisitions=tuple(
-        acquisition for item in observations for acquisition in item.acquisitions),
-        pulses=pulses if len(observations) > 1 else first.pulses)
+    if len(observations) == 1:
+        return first
+    speed = np.average([item.model.trigger_speed for item in observations],
+                       weights=[len(item.acquisitions) for item in observations])
+    return replace(first, model=replace(first.model, trigger_speed=float(speed)), pulses=pulses,
+                   acquisitions=tuple(acquisition for item in observations
+                                      for acquisition in item.acquisitions))
 
 
 def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]

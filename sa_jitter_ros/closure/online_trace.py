@@ -127,7 +127,8 @@ def _observation(averages: Sequence[Average], model: DeclaredModel) -> Observati
         replace(model, trigger_speed=speed, orders=tuple(orders.tolist())), tuple(found), orders,
         orders, tuple(f'channel {k}' for k in range(len(averages[0].raw))),
         TriggerPulses(record, np.zeros(record.size - 1, np.int64), None,
-                      np.zeros(record.size, np.bool_)), model.sample_rate, False)
+                      np.zeros(record.size, np.bool_)), model.sample_rate, False,
+        model.trigger_speed)
 
 
 def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:

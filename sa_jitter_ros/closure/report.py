@@ -28,8 +28,9 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'standard_error': trace.after.standard_error[i],
     } for i, (c, g) in enumerate(zip(trace.lines.channel, trace.lines.order))]
     content: Mapping[str, Json] = plain({
-        'declared': {**asdict(observation.model), 'effects': {
-            effect.name: effect.values for effect in trace.declared}},
+        'declared': {**asdict(observation.model), 'trigger_speed': observation.declared_speed,
+                     'effects': {effect.name: effect.values for effect in trace.declared}},
+        'measured_speed': observation.model.trigger_speed,
         'recordings': list(recordings),
         'remarks': observation.pulses.remarks,
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
