@@ -206,6 +206,22 @@ def test_acceleration_is_fitted_within_its_error(rng):
     check(z_scores(found, acceleration_std=80.0)['acceleration_std'])
 
 
+def test_acceleration_is_fitted_where_no_pulse_lacks(rng):
+    """An acquisition whose ripple is unknown takes nothing from the others."""
+    motion = sines(rng, ACCELERATION_BAND)
+    true = 3e-4 * motion(np.arange(float(PULSES)), derivative=2)
+    errors, bump = (3e-4 * item for item in recovered(partial(motion, derivative=2)))
+    evidence = evidence_of(rng, declared(rng) + errors - true, ripple=bump, speed=-true)
+    ripple = bump.copy()
+    ripple[4] = np.nan
+    kept = np.delete(np.arange(ACQUISITIONS), 4)
+    gap, without = (EFFECTS['speed_fluctuation'].fit(item) for item in (
+        replace(evidence, ripple=ripple),
+        replace(evidence, ripple=bump[kept], errors=evidence.errors[kept],
+                pulses=tuple(evidence.pulses[a] for a in kept))))
+    assert gap.effect == without.effect is not None
+
+
 def test_wandering_source_is_no_acceleration(rng):
     """The ripple follows the errors in both cases, the pulses only in one."""
     errors, bump = (3e-4 * item for item in recovered(sines(rng, ACCELERATION_BAND)))

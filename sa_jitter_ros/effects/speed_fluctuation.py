@@ -16,6 +16,7 @@ from sa_jitter_ros.statistics.pulse_weights import Covariance, PulseWeights
 from scipy import stats
 
 _SIGNIFICANT = 1e-4
+_FEWEST = 2  # acquisitions
 _FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(128)  # enough for the memory of slow motions
 
 
@@ -54,13 +55,14 @@ class SpeedFluctuation(Effect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit the ripple inside the cycles, which the true pulse times must show as well."""
         model = evidence.model
-        curve = np.diff(evidence.times_left - evidence.errors, 2, axis=1)
-        expected = _inside(curve)  # s, at all cycles but the outer two
-        ripple = evidence.ripple[:, 1:-1]
-        if not np.all(np.isfinite(ripple)) or expected.size < 12:
+        resolved = np.all(np.isfinite(evidence.ripple), axis=1)  # not where a pulse lacks
+        if np.count_nonzero(resolved) < _FEWEST or evidence.ripple[:, 1:-1].size < 12:
             return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
+        times = evidence.times_left[resolved]
+        expected = _inside(times - evidence.errors[resolved])  # s, at all cycles but the outer two
+        ripple = evidence.ripple[resolved, 1:-1]
         noise = evidence.ripple_standard_error**2
-        rows = np.mean(evidence.ripple**2, axis=1)
+        rows = np.mean(evidence.ripple[resolved] ** 2, axis=1)
         variance = float(rows.mean() - noise)
         size, error = root(variance, float(rows.std(ddof=1) / np.sqrt(rows.size)))
         slope, _, r, p_value, slope_error = stats.linregress(expected.ravel(), ripple.ravel())
@@ -79,7 +81,7 @@ class SpeedFluctuation(Effect):
             against = (f'the acceleration between the pulses explains {r**2:.0%} of the error '
                        'inside the cycles: something faster moves')
         # Jitter of the pulses has no part in the ripple, a moving source none in the pulses.
-        product = ripple * _inside(np.diff(evidence.times_left, 2, axis=1))
+        product = ripple * _inside(times)
         share = float(product.mean() / np.mean(ripple * expected))
         unsure = float(product.std() / np.sqrt(product.size) / abs(np.mean(ripple * expected)))
         if share < 0.5 and share + 3.0 * unsure < 1.0:
@@ -117,6 +119,7 @@ def _cycles(model: DeclaredModel, acceleration: float) -> float:
     return acceleration / (2.0 * np.pi * model.trigger_revolutions)
 
 
-def _inside(bends: Array) -> Array:
-    """Return the ripple of cycles that second differences at both their ends make."""
+def _inside(times: Array) -> Array:
+    """Return the ripple of all cycles but the outer two that `times` of pulses bend by."""
+    bends = np.diff(times, 2, axis=1)
     return np.asarray(0.25 * (bends[:, :-1] + bends[:, 1:]))
