@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from sa_jitter_ros.closure.cycle_reader import RIPPLE_VARIANCE
 from sa_jitter_ros.effects import EFFECTS, make_effect
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, flat_band_correlation, recovered_correlation, ripple_of_acceleration,
@@ -220,6 +221,28 @@ def test_acceleration_is_fitted_where_no_pulse_lacks(rng):
         replace(evidence, ripple=bump[kept], errors=evidence.errors[kept],
                 pulses=tuple(evidence.pulses[a] for a in kept))))
     assert gap.effect == without.effect is not None
+
+
+def test_noise_that_ripple_and_errors_share_is_no_acceleration(rng):
+    """Both are fitted to the same vibration, whose noise moves them against each other."""
+    points, draws, std = 64, 100, 3e-5
+    u = (np.arange(points) + 0.5) / points
+    lines = np.kron(np.eye(PULSES - 1, PULSES), 1.0 - u[:, None]) + np.kron(
+        np.eye(PULSES - 1, PULSES, 1), u[:, None])
+    fit = np.linalg.pinv(np.hstack((lines, np.kron(np.eye(PULSES - 1), (u * (1.0 - u))[:, None]))))
+    p_values, power = [], []
+    for _ in range(draws):
+        both = std * rng.standard_normal((ACQUISITIONS, len(lines))) @ fit.T
+        errors, ripple = both[:, :PULSES], both[:, PULSES:]
+        power.append(np.mean(ripple[:, 1:-1] ** 2))
+        true = 1e-6 * rng.standard_normal(errors.shape)  # the speed is not quite steady
+        evidence = evidence_of(rng, declared(rng), ripple=ripple, speed=true,
+                               ripple_error=std * np.sqrt(RIPPLE_VARIANCE / points))
+        p_values.append(EFFECTS['speed_fluctuation'].fit(replace(
+            evidence, errors=evidence.errors + errors)).p_value)
+    # one in ten cycles is next to an outer one, which the ends leave a little rougher
+    assert np.mean(power) == pytest.approx(std**2 * RIPPLE_VARIANCE / points, rel=0.05)
+    assert abs(np.mean(p_values) - 0.5) < 4.0 / np.sqrt(12.0 * draws)
 
 
 def test_wandering_source_is_no_acceleration(rng):

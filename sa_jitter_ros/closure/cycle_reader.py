@@ -24,6 +24,9 @@ _SEPARATIONS = 6
 _LOBE, _AROUND = 3, 150
 _OUTLIER = 3.0  # times the noise
 _LINEAR = angle_law('linear')
+_COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
+#: Of a fitted ripple, in parts of that of noise of unit power over a cycle.
+RIPPLE_VARIANCE = float(np.mean(1.0 / (1.0 / 30.0 - (1.0 + _COSINE) / (24.0 * (2.0 + _COSINE)))))
 
 
 @dataclass(frozen=True)
@@ -151,11 +154,13 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
     """
     Return the standard error of the ripple (s) that the noise of the recovered orders leaves.
 
-    u (1 - u) less what pulse errors can follow has the mean square 1/180.
+    Ripples and pulse errors are fitted jointly, of all cycles: at the frequency w (per cycle)
+    u (1 - u) keeps 1/30 - (1 + cos w) / (24 (2 + cos w)) in mean square beyond what straight
+    lines between the pulses follow.
     """
     with np.errstate(divide='ignore', invalid='ignore'):
         signal = (2.0 * np.pi * recovery.orders * np.abs(recovery.amplitudes)) ** 2
-        information = np.nansum(2.0 * signal / recovery.noise**2) / 180.0
+        information = np.nansum(2.0 * signal / recovery.noise**2) / RIPPLE_VARIANCE
     cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
     return float(cycles / model.fundamental_frequency)
 
