@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from sa_jitter_ros.closure.observation import observe
 from sa_jitter_ros.closure.report import report, summary
-from sa_jitter_ros.closure.trace import trace
+from sa_jitter_ros.closure.trace import make_bench, trace
 from sa_jitter_ros.closure.trigger_pulses import trigger_pulses, without_spurious
+from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, make_effects, mesh
@@ -164,3 +165,18 @@ def test_declared_speed_does_not_enter_what_is_fitted():
         content = report(found)
         assert content['declared']['trigger_speed'] == share * SPEED / 4
         assert content['measured_speed'] == pytest.approx(SPEED / 4, rel=1e-4)
+
+
+def test_gap_turns_by_whole_cycles_whatever_the_speed():
+    """The rounded speed at which acquisitions are predicted together must not count per gap."""
+    recording = simulated()
+    lost = replace(recording, pulse_times=np.delete(recording.pulse_times, [25, 60, 64, 108, 165]))
+    effect = make_effect('missing_pulses', probability=0.02)
+    found = []
+    for share in (1.0, 1.0004):
+        seen = observe(lost, MODEL)
+        seen = replace(seen, model=replace(seen.model, trigger_speed=(
+            share * seen.model.trigger_speed)))
+        bench = make_bench(seen, [seen], [lost], ())
+        found.append(bench.expect([effect], range(len(seen.acquisitions))).attenuation)
+    np.testing.assert_allclose(found[0], found[1], atol=2e-5)

@@ -185,8 +185,15 @@ def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) 
 
 
 def _speed(item: Acquisition, model: DeclaredModel) -> float:
-    """Return the speed of an acquisition in Hz, the declared one unless it differs."""
+    """
+    Return the speed of an acquisition in Hz, that of the record unless it differs.
+
+    It is exact where pulses lack: a gap turns the average by whole trigger cycles, and what the
+    speed were off by would count as often as the order has periods in them.
+    """
     ratio = model.trigger_period / mean_period(item.times, item.missing)
+    if item.missing.any():
+        return float(model.trigger_speed * ratio)
     return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))
 
 
