@@ -121,10 +121,15 @@ class Evidence:
         whole = self.errors + self.times - self.times_left
         return ticks_leave_room(whole, self.standard_errors, self.clock.rate)
 
+    @property
+    def jitter_replaced(self) -> bool:
+        """Tell whether an added effect takes the place of the declared jitter."""
+        return any(effect.replaces_jitter(self.model) for effect in self.explained)
+
     def expected_autocovariance(self, lags: Array) -> Array:
         """Return what declared jitter and added effects explain at `lags`, in s^2."""
         total = np.zeros(lags.shape)
-        if not any(effect.replaces_jitter(self.model) for effect in self.explained):
+        if not self.jitter_replaced:
             total = np.where(lags == 0, self.model.distribution.variance, 0.0)
         for effect in self.explained:
             total = total + effect.pulse_autocovariance(self.model, lags)

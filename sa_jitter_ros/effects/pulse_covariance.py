@@ -167,7 +167,7 @@ def _standard_errors(slopes: Sequence[Array], contrast: Array, whitened: Array, 
 def _fourth_cumulant(evidence: Evidence) -> float:
     """Return the fourth cumulant in s^4 of the declared jitter, 0 where something replaces it."""
     jitter = evidence.model.distribution
-    if any(effect.replaces_jitter(evidence.model) for effect in evidence.explained):
+    if evidence.jitter_replaced:
         return 0.0
     draws = jitter.draw(np.random.default_rng(1), 20000)
     return float(stats.kurtosis(draws)) * jitter.variance**2
@@ -222,15 +222,16 @@ def _speed_p_value(evidence: Evidence, power: Array, spread: float) -> float:
 def _law_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
     """Compare the errors with the declared law plus a normal one of the fitted variance."""
     errors = evidence.errors.ravel()
-    jitter = evidence.model.distribution
+    declared, draws = 0.0, np.zeros(1)
+    if not evidence.jitter_replaced:
+        jitter = evidence.model.distribution
+        declared = jitter.variance
+        draws = np.sort(jitter.draw(np.random.default_rng(1), 20000))[::50]
     count = evidence.errors.shape[1]
-    known = evidence.expected_autocovariance(np.zeros(1, int))[0] - jitter.variance
+    known = evidence.expected_autocovariance(np.zeros(1, int))[0] - declared
     noise = float(np.nanmean(evidence.standard_errors**2))
     normal = max(fit.variance + max(known, 0.0) + noise, 1e-30)
-    shrink = np.sqrt(1.0 + jitter.variance / (count * normal))
-    rng = np.random.default_rng(1)
-    draws = np.sort(jitter.draw(rng, 20000)) if known > -0.5 * jitter.variance else np.zeros(1)
-    draws = draws[:: max(1, draws.size // 400)]
+    shrink = np.sqrt(1.0 + declared / (count * normal))
 
     def cdf(x: Array) -> Array:
         return np.asarray(ndtr((x[:, None] - draws) / np.sqrt(normal)).mean(axis=1))
@@ -246,8 +247,7 @@ def _moments_p_value(evidence: Evidence) -> float:
     jitter = evidence.model.distribution
     size = int(errors.size / _effective_repeats(errors))
     power = float(np.mean(errors**2))
-    known = 0.0 if any(effect.replaces_jitter(evidence.model) for effect in evidence.explained
-                       ) else min(jitter.variance, power)
+    known = 0.0 if evidence.jitter_replaced else min(jitter.variance, power)
     rng = np.random.default_rng(1)
     draws = rng.normal(0.0, np.sqrt(power - known), (_DRAWS, size))
     if known:
