@@ -8,13 +8,15 @@ import pytest
 
 from sa_jitter_ros.closure.cycle_reader import RIPPLE_VARIANCE
 from sa_jitter_ros.effects import EFFECTS, make_effect
+from sa_jitter_ros.effects.amplitude_modulation import _chance
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, flat_band_correlation, recovered_correlation, ripple_of_acceleration,
     SLOW_BAND)
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
-from sa_jitter_ros.effects.pulse_covariance import log_likelihood
+from sa_jitter_ros.effects.pulse_covariance import (
+    _law_p_value, fit_covariance, log_likelihood, white)
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.statistics.prediction import DeclaredModel
 from scipy.linalg import toeplitz
@@ -396,3 +398,44 @@ def test_likelihood_prefers_what_is_there(rng):
     for evidence, better in ((quiet, -1.0), (noisy, 1.0)):
         gain = log_likelihood(replace(evidence, explained=(excess,))) - log_likelihood(evidence)
         assert better * gain > 7.0
+
+
+def test_law_of_errors_beside_a_clock_is_without_the_declared_jitter(rng):
+    """The clock takes the place of the uniform jitter: what is left is normal."""
+    clock = make_effect('keyphasor_quantisation', clock_rate=5_000.0)
+    slow = make_effect('correlated_jitter', std=60e-6, correlation=0.8)
+    p_values = []
+    for _ in range(15):
+        errors = stationary(rng, 60e-6**2 * 0.8**LAGS, 120) + rng.normal(0.0, 4e-5, (120, PULSES))
+        evidence = evidence_of(rng, errors, explained=(clock, slow))
+        p_values.append(_law_p_value(evidence, fit_covariance(evidence, white)))
+    bare = replace(MODEL, jitter_distribution='table', jitter_table=(0.0,))
+    same = replace(evidence, model=bare, explained=(slow,))
+    assert p_values[-1] == pytest.approx(_law_p_value(same, fit_covariance(same, white)), rel=0.1)
+    assert np.median(p_values) > 0.01
+
+
+@pytest.mark.parametrize(('noise', 'acquisitions', 'cycles'), [
+    (np.full(12, 0.02), 12, 20), (np.array([0.01, 0.05, 0.05, 0.05]), 2, 20),
+    (np.array([0.01, 0.02]), 3, 6)])
+def test_chance_of_a_modulation_is_as_rare_as_stated(rng, noise, acquisitions, cycles):
+    draws = 20_000
+    weight = noise**-2.0 / np.sum(noise**-2.0)
+    values = rng.standard_normal((draws, acquisitions * cycles, noise.size)) * np.sqrt(weight)
+    means = np.mean(values.sum(axis=2) ** 2 - np.sum(values**2, axis=2), axis=1)
+    p_values = np.array([_chance(mean, weight, acquisitions * cycles) for mean in means[::2]])
+    for level in (1e-3, 1e-2, 0.5):
+        rate = np.mean(p_values < level)
+        assert abs(rate - level) < 4.0 * np.sqrt(level / p_values.size)
+
+
+def test_few_acquisitions_tell_no_noise_that_is_declared(rng):
+    """Their own scatter is uncertain: Student's law."""
+    model = replace(MODEL, noise_std=1.0)
+    p_values = []
+    for _ in range(4000):
+        evidence = replace(evidence_of(rng, np.zeros((3, 5))), model=model)
+        power = rng.chisquare(60.0, (3, 1)) / 60.0
+        p_values.append(EFFECTS['additive_noise'].fit(replace(evidence, lines=replace(
+            evidence.lines, noise_density=np.sqrt(power)))).p_value)
+    assert np.mean(np.array(p_values) < 0.01) < 0.01 + 4.0 * np.sqrt(0.01 / len(p_values))

@@ -47,7 +47,8 @@ class AdditiveNoise(Effect):
         # Of a median over lines of means over acquisitions; lines of other noise do not count.
         scatter = float(np.median(power.std(axis=0, ddof=1)))
         error = scatter * np.sqrt(max(1.0, 0.5 * np.pi * (width > 2)) / (count * width))
-        p_value = float(stats.norm.sf(value / error)) if error > 0.0 else 1.0
+        # Lines of an average share its noise floor at worst: only acquisitions are independent.
+        p_value = float(stats.t.sf(value / error, count - 1)) if error > 0.0 else 1.0
         if not p_value < _SIGNIFICANT:
             return absent(cls.name, 'the noise around the lines is the declared one',
                           p_value=p_value)
