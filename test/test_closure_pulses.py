@@ -180,3 +180,9 @@ def test_gap_turns_by_whole_cycles_whatever_the_speed():
         bench = make_bench(seen, [seen], [lost], ())
         found.append(bench.expect([effect], range(len(seen.acquisitions))).attenuation)
     np.testing.assert_allclose(found[0], found[1], atol=2e-5)
+
+
+@pytest.mark.parametrize('cycles', [1, 4])
+def test_too_few_trigger_cycles_are_named(cycles):
+    with pytest.raises(ModelError, match=f'trigger_cycles is {cycles}: .* at least 5'):
+        traced(simulated(acquisitions=2), replace(MODEL, trigger_cycles=cycles))

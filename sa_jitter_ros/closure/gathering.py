@@ -10,7 +10,8 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.closure.beat import find_beat
 from sa_jitter_ros.closure.cycle_reader import repaired
 from sa_jitter_ros.closure.expectation import Lines
-from sa_jitter_ros.closure.observation import Acquisition, Observation, recovered_again
+from sa_jitter_ros.closure.observation import (
+    Acquisition, CHANCE, Observation, recovered_again)
 from sa_jitter_ros.closure.tone import find_tone
 from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
@@ -45,7 +46,8 @@ def choose_lines(observation: Observation) -> Lines:
     with np.errstate(divide='ignore', invalid='ignore'):
         coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
             np.abs(cycles) ** 2, axis=(0, 1))
-    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (coherence > 4.0 / cycles.shape[1])
+    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (
+        coherence > CHANCE / cycles.shape[1])
     if good.any():
         good &= coherence >= _COHERENT * coherence[good].max()
     channel, order = np.nonzero(good)
@@ -140,11 +142,12 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
     if observation.against_reference:
         standard_errors = np.zeros_like(standard_errors)
     ripple = np.array([item.ripple for item in items])
+    resolved = [item.ripple_standard_error**2 for item in items
+                if np.isfinite(item.ripple_standard_error)]
     return Evidence(
         model=model, pulses=tuple(own), errors=np.array(errors),
         standard_errors=standard_errors, ripple=ripple,
-        ripple_standard_error=float(np.sqrt(np.nanmean(
-            [item.ripple_standard_error**2 for item in items]))) if items else float('nan'),
+        ripple_standard_error=float(np.sqrt(np.mean(resolved))) if resolved else float('nan'),
         against_reference=observation.against_reference,
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
         clock=clock, explained=tuple(effects),

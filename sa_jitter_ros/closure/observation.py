@@ -31,6 +31,8 @@ ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 
 MOST_SAMPLES = 200_000_000
+#: Lines are coherent from cycle to cycle by more than this many times the coherence of noise.
+CHANCE = 4
 _OTHER_MACHINE = 5.0
 # Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
@@ -133,6 +135,9 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     if recording.samples * recording.channels > MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
                              f'most {MOST_SAMPLES} values fit; cut the recording')
+    if model.trigger_cycles <= CHANCE:
+        raise ModelError(f'trigger_cycles is {model.trigger_cycles}: whether a line is coherent '
+                         f'from cycle to cycle takes at least {CHANCE + 1}; raise trigger_cycles')
     if model.sample_rate and abs(recording.sample_rate / model.sample_rate - 1.0) > 1e-3:
         raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
                          f'has {recording.sample_rate:g} Hz')
