@@ -226,3 +226,21 @@ def test_lattice_panel_names_the_clock_of_the_pulse_times(traces):
     imposed, seen = axes.lines[0].get_data()
     assert np.corrcoef(imposed, seen)[0, 1] > 0.99
     assert panel(traces['none'], 'pulse_errors', f'declared clock, {CLOCK:g} Hz')
+
+
+def test_lines_have_the_names_of_their_channels(traces):
+    axes = panel(traces['none'], 'amplitudes', 'cycle by cycle')
+    labels = axes.get_legend_handles_labels()[1]
+    assert {label.split(', ')[1] for label in labels} == {'<left>', 'right & top'}
+
+
+def test_fold_counts_the_pulses_that_lack(traces):
+    trace = traces['geometry']
+    first, *rest = trace.evidence.pulses
+    # from pulse 7 of the first acquisition on, one pulse lacks: its marks are the next ones
+    missing = np.where(np.arange(len(first.times) - 1) == 6, 1, 0)
+    gap = replace(trace, evidence=replace(trace.evidence, pulses=(
+        replace(first, missing=missing), *rest)))
+    whole, shifted = (curve(panel(item, 'trigger_cycle', 'folded by 3 pulses'),
+                            'with target_geometry')[1] for item in (trace, gap))
+    np.testing.assert_allclose(shifted, whole, atol=1.0)  # us, each pattern has mean 0

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.closure.expected_errors import (
     cycle_places, lags_of, Version, versions_of, whole)
-from sa_jitter_ros.closure.plotting import AFTER, BEFORE, MEASURED, panels
+from sa_jitter_ros.closure.plotting import AFTER, BEFORE, legend_below, MEASURED, panels
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.prediction import predict_with
@@ -48,26 +48,26 @@ def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     return figure
 
 
-def amplitudes(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+def amplitudes(evidence: Evidence, channel_names: Sequence[str]) -> Figure:
     """Draw how the amplitudes of the strongest lines move: over time, together, their spectrum."""
     lines = evidence.lines
     figure, axes = panels(3, columns=3)
     strongest = np.argsort(lines.radial_noise)[:4]
-    names = [f'order {lines.order[k]:g}, channel {lines.channel[k]}' for k in strongest]
+    names = [f'order {lines.order[k]:g}, {channel_names[lines.channel[k]]}' for k in strongest]
     moves = lines.radial[..., strongest]
     cycles = moves.shape[1]
     for move, name in zip(moves.reshape(-1, len(names)).T, names):
         axes[0].plot(move, linewidth=0.6, alpha=0.8, label=name)
     axes[0].set(title='cycle by cycle', xlabel='trigger cycle of the fitted acquisitions',
                 ylabel='amplitude over its level, less 1')
-    axes[0].legend(fontsize='x-small')
+    legend_below(axes[0])
     for other in range(1, len(names)):
         axes[1].plot(_thinned(moves[..., 0]), _thinned(moves[..., other]), '.', markersize=2,
                      color=f'C{other}', label=names[other])
     axes[1].set(title='do they move together?', xlabel=f'less 1: {names[0]}',
                 ylabel='less 1: other lines')
     if len(names) > 1:
-        axes[1].legend(fontsize='x-small')
+        legend_below(axes[1])
     power = np.mean(np.abs(np.fft.rfft(moves, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
     axes[2].semilogy(np.fft.rfftfreq(cycles)[1:], power, linewidth=0.9)
     axes[2].set(title='spectrum', xlabel='frequency in cycles per trigger cycle',
@@ -90,7 +90,7 @@ def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
                   label='known of the first')
     axes.set(title='over an acquisition', xlabel='time since its start [s]',
              ylabel='pulse error [µs]')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _law(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -104,7 +104,7 @@ def _law(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
         axes.hist(_MICRO * item.draws, edges, density=True, histtype='step', color=item.colour,
                   label=item.label)
     axes.set(title='law', xlabel='pulse error [µs]', ylabel='density [1/µs]')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -120,7 +120,7 @@ def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]
     axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o', markersize=3,
                   capsize=2, color=MEASURED, label='recovered')
     axes.set(title='autocorrelation', xlabel='lag [trigger pulses]', ylabel='correlation')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _return_map(axes: Axes, evidence: Evidence) -> None:
@@ -142,7 +142,7 @@ def _lattice(axes: Axes, evidence: Evidence) -> None:
         axes.plot(*2 * [[grid.min(), grid.max()]], color=AFTER, linewidth=0.9, label='slope 1')
         axes.set(title=f'clock of the pulse times, {evidence.clock.rate:.6g} Hz',
                  xlabel='error that its ticks impose [µs]', ylabel='recovered pulse error [µs]')
-        axes.legend(fontsize='x-small')
+        legend_below(axes)
         return
     rate = evidence.model.keyphasor_rate
     ticks = ((evidence.times - evidence.errors) * rate) % 1.0
@@ -163,7 +163,7 @@ def _origin(axes: Axes, evidence: Evidence) -> None:
     axes.plot(ends, 0.0 * ends, color=BEFORE, linewidth=0.9, label='the vibration moves')
     axes.set(title='whose error: second differences', xlabel='of the pulse errors [µs]',
              ylabel='of the pulse times [µs]')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
@@ -175,7 +175,7 @@ def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> 
         axes.axhline(_MICRO * item.std, color=item.colour, linewidth=0.9, label=item.label)
     axes.set(title='size over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
     axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _intervals(axes: Axes, evidence: Evidence) -> None:
@@ -199,7 +199,7 @@ def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> Non
     axes.set(title='over the trigger cycle', xlabel='u, position in the trigger cycle',
              ylabel='RMS angle error [µs]')
     axes.set_ylim(bottom=0.0)
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _angle_errors(evidence: Evidence, u: Array) -> Array:
@@ -242,7 +242,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.set_xticks([], minor=True)
     axes.set(title=f'order {g:g} over the number of cycles', xlabel='averaged trigger cycles',
              ylabel='attenuation')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
@@ -254,9 +254,8 @@ def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     marks = len(angles[0]) if angles else 1
     period = marks // int(np.gcd(marks, step)) if marks > 1 else 12
     period = min(period, evidence.errors.shape[1])
-    index = np.array([pulses.first + np.arange(evidence.errors.shape[1])
-                      for pulses in evidence.pulses]) % period
-    places = np.arange(period)
+    index = np.array([pulses.index for pulses in evidence.pulses]) % period
+    places = np.unique(index)
     mean = np.array([evidence.errors[index == k].mean() for k in places])
     error = np.array([evidence.errors[index == k].std() / np.sqrt((index == k).sum())
                       for k in places])
@@ -268,7 +267,7 @@ def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     axes.axhline(0.0, color='0.4', linewidth=0.8)
     axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse mod {period}',
              ylabel='pulse error [µs]')
-    axes.legend(fontsize='x-small')
+    legend_below(axes)
 
 
 def _thinned(values: Array) -> Array:

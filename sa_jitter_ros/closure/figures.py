@@ -74,7 +74,8 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
          evidence_figures.trigger_cycle),
         ('amplitudes', 'Amplitudes of the lines',
          'How the amplitudes move from cycle to cycle once the pulse errors are taken out: what '
-         'is no matter of timing.', evidence_figures.amplitudes))
+         'is no matter of timing.', lambda evidence, _: evidence_figures.amplitudes(
+             evidence, trace.observation.channel_names)))
     for name, title, caption, draw in drawn:
         found.append(Illustration(name, title, caption, draw(trace.evidence, effects)))
     return tuple(found)

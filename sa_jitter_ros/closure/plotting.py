@@ -24,3 +24,9 @@ def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
         one.grid(alpha=0.3)
         one.tick_params(labelsize='small')
     return figure, axes[:count]
+
+
+def legend_below(axes: Axes) -> None:
+    """Add the legend below a panel, where it hides no data."""
+    axes.legend(fontsize='x-small', loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2,
+                frameon=False)
