@@ -186,3 +186,11 @@ def test_gap_turns_by_whole_cycles_whatever_the_speed():
 def test_too_few_trigger_cycles_are_named(cycles):
     with pytest.raises(ModelError, match=f'trigger_cycles is {cycles}: .* at least 5'):
         traced(simulated(acquisitions=2), replace(MODEL, trigger_cycles=cycles))
+
+
+def test_order_that_is_not_compared_is_named():
+    content = report(traced(simulated(), replace(MODEL, orders=(8.0, 13.0, 16.0))))
+    assert {item['order'] for item in content['lines']} == {8.0, 16.0}
+    assert any(text.startswith('order 13 was declared and is not compared')
+               for text in content['remarks'])
+    assert 'order 13' in summary(content)

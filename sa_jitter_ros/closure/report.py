@@ -32,7 +32,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
                      'effects': {effect.name: effect.values for effect in trace.declared}},
         'measured_speed': observation.model.trigger_speed,
         'recordings': list(recordings),
-        'remarks': observation.pulses.remarks,
+        'remarks': [*observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
         'against': 'reference keyphasor' if observation.against_reference else 'vibration',
@@ -95,6 +95,14 @@ def plain(value: Any) -> Json:
     if isinstance(value, (float, np.floating)):
         return float(value) if math.isfinite(value) else None
     return value
+
+
+def _not_compared(trace: Trace) -> Sequence[str]:
+    """Say which declared orders have no line to compare."""
+    orders = trace.observation.orders
+    return [f'order {orders[g]:g} was declared and is not compared: on no channel does it stand '
+            'out of the noise from cycle to cycle as the other lines do'
+            for g in np.setdiff1d(np.arange(orders.size), trace.lines.order)]
 
 
 def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
