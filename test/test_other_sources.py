@@ -29,8 +29,9 @@ def sources(rng, ratio, orders, *, drift, tone=0.0):
 def test_orders_of_other_shafts_are_found_and_tones_are_not(rng):
     orders = {8.0: 1.0, 8.37: 0.2, 12.3: 0.1}
     found = sources(rng, 2.4, orders, drift=0.01, tone=0.3)
-    # a hundredth of what an average resolves
-    np.testing.assert_allclose(found, [8.37, 12.3], atol=0.01 / (CYCLES * 2.4))
+    # places of single acquisitions scatter by 0.04 of what an average resolves; of 5, 3 errors
+    np.testing.assert_allclose(found, [8.37, 12.3],
+                               atol=3.0 * 0.04 / np.sqrt(5.0) / (CYCLES * 2.4))
 
 
 @pytest.mark.parametrize(('other', 'count'), [(9.0, 1), (9.0 + 1.0 / 3.0, 1), (9.04, 0)])
