@@ -133,11 +133,11 @@ def _rms(error: Mapping[str, Any]) -> float:
 
 def _standard_errors(stated: Mapping[str, Any], truth: Any) -> float:
     """Return the error of a parameter in standard errors, of a list its root mean square."""
-    value, error = np.array(stated['value']), np.array(stated['standard_error'])
+    value, error = np.array(stated['value']), np.array(stated['standard_error'], float)
     if value.shape != np.shape(truth):
         return float('nan')
     off = value - truth
-    off = off - off.mean() if off.ndim else off
+    off = off - off[np.isfinite(error)].mean() if off.ndim else off  # None: a mark never seen
     with np.errstate(divide='ignore', invalid='ignore'):
         z = off / error
     return float(np.sqrt(np.nanmean(z**2))) if z.ndim else float(z)
