@@ -86,7 +86,7 @@ def other_cases() -> list[Case]:
              'orders': [12.0, 16.0, 18.0, 36.0, 54.0, 72.0]}
     return [
         Case('motor, 10 V', [stored('motor_10V_100kHz.npz')],
-             {**motor, 'trigger_speed': 19.6, 'trigger_cycles': 4}),
+             {**motor, 'trigger_speed': 19.6, 'trigger_cycles': 5}),
         Case('motor, 30 V', [stored('motor_30V_100kHz.npz')],
              {**motor, 'trigger_speed': 94.4, 'trigger_cycles': 8}),
         Case('motor, run-up', [stored('motor_runup_20V_40kHz.npz')],
@@ -213,7 +213,7 @@ def error_figure(cases: Sequence[Case]) -> Figure:
         axes.bar(place + shift, [case.value(when, 'rms') for case in used], 0.38, color=colour,
                  label=f'{when} the loop')
     axes.set_xticks(place, [case.title.replace(', ', ',\n') for case in used], fontsize='small')
-    axes.set(ylabel='RMS of observed minus\npredicted attenuation', yscale='log', ylim=(1e-3, 0.4))
+    axes.set(ylabel='RMS of observed minus\npredicted attenuation', yscale='log', ylim=(1e-4, 1.0))
     axes.grid(axis='y', alpha=0.3)
     axes.legend(fontsize='small')
     return figure

@@ -109,6 +109,17 @@ def test_demo_plays_a_wav_whose_tach_channel_it_is_told(machine, process_environ
     assert 'give --tach-channel' in without.stderr
 
 
+def test_demo_says_why_nothing_is_corrected(process_environment, tmp_path, rng):
+    path = tmp_path / 'noise.npz'
+    write_npz(path, Recording(
+        ArraySource(rng.standard_normal((1, round(RATE * SECONDS)))), RATE,
+        pulse_times=np.arange(0.1, SECONDS, 1.0 / SPEED), orders=(1.0,)))
+    done = run_demo(process_environment, str(path), '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert re.search('note: the correction of [0-9]+ averages was refused: .*synchronous order',
+                     done.stdout), done.stdout
+
+
 def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_path):
     path = tmp_path / 'broken.npz'
     path.write_bytes(b'PK\x03\x04 and nothing else')

@@ -120,6 +120,11 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
         spread = (sum(float((e**2).sum()) for e in errors) / sum(map(len, errors))) ** 0.5
         print(f'\npulse errors recovered from the vibration: {spread * 1e6:.3g} us (standard '
               f'deviation), declared {1e6 / plan.keyphasor_rate / 12**0.5:.3g} us')
+    averager = watcher.status.get('synchronous_averager', {})
+    refused = averager.get('shaft.corrections_refused')
+    if refused:
+        print(f'note: the correction of {refused} averages was refused: '
+              f'{averager["shaft.refusal"]}')
     if plan.note:
         print(f'note: {plan.note}')
     last = {kind: items[-1] if items else None for kind, items in watcher.averages.items()}
