@@ -29,15 +29,17 @@ def text_table(plan: Plan, amplitudes: Sequence[AverageMessage],
     """Table of the orders: measured amplitude, attenuation, and what was predicted."""
     rows, channels = amplitude_rows(amplitudes)
     unit = f' [{plan.unit}]' if plan.unit and plan.unit != 'unknown' else ''
-    lines = [f'{"order":>8} {"channel":>12} {"amplitude" + unit:>16} {"corrected":>10} '
+    names = [plan.channels[int(channel)] for channel in channels]
+    width = max(12, *map(len, names))
+    lines = [f'{"order":>8} {"channel":>{width}} {"amplitude" + unit:>16} {"corrected":>10} '
              f'{"noise":>9} {"attenuation":>12} {"predicted mean [5 % .. 95 %]":>30}']
     for i in range(rows.shape[1]):
         order, raw, _, corrected, _, attenuation, _, noise = (
             _mean(rows[:, i, field]) for field in range(rows.shape[2]))
         row = prediction.values[i] if prediction is not None else np.full(7, np.nan)
         lines.append(
-            f'{order:8g} {plan.channels[int(channels[i])][:12]:>12} {raw:16.5g} {corrected:10.5g} '
-            f'{noise:9.2g} {attenuation:12.4f} {row[1]:14.4f} [{row[4]:.4f} .. {row[6]:.4f}]')
+            f'{order:8g} {names[i]:>{width}} {raw:16.5g} {corrected:10.5g} {noise:9.2g} '
+            f'{attenuation:12.4f} {row[1]:14.4f} [{row[4]:.4f} .. {row[6]:.4f}]')
     return '\n'.join(lines)
 
 
