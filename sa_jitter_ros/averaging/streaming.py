@@ -234,16 +234,16 @@ class StreamingAverager:
         first = self._next - begin
         low, high = (stretch.position(float(pulse)) for pulse in pulses[first:first + 2])
         self.timeline.counts.samples_dropped += stretch.use(low, high)
-        averages, failed = [], ''
+        averages, failed, clock = [], '', stretch.clock
         self._lead = 0.0
         for name, shaft in self.shafts.items():
-            margin = shaft.margin(float(pulses[first + 1] - pulses[first]), stretch.clock.rate)
-            self._lead = max(self._lead, 1.5 * margin / stretch.clock.rate)
+            margin = shaft.margin(float(pulses[first + 1] - pulses[first]), clock.rate)
+            self._lead = max(self._lead, 1.5 * margin / clock.rate)
             offset = max(int(np.floor(low)) - margin, 0)
-            clock, begin = stretch.clock, stretch.index + offset
+            index = stretch.index + offset
             cycle = CycleSamples(
                 stretch.samples[offset:int(np.ceil(high)) + margin + 1], clock.time, clock.rate,
-                pulses, first, lead=(begin - clock.index) / clock.rate)
+                pulses, first, lead=(index - clock.index) / clock.rate)
             try:
                 average = shaft.update(cycle)
             except SignalError as error:  # of this shaft: the others go on

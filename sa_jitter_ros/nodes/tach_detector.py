@@ -56,17 +56,17 @@ PARAMETERS = (
 )
 
 
-DETECTOR = ('automatic_threshold', 'threshold', 'hysteresis', 'polarity', 'edge', 'interpolate',
-            'minimum_interval', 'learning_time', 'minimum_difference')
+# Parameters that are options of the detector as they are, and all that decide what it finds.
+OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
+           'minimum_difference')
+DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
 
 
 def detector_of(values: Values) -> KeyphasorDetector:
     """Detector with these parameters; raises `ParameterError`."""
     return KeyphasorDetector(
         threshold=None if values['automatic_threshold'] else values['threshold'],
-        hysteresis=values['hysteresis'], polarity=values['polarity'], edge=values['edge'],
-        interpolate=values['interpolate'], minimum_interval=values['minimum_interval'],
-        learning_time=values['learning_time'], minimum_difference=values['minimum_difference'])
+        **{name: values[name] for name in OPTIONS})
 
 
 class TachDetector(MonitoringNode):
@@ -95,7 +95,7 @@ class TachDetector(MonitoringNode):
 
     def _apply(self, values: Values) -> None:
         self._keyphasor = values['keyphasor']
-        if any(values[name] != self._values[name] for name in DETECTOR):
+        if any(values[name] != self._values[name] for name in DECISIVE):
             self._begin(values)
         self._values = values
 
