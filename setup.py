@@ -14,12 +14,12 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('close_loop', 'demo', 'design', 'reproduce')
+COMMANDS = ('close_loop', 'demo', 'design')
 
 setup(
     name=NAME,
     version='0.1.0',
-    description='On-line synchronous averaging of vibration, honest about keyphasor jitter',
+    description='Synchronous averaging of vibration, with the effect of keyphasor jitter',
     author='sa_jitter_ros contributors',
     maintainer='sa_jitter_ros maintainers',
     maintainer_email='maintainers@sa-jitter-ros.example',
@@ -41,6 +41,7 @@ setup(
         'scipy>=1.10',
     ],
     extras_require={
+        'docs': ['myst-parser>=2,<6', 'sphinx>=7.2,<10'],
         'test': [
             'catkin_pkg',
             'colcon-bash',

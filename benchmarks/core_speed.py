@@ -15,8 +15,7 @@ import tracemalloc
 from typing import Any
 
 import numpy as np
-from peers import METHODS, Package, PACKAGES, stream
-from record import gains, make_record, Record
+from peers import gains, make_record, METHODS, Package, PACKAGES, Record, stream
 from timing import interleaved, machine, memory_bandwidth, multiply_adds, Timing
 
 TAPS = 16  # of the band-limited kernel: multiply-adds in a resampled value

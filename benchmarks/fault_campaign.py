@@ -11,22 +11,21 @@ docs/reliability.md. The exit status is 1 if anything was wrong.
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 import json
 from pathlib import Path
 import sys
 import time
 from typing import Any
 
-from fault_check import ShaftChecker, WrongAverageError
-from fault_correction import check_correction
+from fault_check import check_correction, ShaftChecker, WrongAverageError
 from fault_disturb import Disturber
 from fault_graph import Graph, ROLES, SHAFTS
 from fault_residual import check_report, ResidualChecker
 from fault_source import FaultySource, KEYPHASOR, Scene
+from matplotlib.figure import Figure
 import numpy as np
-from performance_page import fill
-from reliability_page import draw_faults, fault_sections
+from page import fill, growth, LONG, MEMORY, table
 
 ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
@@ -59,7 +58,7 @@ class Campaign:
 
     def play(self, *, kills: bool) -> None:
         """Play a scene and wait until all averages are well again."""
-        self.source.displace = self.disturber.set_law()
+        self.source.displace = self.disturber.set_angle_law()
         scene = self.source.scene()
         self.disturber.faults.clear()
         before = self.averages
@@ -208,7 +207,7 @@ class Campaign:
 def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float = 1.0
         ) -> dict[str, Any]:
     """Run a campaign; nodes are killed in the first half, memory is watched in the second."""
-    graph, told = Graph(), 0
+    graph, reported = Graph(), 0
     try:
         graph.start(list(ROLES))
         campaign = Campaign(seed, graph, jitter=jitter)
@@ -216,13 +215,13 @@ def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float 
             campaign.play(kills=number < scenes // 2)
             if number % 5 == 4:
                 campaign.account()
-            if number % 10 == 9 or campaign.wrong[told:]:
+            if number % 10 == 9 or campaign.wrong[reported:]:
                 report('\n'.join([
                     f'{number + 1} of {scenes} scenes, {sum(campaign.faults.values())} faults, '
                     f'{campaign.averages} averages, {len(campaign.wrong)} wrong',
-                    *campaign.wrong[told:]]))
-            told = len(campaign.wrong)
-            if told > 20 or graph.died:
+                    *campaign.wrong[reported:]]))
+            reported = len(campaign.wrong)
+            if reported > 20 or graph.died:
                 break
         if scenes >= ENOUGH and not campaign.residuals.checked:
             campaign.wrong.append('analyser: no residual')
@@ -238,6 +237,68 @@ def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float 
         'recovery': campaign.recovery, 'corrected': dict(campaign.corrected),
         'residuals': campaign.residuals.checked, 'verdicts': dict(campaign.verdicts),
         'rss': [(role, life.rss) for role, life in lives]}
+
+
+# --- the page ------------------------------------------------------------------------------------
+
+def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
+    """Return the contents of the campaign's sections."""
+    faults, checked = found['faults'], found['checked']
+    rows = [(kind, f'{count:,}', f'{checked[kind]:,}') for kind, count in faults.items()]
+    averages, extra = found['averages'], found['recovery']
+    corrected, verdicts = found['corrected'], found['verdicts']
+    again = [scenes for scenes in extra if scenes]
+    later = f'; {len(again)} needed up to {max(again)} more' if again else ''
+    summary = (
+        f'{sum(faults.values()):,} faults in {found["scenes"]} scenes and {found["seconds"]:.0f} '
+        f's (seed {found["seed"]}): {sum(averages.values()):,} averages were published and '
+        f'checked ({", ".join(f"{name} {count:,}" for name, count in averages.items())}), '
+        f'**{len(found["wrong"])} things were wrong**, {len(found["died"])} nodes died of '
+        f'themselves. Of the averages with `correct_jitter`, {corrected["corrected"]:,} were '
+        f'corrected and {corrected["refused"]:,} refused; {found["residuals"]:,} residuals were '
+        f'recomputed and {sum(verdicts.values()):,} traces looked through '
+        f'({", ".join(f"{name} {count:,}" for name, count in verdicts.items())}). In '
+        f'{len(extra) - len(again)} of {len(extra)} scenes all averages were back '
+        f'within the faultless 1.4 s at its end{later}.')
+    memory = [(role, *growth(rss)) for role, rss in found['rss']
+              if rss and rss[-1][0] - rss[0][0] > LONG]
+    return {'campaign': summary,
+            'faults': table(('fault', 'injected', 'averages checked in scenes with it'), rows),
+            'memory': table(('node', *MEMORY), memory)}
+
+
+def draw_faults(found: Mapping[str, Any], folder: Path) -> None:
+    """Draw faults by kind, and the memory of every process over time."""
+    kinds = list(found['faults'])[::-1]
+    figure = Figure(figsize=(10.0, 0.16 * len(kinds) + 3.6), layout='constrained')
+    bars, memory = figure.subplots(2, 1, height_ratios=(0.16 * len(kinds), 2.6))
+    place = np.arange(len(kinds))
+    bars.barh(place + 0.2, [found['checked'][kind] for kind in kinds], 0.4, color='tab:blue',
+              label='averages checked in scenes with it, all true' if not found['wrong']
+              else 'averages checked in scenes with it')
+    bars.barh(place - 0.2, [found['faults'][kind] for kind in kinds], 0.4, color='tab:orange',
+              label='injected')
+    bars.set_yticks(place, kinds, fontsize=7)
+    bars.set_ylim(-0.6, len(kinds) - 0.4)
+    bars.set_xscale('log')
+    bars.legend(loc='upper center', bbox_to_anchor=(0.5, 1.07), ncols=2, fontsize=8)
+    bars.grid(axis='x', alpha=0.3)
+    roles = list(dict.fromkeys(role for role, _ in found['rss']))
+    for role, rss in found['rss']:
+        if rss:
+            times, values = np.array(rss).T
+            first = role in roles
+            memory.plot(times, values, '.-', markersize=2, linewidth=0.8,
+                        color=f'C{list(dict.fromkeys(r for r, _ in found["rss"])).index(role)}',
+                        label=role if first else None)
+            if first:
+                roles.remove(role)
+    memory.set_xlabel('time [s]; a line ends where its process was killed')
+    memory.set_ylabel('resident memory [MB]')
+    memory.set_ylim(bottom=0.0)
+    memory.legend(fontsize=8, ncols=5)
+    memory.grid(alpha=0.3)
+    figure.savefig(folder / 'reliability-faults.png', dpi=110)
 
 
 def main() -> int:

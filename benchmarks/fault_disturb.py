@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from fault_graph import Graph, ORDERS, ROLES, TOLD
+from fault_graph import DECLARED_ORDERS, Graph, ORDERS, ROLES
 import numpy as np
 from rclpy.task import Future
 from sa_jitter_ros.nodes.messages import encode_array
@@ -17,10 +17,10 @@ VALID: dict[str, list[tuple[str, list[Any]]]] = {
         ('pulses_per_trigger', [0, 1, 2]), ('missing_pulses', ['break', 'bridge']),
         ('interval_tolerance', [0.2, 0.25, 0.28]), ('gear.samples_per_revolution', [0, 300, 512]),
         ('tach.mesh_orders', [[5.0], [12.0]]), ('keyphasor_rate', [0.0, 6400.0])],
-    'averager': [('trigger_cycles', [4, 6, 6]), ('shaft.orders', [TOLD, [1.0, 5.0]]),
+    'averager': [('trigger_cycles', [4, 6, 6]), ('shaft.orders', [DECLARED_ORDERS, [1.0, 5.0]]),
                  ('correct_jitter', [True, False]), ('keyphasor_rate', [0.0, 6400.0])],
     'predictor': [
-        ('trigger_cycles', [4, 6, 6]), ('orders', [TOLD, [1.0, 40.0]]),
+        ('trigger_cycles', [4, 6, 6]), ('orders', [DECLARED_ORDERS, [1.0, 40.0]]),
         ('ratio', [1.0, 1.0, 2.40789]),
         ('effects.excess_jitter.std', [1e-6, 2e-5]),
         ('effects.excess_jitter.enabled', [True, False]),
@@ -46,7 +46,7 @@ NONSENSE = ('shaft_speed', 'shaft/order_amplitude', 'shaft/pulse_error', 'predic
 
 class Disturber:
     """
-    Disturbs nodes of a graph at random; `killed` is told of each that was.
+    Disturbs nodes of a graph at random; `killed` is called with each that is killed.
 
     `settings` are the parameters that each averager may have at present, the newest last; the
     lists stay the same objects.
@@ -76,7 +76,7 @@ class Disturber:
             actions.append(self._stall)
         return actions
 
-    def set_law(self) -> bool:
+    def set_angle_law(self) -> bool:
         """Choose the angle law of the next scene; return whether pulses may be displaced."""
         law = str(self.rng.choice(['linear', 'linear', 'linear', 'quadratic', 'spline']))
         if law != self.settings['direct'][-1].get('angle_law', 'linear'):

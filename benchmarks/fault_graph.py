@@ -40,9 +40,10 @@ AVERAGER: dict[str, Any] = {
     'averaging': 'block', 'missing_pulses': 'break', 'keyphasor': 'keyphasor'}
 DIRECT = {**AVERAGER, 'shafts': ['tach', 'gear'], 'gear.ratio': 2.40789, 'tach.ratio': 1.0,
           'tach.orders': ORDERS, 'gear.orders': ORDERS}
-TOLD = [1.0, 5.0, MESH]
-DETECTED = {**AVERAGER, 'shaft.orders': TOLD, 'shaft.ratio': 1.0, 'correct_jitter': True}
-MODEL = {'pulses_per_revolution': 2, 'trigger_cycles': CYCLES, 'orders': TOLD,
+DECLARED_ORDERS = [1.0, 5.0, MESH]
+DETECTED = {**AVERAGER, 'shaft.orders': DECLARED_ORDERS, 'shaft.ratio': 1.0,
+            'correct_jitter': True}
+MODEL = {'pulses_per_revolution': 2, 'trigger_cycles': CYCLES, 'orders': DECLARED_ORDERS,
          'follow_shaft_speed': True, 'keyphasor_rate': 6400.0}
 DETECTOR = {'automatic_threshold': False, 'threshold': 0.5, 'learning_time': 0.3}
 

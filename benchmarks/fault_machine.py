@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.timeline import SampleBlock
+from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -160,7 +160,7 @@ class Window:
 
 
 def equal_weights(count: int) -> FloatArray:
-    """Return the weights of a plain mean."""
+    """Return equal weights."""
     return np.full(count, 1.0 / max(count, 1))
 
 

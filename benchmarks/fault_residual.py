@@ -11,7 +11,7 @@ from typing import Any
 
 from fault_check import WrongAverageError
 import numpy as np
-from sa_jitter_ros.closure.expectation import RESOLUTION
+from sa_jitter_ros.inference.expectation import RESOLUTION
 from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage, ResidualMessage
 
 KEPT = 300  # averages and predictions that a residual may be of

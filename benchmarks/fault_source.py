@@ -13,8 +13,8 @@ from typing import Any
 
 from fault_machine import MESH, RATE, Run, TEETH
 import numpy as np
-from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.nodes.messages import encode_pulse_reference, encode_samples
+from sa_jitter_ros.samples import SampleBlock
 
 BODY, TAIL = 1.4, 1.4  # s of a scene with faults, and without: 170 pulses fill no queue
 SHORTEST = 0.25  # s that a source sends before it changes again: two blocks or more
@@ -26,8 +26,8 @@ TEETH_FAULTS = ('missing', 'double', 'stray', 'displaced', 'far displaced')
 PULSES = ('lost', 'repeated', 'swapped', 'late', 'foreign', 'wild')
 SPACING = 8  # teeth between two faults of teeth or pulses
 JITTER = 1.0 / RATE  # s, declared width of the errors that all teeth have
-# Teeth at the end of a scene without them. The next scene's law may be one that curves between
-# such pulses: it reads eight cycles back from averages that wait for their last pulses.
+# Teeth at the end of a scene without them. The next scene's angle law may curve between such
+# pulses: it reads eight cycles back from averages that wait for their last pulses.
 STEADY = 56
 REJECTED = ('layout', 'header', 'channels', 'rate')  # messages that are refused as such
 

@@ -23,9 +23,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.nodes.base import INPUT_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import encode_pulse_reference, encode_samples
+from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
 from std_msgs.msg import Float64MultiArray
 

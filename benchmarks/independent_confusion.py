@@ -23,7 +23,6 @@ from typing import Any
 from independent_effects import draw_case, KNOWN, UNKNOWN
 from independent_machines import declared, record
 import numpy as np
-from sa_jitter_ros.closure.report import report as make_report
 from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.errors import SaJitterError
 
@@ -68,14 +67,14 @@ class Run:
             self.verdict == ('traced' if self.found else 'none'))
 
 
-def judge(effects: tuple[str, ...], seed: int, folder: Path, *, plain: bool = False,
+def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: bool = False,
           pictures: bool = False) -> Run:
     """
     Draw a case, run `close_loop` on it in `folder` and read its report.
 
     Without `pictures`, which take most of its time, the command stops short of drawing them.
     """
-    case = draw_case(effects, seed, plain=plain)
+    case = draw_case(effects, seed, only_declared=only_declared)
     fields = record(case.machine, case.what, np.random.default_rng([seed, 1]))
     np.savez(folder / 'machine.npz', **fields)
     (folder / 'model.yaml').write_text(declared(case.machine))
@@ -121,7 +120,7 @@ def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str,
         status = close_loop.main(arguments)
         return status, {} if status else json.loads((options.output / 'report.json').read_text())
     try:
-        return 0, make_report(close_loop.run(options))
+        return 0, close_loop.run(options).report
     except SaJitterError as error:
         print(error, file=sys.stderr)
         return 2, {}
@@ -178,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--pairs', type=int, default=3, help='machines a pair of effects')
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--only', help='one case, effects joined by +')
-    parser.add_argument('--plain', action='store_true', help='no undeclared orders')
+    parser.add_argument('--only-declared', action='store_true', help='no undeclared orders')
     parser.add_argument('--pictures', action='store_true', help='run the whole command')
     parser.add_argument('--keep', type=Path, help='folder for all files of the runs')
     options = parser.parse_args(arguments)
@@ -195,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 if options.keep:
                     folder = options.keep / f'{"+".join(effects) or "none"}_{seed}'
                     folder.mkdir(parents=True, exist_ok=True)
-                run = judge(effects, seed, folder, plain=options.plain,
+                run = judge(effects, seed, folder, only_declared=options.only_declared,
                             pictures=options.pictures)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)

@@ -11,9 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from independent_draws import draw_machine
-from independent_machines import (
-    Array, attenuation, band, Disturbance, Generator, Machine, Waves)
+from independent_machines import (Array, attenuation, band, Disturbance, draw_machine, Generator,
+                                  Machine, Waves)
 import numpy as np
 from scipy import signal
 
@@ -208,16 +207,16 @@ UNKNOWN = ('following_level', 'late_recovery', 'two_paths', 'resonance')
 _MAKERS = {item.__name__: item for item in MEAN + AS_THEY_ARE + SCATTER}
 
 
-def draw_case(names: tuple[str, ...], seed: int, *, plain: bool = False) -> Case:
+def draw_case(names: tuple[str, ...], seed: int, *, only_declared: bool = False) -> Case:
     """
     Draw a machine and what of `names` happens to it; no name: the declared model is right.
 
-    A `plain` machine has no vibration but the declared orders: no sidebands, no other shafts.
+    A machine of `only_declared` orders has neither sidebands nor other shafts.
     """
     for attempt in range(200):
         rng = np.random.default_rng([seed, attempt, *(ord(c) for c in '+'.join(names))])
         machine = _machine(rng, names)
-        if plain:
+        if only_declared:
             count = machine.orders.size
             machine = replace(machine, components=machine.orders, peaks=machine.peaks[:, :count])
         what, truth = Disturbance(), {}

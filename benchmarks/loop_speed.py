@@ -19,12 +19,12 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.prediction.distributions import Uniform
+from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
+from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
 from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh
 from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
 from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
-from sa_jitter_ros.statistics.distributions import Uniform
-from sa_jitter_ros.statistics.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
 from timing import interleaved, machine
 
 RATIO = 2.40789
@@ -56,7 +56,7 @@ def prediction(orders: int, rounds: int) -> dict[str, float]:
         'table of 50 errors, 40 trigger cycles': model(
             40, jitter_distribution='table', jitter_table=table),
         'uniform, 1000 trigger cycles': model(1000),
-        'uniform, 5 trigger cycles (law is sampled)': model(5)}
+        'uniform, 5 trigger cycles (distribution is sampled)': model(5)}
     timings = interleaved({name: partial(predict, item) for name, item in models.items()},
                           rounds=rounds)
     return {name: 1e3 * timing.median for name, timing in timings.items()}
@@ -82,7 +82,7 @@ def recovery(count: int, rounds: int) -> dict[str, float]:
     calls = {}
     for channels in (1, 8, 64):
         cycles, periods, jitter = trigger_cycles(count, channels)
-        call = partial(recover_pulse_errors, cycles, periods=periods, ratio=RATIO,
+        call = partial(recover_pulse_errors, cycles, periods=periods, cycle_length=RATIO,
                        declared_standard_deviation=jitter)
         assert call().accepted
         calls[f'{count} trigger cycles x {channels} channels'] = call
@@ -108,7 +108,7 @@ def clock(count: int, rounds: int) -> float:
     elapsed = []
     for _ in range(rounds + 1):
         start = time.perf_counter()
-        recover_pulse_errors(cycles, periods=periods, ratio=RATIO,
+        recover_pulse_errors(cycles, periods=periods, cycle_length=RATIO,
                              declared_standard_deviation=jitter)
         elapsed.append(1e3 * (time.perf_counter() - start))
     return median(elapsed[1:])
@@ -117,17 +117,18 @@ def clock(count: int, rounds: int) -> float:
 def iterations(count: int, rounds: int) -> dict[str, float]:
     """Monte Carlo iterations per second: averages of 40 trigger cycles at one order."""
     signal = AveragedSignal(trigger_cycles=40, cycle_length=RATIO, order=19.0)
-    law = Uniform(RATIO * SPEED / KEYPHASOR_RATE)
+    distribution = Uniform(RATIO * SPEED / KEYPHASOR_RATE)
     rng = np.random.default_rng(3)
 
     def one_by_one() -> None:
         for _ in range(count // 100):
-            signal.whole_trigger_cycles(law.draw(rng, (1, 41)))
+            signal.whole_trigger_cycles(distribution.draw(rng, (1, 41)))
 
-    calls = {name: partial(monte_carlo, method, law, 40, count, seed=1) for name, method in (
-        ('whole trigger cycles', signal.whole_trigger_cycles),
-        ('whole fundamental cycles', signal.whole_fundamental_cycles),
-        ('majority assignment', signal.majority_assignment))}
+    methods = {'whole trigger cycles': signal.whole_trigger_cycles,
+               'whole fundamental cycles': signal.whole_fundamental_cycles,
+               'majority assignment': signal.majority_assignment}
+    calls = {name: partial(monte_carlo, method, distribution, 40, count, seed=1)
+             for name, method in methods.items()}
     timings = interleaved({**calls, 'whole trigger cycles, one by one': one_by_one},
                           rounds=rounds)
     return {name: (count // 100 if 'one by one' in name else count) / timing.best

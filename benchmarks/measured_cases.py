@@ -18,13 +18,14 @@ from typing import Any
 
 from matplotlib.figure import Figure
 import numpy as np
-from sa_jitter_ros.closure.plotting import AFTER, BEFORE
-from sa_jitter_ros.closure.trigger_pulses import with_slower_clock
 from sa_jitter_ros.commands import close_loop
-from sa_jitter_ros.recordings import open_recording
+from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.channel_map import ChannelSelection
 from sa_jitter_ros.recordings.npz_format import write_npz
-from sa_jitter_ros.recordings.recording import ChannelSelection, Recording
+from sa_jitter_ros.recordings.recording import Recording
+from sa_jitter_ros.report.plotting import AFTER, BEFORE
 from scipy import stats
+from worse_pulses import with_slower_clock
 import yaml
 
 CLOCKS = (2560.0, 3300.0, 4700.0, 5120.0, 6000.0, 9100.0, 13000.0)
@@ -57,7 +58,7 @@ class Case:
 def gear0(clock: float, channels: Sequence[int] = ()) -> Callable[[Path], Recording]:
     """Return what opens the gearbox with its keyphasor timed by a slower clock."""
     def made(data: Path) -> Recording:
-        recording = with_slower_clock(open_recording(data / 'gear0_gearbox.npz'), clock)
+        recording = with_slower_clock(read(data / 'gear0_gearbox.npz'), clock)
         if not channels:
             return recording
         rows = tuple(channels)
@@ -69,7 +70,7 @@ def gear0(clock: float, channels: Sequence[int] = ()) -> Callable[[Path], Record
 
 def stored(name: str, acquisition: int = 0) -> Callable[[Path], Recording]:
     """Return what opens a recording as it is."""
-    return lambda data: open_recording(data / name, acquisition=acquisition)
+    return lambda data: read(data / name, acquisition=acquisition)
 
 
 def gearbox_cases() -> list[Case]:
@@ -135,9 +136,9 @@ def transfer_table(period_std: float, data: Path) -> str:
     lines = ['| clock | RMS without the effect | RMS with it |', '|---|---|---|']
     for clock in CLOCKS:
         if clock != FITTED:
-            bare, told = (run(case, data) for case in transferred(clock, period_std))
-            lines.append(f'| {bare.title} | {bare.value("before", "rms"):.4f} | '
-                         f'{told.value("before", "rms"):.4f} |')
+            without, fitted = (run(case, data) for case in transferred(clock, period_std))
+            lines.append(f'| {without.title} | {without.value("before", "rms"):.4f} | '
+                         f'{fitted.value("before", "rms"):.4f} |')
     return '\n'.join(lines)
 
 

@@ -10,7 +10,7 @@ markers of the page are replaced, the figures drawn again, and all numbers kept 
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import json
 import os
 from pathlib import Path
@@ -19,13 +19,16 @@ import subprocess
 import sys
 from typing import Any
 
-from performance_page import draw, fill, sections
+from matplotlib.figure import Figure
+from page import fill, table
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 PEERS = (('numpy', 'scipy'), ('rota-order',), ('acoular',), ('--pre', 'phonometry'))
 # What the wheels of ROS 2 leave for child processes, wrong for another environment's Python.
 WHEELS = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'
+OURS = 'sa_jitter_ros, resampling and mean'
+REFERENCE = 'quintic spline'
 
 
 def plain_environment() -> dict[str, str]:
@@ -71,6 +74,213 @@ def measure(quick: bool) -> dict[str, Any]:
     return {'core': run(peer_python(), 'core_speed.py', small, plain_environment()),
             'loop': run(sys.executable, 'loop_speed.py', small, environment),
             'graph': run(sys.executable, 'graph_speed.py', brief, environment)}
+
+
+# --- the page ------------------------------------------------------------------------------------
+
+def sections(found: Mapping[str, Any]) -> dict[str, str]:
+    """Return the contents of all sections of the page."""
+    core, loop, graph = found['core'], found['loop'], found['graph']
+    return {
+        'machine': _machine(core, loop, graph), 'core': _comparisons(core['comparisons']),
+        'limits': _limits(core), 'growth': _growth(core), 'loop': _loop(loop),
+        'threads': table(('threads of linear algebra', 'recovery of 100 trigger cycles x 8 '
+                          'channels, on the clock'),
+                         [(name, f'{value:.0f} ms') for name, value in loop['threads'].items()]),
+        'graph': _graph(graph['runs']), 'latency': _latency(graph['latency']),
+        'saturation': _saturation(graph['runs'])}
+
+
+def _machine(core: Mapping[str, Any], loop: Mapping[str, Any], graph: Mapping[str, Any]) -> str:
+    rows = [(name, value) for name, value in core['machine'].items() if name != 'load']
+    rows += [('loop and graph', ', '.join(
+        f'{name} {loop["machine"][name]}' for name in ('python', 'numpy', 'scipy')))]
+    rows += [('load average when the parts began',
+              ', '.join(str(part) for part in (core['machine']['load'], loop['machine']['load'],
+                                               graph['load'])))]
+    return table(('', ''), rows)
+
+
+def _comparisons(comparisons: Iterable[Mapping[str, Any]]) -> str:
+    texts = []
+    for comparison in comparisons:
+        rows, reference = comparison['rows'], comparison['rows'][REFERENCE]['best']
+        bands = ' / '.join(f'{band:.2f}' for band in comparison['bands'])
+        lines = []
+        for name, row in rows.items():
+            gain = ('-' if row['gains'] is None
+                    else ' / '.join(f'{value:.4f}' for value in row['gains']))
+            lines.append((
+                name + ('*' if row['note'] else ''), f'{row["best"]:.3f}', f'{row["median"]:.3f}',
+                f'{row["nanoseconds"]:.1f}', f'{reference / row["best"]:.3g}', gain))
+        text = (f'**{comparison["channels"]} channels, {comparison["seconds"]:g} s, ratio '
+                f'{comparison["ratio"]:g}**\n\n')
+        text += table(('method', 'CPU s, least', 'median', 'ns per sample and channel',
+                       f'speed, {REFERENCE} = 1', f'gain error in dB at f/fs = {bands}'), lines)
+        notes = [f'\\* {name}: {row["note"]}.' for name, row in rows.items() if row['note']]
+        notes += [f'{name} was skipped: {why}.' for name, why in comparison['skipped'].items()]
+        texts.append('\n\n'.join((text, *notes)))
+    return '\n\n'.join(texts)
+
+
+def _limits(core: Mapping[str, Any]) -> str:
+    limits = core['limits']
+    rows = []
+    for comparison in core['comparisons']:
+        for name in (OURS, 'sa_jitter_ros, on line'):
+            value = comparison['rows'][name]['nanoseconds']
+            rows.append((f'{name}, {comparison["channels"]} channels, ratio '
+                         f'{comparison["ratio"]:g}', f'{value:.1f}',
+                         f'{value / limits["memory"]:.0f}', f'{value / limits["arithmetic"]:.0f}'))
+    return (f'One core reads {limits["bandwidth"] / 1e9:.1f} GB/s from memory and does '
+            f'{limits["multiply_adds"] / 1e9:.1f} 10^9 multiply-adds a second in a product of '
+            f'matrices: {limits["memory"]:.2f} ns to read a sample of 8 bytes once, '
+            f'{limits["arithmetic"]:.2f} ns for the 16 multiply-adds of a resampled value.\n\n'
+            + table(('', 'ns per sample and channel', 'times memory limit',
+                     'times arithmetic limit'), rows))
+
+
+def _growth(core: Mapping[str, Any]) -> str:
+    rows = [(name, ' / '.join(values), ' / '.join(f'{value:.1f}' for value in values.values()))
+            for name, values in core['growth'].items()]
+    memory = core['memory']
+    rows.append(('memory in MB over record length in s', ' / '.join(memory),
+                 ' / '.join(f'{value:.2f}' for value in memory.values())))
+    return table(('what grows', 'values', 'ns per sample and channel, or MB'), rows)
+
+
+def _loop(loop: Mapping[str, Any]) -> str:
+    rows = [(f'prediction of 64 orders: {name}', f'{value:.1f} ms', 'below 50 ms')
+            for name, value in loop['prediction'].items()]
+    rows += [(f'recovery: {name}', f'{value:.0f} ms', 'below 250 ms' if ' 8 ' in name else '')
+             for name, value in loop['recovery'].items()]
+    rows += [(f'Monte Carlo: {name}', f'{value:,.0f} iterations/s', '')
+             for name, value in loop['iterations'].items()]
+    closed = loop['close_loop']
+    rows.append((
+        f'`close_loop`, recording of {closed["megabytes"]:.1f} MB ({closed["channels"]} channels, '
+        f'{closed["seconds"]:.1f} s), found {", ".join(closed["missing"]) or "nothing"}',
+        f'{closed["wall"]:.1f} s ({closed["cpu"]:.1f} s of CPU)', 'below 60 s'))
+    return table(('', 'median', 'goal'), rows)
+
+
+def _graph(runs: Iterable[Mapping[str, Any]]) -> str:
+    return table(
+        ('channels', 'shared memory', 'MB/s', 'ms in a message', 'CPU share of one core',
+         'peak memory in MB', 'averages', 'latency from the last pulse in ms, median / 99 %',
+         'sustained'),
+        [(str(run['channels']), _memory(run), f'{run["megabytes_per_second"]:.3g}',
+          f'{run["block_milliseconds"]:.3g}', f'{run["cpu_share"]:.1%}',
+          f'{run["peak_megabytes"]:.0f}', f'{run["averages"]} of {run["expected"]}',
+          f'{run["pulse_median"]:.0f} / {run["pulse_99"]:.0f}',
+          'yes' if run['sustained'] else 'no') for run in runs])
+
+
+def _memory(run: Mapping[str, Any]) -> str:
+    return '64 MB' if run['large'] else '0.5 MB'
+
+
+def _latency(runs: Iterable[Mapping[str, Any]]) -> str:
+    return table(
+        ('messages of', 'averages', 'from the last pulse, median', '99 %',
+         'from when the last sample was sent, median', '99 %', 'CPU share'),
+        [(f'{run["block_milliseconds"]:.3g} ms', str(run['averages']),
+          *(f'{run[key]:.1f} ms' for key in ('pulse_median', 'pulse_99', 'data_median',
+                                             'data_99')),
+          f'{run["cpu_share"]:.1%}') for run in runs])
+
+
+def _saturation(runs: Iterable[Mapping[str, Any]]) -> str:
+    failed = [run for run in runs if not run['sustained']]
+    if not failed:
+        return 'Nothing saturated at these numbers of channels.'
+    texts = []
+    for run in failed:
+        diagnostics = run['diagnostics']
+        counts = ', '.join(f'{key} {value}' for key, value in diagnostics['counts'].items())
+        texts.append(f'{run["channels"]} channels, {_memory(run)}: level '
+                     f'{diagnostics["level"]} (1 = WARN), {counts}')
+        texts += [f'    {message}' for message in diagnostics['messages']]
+    return '\n\n'.join(texts)
+
+
+def draw(found: Mapping[str, Any], folder: Path) -> None:
+    """Draw the figures of the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _draw_core(found['core']['comparisons'][0]).savefig(folder / 'performance-core.png', dpi=110)
+    _draw_growth(found['core']).savefig(folder / 'performance-growth.png', dpi=110)
+    _draw_graph(found['graph']['runs']).savefig(folder / 'performance-graph.png', dpi=110)
+
+
+def _draw_core(comparison: Mapping[str, Any]) -> Figure:
+    figure = Figure(figsize=(7.5, 4.2), layout='constrained')
+    axes = figure.subplots()
+    for name, row in comparison['rows'].items():
+        if row['gains'] is None:
+            continue
+        own = name.startswith('sa_jitter')
+        below = name in (OURS, 'tsa linear')  # their labels would meet another
+        error = abs(row['gains'][-1])
+        axes.loglog(row['nanoseconds'], error, 'o', color='tab:blue' if own else 'tab:gray')
+        axes.annotate(name.replace('sa_jitter_ros, ', ''), (row['nanoseconds'], error),
+                      xytext=(5, -12 if below else 4), textcoords='offset points',
+                      fontsize='small',
+                      color='tab:blue' if own else 'black')
+    axes.set_xlabel('CPU time per sample and channel [ns]')
+    axes.set_ylabel('gain error at 0.30 of the sampling rate [dB]')
+    axes.set_title(f'{comparison["channels"]} channels x {comparison["seconds"]:g} s at 93.75 kHz;'
+                   ' blue: this package', fontsize='medium')
+    axes.margins(x=0.2, y=0.1)
+    axes.grid(which='both', alpha=0.2)
+    return figure
+
+
+def _draw_growth(core: Mapping[str, Any]) -> Figure:
+    figure = Figure(figsize=(9.5, 5.4), layout='constrained')
+    growth = [(name, values) for name, values in core['growth'].items() if name != 'averaging']
+    panels = figure.subplots(2, 3).ravel()
+    for axes, (name, values) in zip(panels, growth):
+        axes.semilogx([float(key) for key in values], list(values.values()), 'o-')
+        axes.set_xticks([float(key) for key in values], list(values), fontsize='small')
+        axes.minorticks_off()
+        limit = max(core['limits']['memory'], core['limits']['arithmetic'])
+        axes.axhline(limit, color='tab:red', linewidth=1.0, label='limit of the machine')
+        axes.set_xlabel(name)
+        axes.set_ylim(bottom=0.0)
+    memory = core['memory']
+    panels[4].plot([float(key) for key in memory], list(memory.values()), 'o-')
+    panels[4].set_xlabel('record length in s')
+    panels[4].set_ylabel('peak memory [MB]')
+    panels[4].set_ylim(0.0, 1.3 * max(memory.values()))
+    averaging = core['growth']['averaging']
+    panels[5].bar(list(averaging), list(averaging.values()))
+    panels[5].set_xlabel('averaging')
+    for axes in (panels[0], panels[3], panels[5]):
+        axes.set_ylabel('ns per sample and channel')
+    panels[0].legend(fontsize='small')
+    for axes in panels:
+        axes.grid(alpha=0.3)
+    return figure
+
+
+def _draw_graph(runs: Sequence[Mapping[str, Any]]) -> Figure:
+    figure = Figure(figsize=(8.5, 3.4), layout='constrained')
+    share, latency = figure.subplots(1, 2)
+    for run in runs:
+        marker = {'markerfacecolor': 'none' if not run['large'] else None,
+                  'color': 'tab:blue' if run['sustained'] else 'tab:red'}
+        share.plot(run['channels'], 100.0 * run['cpu_share'], 'o', **marker)
+        latency.semilogy(run['channels'], run['pulse_median'], 'o', **marker)
+        latency.semilogy(run['channels'], run['pulse_99'], '^', **marker)
+    share.set_ylabel('CPU share of one core [%]')
+    share.set_ylim(0.0, 105.0)
+    share.set_title('filled: 64 MB of shared memory, open: 0.5 MB; red: not sustained',
+                    fontsize='small')
+    latency.set_ylabel('latency [ms]: o median, ^ 99 %')
+    for axes in (share, latency):
+        axes.set_xlabel('channels at 93.75 kHz')
+        axes.grid(alpha=0.3)
+    return figure
 
 
 def main() -> int:

@@ -28,10 +28,9 @@ from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, S
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 import numpy as np
-from performance_page import fill, table
+from page import fill, growth, MEMORY, table
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
-from reliability_page import growth, MEMORY
 from sa_jitter_ros.nodes.base import RESULT_QOS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -107,15 +106,15 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
                 rss[name].append((time.monotonic() - begin, resident(process)))
             report(f'{time.monotonic() - begin:.0f} of {seconds:.0f} s, {len(sink.ends)} averages')
             spin(lambda: source.poll() is not None, PERIOD)
-        told = json.loads(source.communicate()[0])
+        sent = json.loads(source.communicate()[0])
         spin(lambda: False, 3.0)
     context.try_shutdown()
     counts = sink.status[-1][3]
     return {
         'channels': channels, 'seconds': seconds, 'correct_jitter': correct,
-        'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': told['latest'],
+        'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': sent['latest'],
         'end': sink.ends, 'sequence': sink.sequences, 'published': int(counts['averages']),
-        'latency': [arrival - told['start'] - end for arrival, end in zip(
+        'latency': [arrival - sent['start'] - end for arrival, end in zip(
             sink.arrivals, sink.ends)],
         'expected': int((seconds * SPEED - 1) / TRIGGER_CYCLES), 'rss': rss,
         'counts': {key: int(counts[key]) for key in (*KEYS, 'samples_lost')},

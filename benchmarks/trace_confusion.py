@@ -15,8 +15,9 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.closure.observation import observe
-from sa_jitter_ros.closure.trace import Trace, trace
+from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.inference.trace import Trace, trace
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect, IndexArray, Setting
@@ -26,7 +27,6 @@ from sa_jitter_ros.simulation.keyphasor import Keyphasor
 from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
 from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
-from sa_jitter_ros.statistics.prediction import DeclaredModel
 
 SAMPLE_RATE = 6000.0
 KEYPHASOR_RATE = 5000.0
@@ -49,11 +49,6 @@ EFFECTS: Mapping[str, Mapping[str, Any]] = {
     'amplitude_modulation': {'std': 0.3},
     'interfering_tone': {'frequency': 400.9, 'amplitude': 0.12},
 }
-
-# What makes an effect larger, where it is not its standard deviation; a clock slower.
-_SIZE = {'keyphasor_quantisation': 'clock_rate', 'target_geometry': 'pulse_angles',
-         'speed_fluctuation': 'acceleration_std', 'clock_skew': 'skew',
-         'missing_pulses': 'probability', 'interfering_tone': 'amplitude'}
 
 PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('target_geometry', 'excess_jitter'),
          ('excess_jitter', 'amplitude_modulation'), ('speed_fluctuation', 'additive_noise'),
@@ -123,30 +118,19 @@ def model(*, trigger_cycles: int = 20, pulses: int = 1, ratio: float = 1.0) -> D
         noise_std=NOISE, sample_rate=SAMPLE_RATE)
 
 
-def sized(name: str, size: float) -> Mapping[str, Any]:
-    """Return the parameters of an effect at some parts of its documented size."""
-    values = dict(EFFECTS[name])
-    key = _SIZE.get(name, 'std')
-    if isinstance(values.get(key), tuple):
-        values[key] = tuple(size * angle for angle in values[key])
-    elif key in values:
-        values[key] = values[key] / size if key == 'clock_rate' else values[key] * size
-    return values
-
-
-def run(seed: int, names: Sequence[str], *, acquisitions: int = 24, size: float = 1.0) -> Trace:
-    """Trace one simulated machine with these effects at some parts of their documented sizes."""
+def run(seed: int, names: Sequence[str], *, acquisitions: int = 24) -> Trace:
+    """Trace one simulated machine with these effects."""
     geometry = 'target_geometry' in names
     pulses, ratio = (4, 4.0) if geometry else (1, 1.0)
-    effects = (*make_effects({name: sized(name, size) for name in names if name in EFFECTS}),
+    effects = (*make_effects({name: EFFECTS[name] for name in names if name in EFFECTS}),
                *(UNKNOWN[name]() for name in names if name in UNKNOWN))
     gearbox = machine(effects, seed=seed, pulses=pulses, ratio=ratio,
                       jitter='keyphasor_quantisation' not in names)
     declared = model(pulses=pulses, ratio=ratio)
     taken = recording(gearbox, (acquisitions * declared.trigger_cycles + 3) / SPEED)
     if 'keyphasor_quantisation' in names:
-        declared = replace(declared, keyphasor_rate=sized(
-            'keyphasor_quantisation', size)['clock_rate'])
+        declared = replace(
+            declared, keyphasor_rate=EFFECTS['keyphasor_quantisation']['clock_rate'])
     return trace([observe(taken, declared)], [taken])
 
 
@@ -155,15 +139,15 @@ def fell(found: Trace, *, known: bool = False) -> bool:
     Tell whether the held-out RMS, less its standard error, fell at least five-fold.
 
     The standard error is that of the mean residual: of the held-out mean and of the prediction,
-    whose parameters half of the acquisitions told; with `known` parameters of the former alone.
+    whose parameters come from half of the acquisitions; with `known` parameters the former only.
     """
     error = found.after.rms_standard_error**2 - known * found.after.rms_parameter_error**2
     left = math.sqrt(max(found.after.rms**2 - error, 0.0))
     return bool(found.findings) and left <= 0.2 * found.before.rms
 
 
-def told(found: Trace) -> str:
-    """Return what a trace says in one word."""
+def answer(found: Trace) -> str:
+    """Return the effects that were found and the verdict."""
     names = '+'.join(item.name for item in found.findings)
     return f'{names or "-"} ({found.verdict})'
 
@@ -174,7 +158,7 @@ def one(seed: int, names: Sequence[str], acquisitions: int
     found = run(seed, names, acquisitions=acquisitions)
     values = '; '.join(f'{item.effect.values} +- {dict(item.standard_errors)}'
                        for item in found.findings if item.effect is not None)
-    return (told(found), found.before.rms, found.after.rms, found.before.chi2_per_dof,
+    return (answer(found), found.before.rms, found.after.rms, found.before.chi2_per_dof,
             found.after.chi2_per_dof, values, fell(found), fell(found, known=True))
 
 

@@ -27,3 +27,7 @@ class RecordingError(SaJitterError):
 
 class ModelError(SaJitterError):
     """A declared model, or data offered to it, that does not make sense."""
+
+
+class DataWarning(UserWarning):
+    """Samples or pulses that could not be used: how many, and why."""

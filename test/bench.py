@@ -1,75 +1,54 @@
-"""A bench around one node: publishers of its inputs, recorders of its outputs, in one process."""
+"""A bench around one node: publishers of its inputs, captured outputs, its status when asked."""
 
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sa_jitter_ros.nodes import messages
-from sa_jitter_ros.nodes.base import INPUT_QOS, RESULT_QOS
+from sa_jitter_ros.nodes.base import INPUT_QOS
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from std_msgs.msg import Float64, Float64MultiArray
 
-# Who shares an executor with a player that catches up hears it later: no queue may overflow.
-BENCH_QOS = QoSProfile(depth=5000, reliability=ReliabilityPolicy.RELIABLE)
+
+class SteadyClock:
+    """A clock that stands still until a test moves it: replaces `time` in a module."""
+
+    def __init__(self):
+        self.now = 1000.0
+
+    def monotonic(self):
+        """Return the time in s."""
+        return self.now
 
 
 class NodeBench:
     """
-    One node and its neighbours in an executor.
+    One node and its neighbours in a graph.
 
     Parameters are given as keywords, `__` for the dot. `inputs` and `outputs` are {topic: type};
     `send(topic, message)` publishes, `settle()` serves callbacks until the node has had all that
-    was sent and the bench all that came back, `received[topic]` are the messages.
+    was sent and the bench all that came back, `received[topic]` are the messages. The node's
+    timer of diagnostics is stopped: a status says what came since the one before, so that a test
+    must decide when it is published. `diagnostics()` publishes it and returns it.
     """
 
-    def __init__(self, context, executor_for, node_class, *, inputs, outputs, qos=INPUT_QOS,
-                 result_qos=RESULT_QOS, overrides=(), **parameters):
-        overrides = [*overrides, *(Parameter(name.replace('__', '.'), value=value)
-                                   for name, value in parameters.items())]
-        self.node = node_class(context=context, parameter_overrides=overrides)
-        self.bench = Node('bench', context=context)
-        self.handled = 0
-        for subscription in self.node.subscriptions:
-            if subscription.topic_name.lstrip('/') in inputs:
-                subscription.callback = self._counting(subscription.callback)
-        self.sent = 0
-        self.publishers = {topic: self.bench.create_publisher(kind, topic, qos)
-                           for topic, kind in inputs.items()}
-        self.received = {}
-        for topic, kind in {**outputs, '/diagnostics': DiagnosticArray}.items():
-            self.received[topic] = []
-            self.bench.create_subscription(kind, topic, self.received[topic].append, result_qos)
-        self.spin = executor_for(self.node, self.bench)
-        self.matched = self.spin(
-            lambda: all(item.get_subscription_count() for item in self.publishers.values())
-            and all(self.bench.count_publishers(topic) for topic in self.received),
-            timeout=10.0 if qos is INPUT_QOS else 0.3)
-
-    def _counting(self, callback):
-        def counted(message):
-            self.handled += 1
-            callback(message)
-        return counted
-
-    def send(self, topic, message):
-        """Publish a message."""
-        self.publishers[topic].publish(message)
-        self.sent += 1
-        if self.sent - self.handled > 50:
-            assert self.spin(lambda: self.handled >= self.sent)
-
-    def settle(self):
-        """Serve callbacks until all messages sent so far, and their results, have arrived."""
-        assert self.spin(lambda: self.handled >= self.sent)
-        self.spin.settle(lambda: [len(items) for items in self.received.values()])
-
-    def diagnostics_when_asked(self):
-        """Stop the node's status at 1 Hz: a status tells only what came since the one before."""
+    def __init__(self, graph, node_class, *, inputs, outputs, qos=INPUT_QOS, result_qos=None,
+                 overrides=(), **parameters):
+        self.graph, self.spin, self.settle = graph, graph.spin, graph.settle
+        self.node = graph.add(
+            node_class, {name.replace('__', '.'): value for name, value in parameters.items()},
+            parameter_overrides=list(overrides))
         for timer in self.node.timers:
             if timer.callback == self.node.publish_diagnostics:
                 timer.cancel()
+        self.publishers = {topic: graph.publisher(topic, kind, qos=qos)
+                           for topic, kind in inputs.items()}
+        self.received = {topic: graph.capture(topic, kind, qos=result_qos)
+                         for topic, kind in {**outputs, '/diagnostics': DiagnosticArray}.items()}
+
+    def send(self, topic, message):
+        """Publish a message."""
+        self.graph.publish(topic, message)
 
     def diagnostics(self):
         """Return level, message and values of the node's status now."""
@@ -87,7 +66,7 @@ class NodeBench:
 
     def client(self):
         """Return a client of the node's parameter services that waits for what it asks."""
-        client = AsyncParameterClient(self.bench, self.node.get_name())
+        client = AsyncParameterClient(self.graph.node, self.node.get_name())
         assert self.spin(client.services_are_ready)
 
         def ask(method, *arguments):
@@ -106,7 +85,7 @@ class NodeBench:
 class AveragerBench(NodeBench):
     """A bench around the averager with one machine."""
 
-    def __init__(self, context, executor_for, *, shafts=('shaft',), **options):
+    def __init__(self, graph, *, shafts=('shaft',), **options):
         parameters = {'shafts': list(shafts), **options}
         vibration = options.get('vibration_type', 'std_msgs/Float64MultiArray')
         tach = options.get('tach_type', 'sensor_msgs/TimeReference')
@@ -114,7 +93,7 @@ class AveragerBench(NodeBench):
                  'tach_pulse': messages.PULSE_TYPES[tach.replace('/msg/', '/')]}
         outputs = {f'{shaft}/{kind}': Float64MultiArray for shaft in shafts for kind in (
             'order_amplitude', 'synchronous_average', 'condition_indicator', 'standard_error')}
-        super().__init__(context, executor_for, SynchronousAverager, inputs=kinds,
+        super().__init__(graph, SynchronousAverager, inputs=kinds,
                          outputs={**outputs, 'shaft_speed': Float64}, **parameters)
         self.references = 'tach_type' not in options
 

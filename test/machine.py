@@ -3,10 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from sa_jitter_ros.angle.pulses import PulseValidator
-from sa_jitter_ros.averaging.shaft import AverageSettings
+from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
-from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.pulses.validation import PulseValidator
+from sa_jitter_ros.samples import SampleBlock
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ import os
 from pathlib import Path
 import re
 import shlex
+import subprocess
 import sys
 import tempfile
 
@@ -162,14 +163,17 @@ def namespace_of(document):
 
 
 def run_python(block):
-    """Run a block and the tests that it defines; return what it prints."""
-    namespace = namespace_of(block.document)
-    known = set(namespace)
-    with inside(folder_of(block.document)), redirect_stdout(io.StringIO()) as printed:
-        exec(compile(block.text, block.place, 'exec'), namespace)
-        for name in set(namespace) - known:
-            if name.startswith('test_'):
-                namespace[name]()
+    """Run a block, or by pytest the tests that it holds; return what it prints."""
+    folder = folder_of(block.document)
+    if block.name.startswith('test_'):
+        done = subprocess.run(
+            [sys.executable, '-m', 'pytest', '-p', 'no:cacheprovider', block.name], cwd=folder,
+            env={**os.environ, 'PYTHONPATH': str(ROOT)}, capture_output=True, text=True,
+            check=False)
+        assert done.returncode == 0, done.stdout
+        return ''
+    with inside(folder), redirect_stdout(io.StringIO()) as printed:
+        exec(compile(block.text, block.place, 'exec'), namespace_of(block.document))
     return printed.getvalue()
 
 
@@ -252,6 +256,8 @@ def all_topics():
             found |= topics_of(made)
     with node('synchronous_averager', '--params-file',
               str(ROOT / 'config' / 'synchronous_averager.yaml')) as made:
+        found |= topics_of(made)
+    with node('jitter_predictor', '-p', 'shafts:=[input, output]') as made:
         return found | topics_of(made)
 
 
@@ -370,10 +376,10 @@ def parameters_of(name):
 def table_of_parameters():
     """Return docs/parameters.md."""
     lines = ['# Parameters', '',
-             'What `ros2 param describe` tells, node by node. `<shaft>` stands for each name in '
-             '`shafts`. A float parameter takes an integer.',
-             'Those marked *fixed* are read when the node starts. Written by '
-             '`python test/test_docs.py`.']
+             'The parameters of each node, as `ros2 param describe` prints them. `<shaft>` stands '
+             'for each name in `shafts`. A float parameter accepts an integer.',
+             'A *fixed* parameter is read when the node starts. `python test/test_docs.py` writes '
+             'this page.']
     for name in NODES:
         lines += ['', f'## {name}', '| parameter | default | allowed | meaning |',
                   '|---|---|---|---|']

@@ -1,17 +1,18 @@
 """The forward model of every effect, against closed forms, quadrature and Monte Carlo."""
 
-import time
+from dataclasses import fields
+import doctest
+from inspect import signature
 
 import numpy as np
 import pytest
-
 from sa_jitter_ros.effects import (
-    Effect, EFFECTS, enabled_effects, make_effect, parameter_defaults, parameter_ranges,
-    predict_with)
+    Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges,
+    predict as predict_from_parameters, predict_with)
 from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.statistics.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
 from scipy.signal import lfilter
 from scipy.stats import kstest, norm
 
@@ -288,7 +289,7 @@ def test_geometry_has_the_law_of_drawn_averages(rng, angles, cycles):
 @pytest.mark.parametrize('name', ['target_geometry', 'clock_skew', 'missing_pulses',
                                   'keyphasor_quantisation'])
 @pytest.mark.parametrize('cycles', [10_000, 1_000_000])
-def test_long_averages_with_known_errors_take_a_bounded_time_or_are_refused(name, cycles):
+def test_long_averages_with_known_errors_are_predicted_or_refused(name, cycles):
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles, 'orders': (2.0, 3.0)})
     values = {**SMALL[name], 'skew': 1e-7} if name == 'clock_skew' else SMALL[name]
     effects = [make_effect(name, **values)]
@@ -296,9 +297,7 @@ def test_long_averages_with_known_errors_take_a_bounded_time_or_are_refused(name
         with pytest.raises(ModelError, match=r'is 1000000 with 2 orders.* at most 20000 cycles'):
             predict_with(model, effects)
         return
-    begin = time.process_time()
     prediction = predict_with(model, effects)
-    assert time.process_time() - begin < 20.0  # 2 s on an idle machine
     assert np.all((prediction.mean_attenuation > 0.0) & (prediction.mean_attenuation < 1.0))
 
 
@@ -440,3 +439,30 @@ def test_pulses_on_no_grid_show_none(rng):
     assert find_clock(times[:5]).rate == 0.0
     holes = np.delete(times, [20, 90, 91, 250])
     assert find_clock(holes).rate == 0.0
+
+
+def test_the_library_predicts_as_the_declared_model_does():
+    assert doctest.testmod(library).failed == 0
+    skew = {'skew': 1e-4}
+    result = predict_from_parameters(
+        keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40, orders=[23, 46],
+        noise_std=0.1, sample_rate=20e3, effects={'clock_skew': skew})
+    model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+                          orders=(23.0, 46.0), noise_std=0.1, sample_rate=20e3)
+    same = predict_with(model, [make_effect('clock_skew', **skew)])
+    for name in ('order', 'mean_attenuation', 'variance', 'standard_deviation', 'quantile_05',
+                 'quantile_50', 'quantile_95', 'loss', 'header'):
+        np.testing.assert_array_equal(getattr(result, name), getattr(same, name))
+    np.testing.assert_allclose(result.ppf(0.05)[:, 0], result.quantile_05)
+    np.testing.assert_allclose(result.cdf(result.quantile_50[:, None]), 0.5, atol=1e-3)
+    assert result.header == (25.0, 10e3, 40.0, 1.0, result.pulse_error_standard_deviation, 0.1)
+    names = list(signature(predict_from_parameters).parameters)
+    assert names[:-1] == [item.name for item in fields(DeclaredModel)]
+
+
+def test_the_library_refuses_unknown_effects_and_parameters():
+    known = {'keyphasor_rate': 10e3, 'trigger_speed': 25.0, 'trigger_cycles': 40, 'orders': [1]}
+    with pytest.raises(ParameterError, match='no effect'):
+        predict_from_parameters(**known, effects={'hum': {}})
+    with pytest.raises(ParameterError, match="no 'rate'"):
+        predict_from_parameters(**known, effects={'clock_skew': {'rate': 1.0}})

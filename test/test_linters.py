@@ -25,6 +25,7 @@ def test_ruff():
     check('ruff', 'check', '--output-format=concise', '--quiet', '.')
 
 
+@pytest.mark.style
 def test_flake8():
     check('flake8', '.')
 

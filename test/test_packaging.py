@@ -54,14 +54,16 @@ def manifest():
 
 @pytest.fixture(scope='module')
 def packages():
-    """Return all packages that are imported and neither ours nor Python's."""
+    """Return all packages that are imported and neither ours, nor Python's, nor of tests only."""
     own = {path.stem for path in MODULES} | {path.parent.name for path in MODULES}
-    return set().union(*map(needs, MODULES)) - own
+    return set().union(*map(needs, MODULES)) - own - {'pytest'}
 
 
 def test_manifest_is_of_format_3_for_ament_python(manifest):
     assert manifest.package_format == 3
-    assert [export.content for export in manifest.exports] == ['ament_python']
+    assert {export.tagname: export.content for export in manifest.exports} == {
+        'build_type': 'ament_python', 'rosdoc2': 'rosdoc2.yaml'}
+    assert (ROOT / 'rosdoc2.yaml').is_file()
     assert manifest.licenses == ['Apache-2.0']
     assert (ROOT / manifest.licenses[0].file).is_file()
 
@@ -130,7 +132,7 @@ def modules_of(folder):
     return {path.relative_to(folder): path.read_text() for path in folder.rglob('*.py')}
 
 
-@pytest.mark.slow
+@pytest.mark.build
 def test_colcon_builds_what_ros2_run_looks_for(tmp_path, scripts):
     if find_spec('colcon_ros') is None:
         pytest.skip('colcon-ros is not installed')

@@ -7,11 +7,11 @@ import tracemalloc
 import wave
 import zipfile
 
+from bag_writer import write_bag
 import numpy as np
 import pytest
-from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings import (
-    ArraySource, ChannelMap, open_recording, Recording, write_bag, write_npz)
+from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.recordings import ArraySource, read, Recording, write_npz
 from sa_jitter_ros.recordings import mat_format, npz_format
 import scipy.io
 import scipy.io.wavfile
@@ -88,7 +88,7 @@ def test_contradictions_are_refused(recording, change, message):
 
 def test_npz_round_trip(recording, tmp_path):
     write_npz(tmp_path / 'rig.npz', recording)
-    assert_same(open_recording(tmp_path / 'rig.npz'), recording)
+    assert_same(read(tmp_path / 'rig.npz'), recording)
 
 
 def save(path, *, compress=False, **fields):
@@ -104,7 +104,7 @@ def test_npz_of_any_layout_in_memory_or_mapped(rng, tmp_path, monkeypatch, compr
     monkeypatch.setattr(npz_format, 'IN_MEMORY_BYTES', limit)
     vibration = np.asarray(rng.standard_normal((4, 1000)).astype(np.float32), order=order)
     path = save(tmp_path / 'rig.npz', compress=compress, vibration=vibration, sample_rate=RATE)
-    opened = open_recording(path)
+    opened = read(path)
     assert isinstance(opened.vibration.array, np.memmap) == (limit == 0)
     np.testing.assert_array_equal(opened.read(), vibration)
 
@@ -121,7 +121,7 @@ def test_large_npz_is_written_and_read_with_bounded_memory(tmp_path):
     tracemalloc.start()
     write_npz(path, Recording(Ramp(), RATE))
     last = None
-    for block in open_recording(path).blocks(10_000):
+    for block in read(path).blocks(10_000):
         last = block
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -131,7 +131,7 @@ def test_large_npz_is_written_and_read_with_bounded_memory(tmp_path):
 
 
 def test_npz_minimum_gets_the_documented_defaults(tmp_path):
-    opened = open_recording(
+    opened = read(
         save(tmp_path / 'rig.npz', vibration=np.ones(10, np.int16), sample_rate=100))
     assert (opened.channels, opened.channel_names, opened.units) == (1, ('channel 0',), ('',))
     assert (opened.pulses_per_revolution, opened.pulses_per_trigger, opened.ratio) == (1, None, 1)
@@ -143,25 +143,25 @@ def test_rows_with_a_tach_each_are_acquisitions(rng, tmp_path):
     vibration, tach = rng.standard_normal((2, 5, 100))
     path = save(tmp_path / 'rows.npz', vibration=vibration, tach=tach, sample_rate=RATE,
                 tach_rate=RATE, channel_names=list('abcde'), units='g')
-    opened = open_recording(path, acquisition=3)
+    opened = read(path, acquisition=3)
     assert (opened.acquisitions, opened.channel_names, opened.units) == (5, ('d',), ('g',))
     np.testing.assert_array_equal(opened.read()[0], vibration[3])
     np.testing.assert_array_equal(opened.read_tach(), tach[3])
     with pytest.raises(RecordingError, match='acquisition 5: the file holds 5'):
-        open_recording(path, acquisition=5)
+        read(path, acquisition=5)
 
 
 def test_a_revolution_counter_becomes_pulses(tmp_path):
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE, start_time=2.0,
                 tach_count=np.array([7, 7, 8, 8, 8, 10, 10]), tach_rate=10.0)
-    np.testing.assert_allclose(open_recording(path).pulse_times, [2.2, 2.45, 2.5])
+    np.testing.assert_allclose(read(path).pulse_times, [2.2, 2.45, 2.5])
 
 
 @pytest.mark.parametrize('kind', [np.uint8, np.int64, np.float64])
 def test_a_revolution_counter_that_is_reset_goes_on(tmp_path, kind):
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
                 tach_count=np.array([254, 255, 0, 1, 1, 2]).astype(kind), tach_rate=10.0)
-    np.testing.assert_allclose(open_recording(path).pulse_times, [0.1, 0.3, 0.5])
+    np.testing.assert_allclose(read(path).pulse_times, [0.1, 0.3, 0.5])
 
 
 @pytest.mark.parametrize(('counts', 'message'), [
@@ -171,7 +171,7 @@ def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, m
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
                 tach_count=np.array(counts), tach_rate=10.0)
     with pytest.raises(RecordingError, match=message):
-        open_recording(path)
+        read(path)
 
 
 @pytest.mark.parametrize(('fields', 'message'), [
@@ -195,7 +195,7 @@ def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, m
 def test_npz_with_wrong_fields(tmp_path, fields, message):
     path = save(tmp_path / 'bad.npz', **fields)
     with pytest.raises(RecordingError, match=message) as caught:
-        open_recording(path)
+        read(path)
     assert str(caught.value).startswith(str(path))
     assert '\n' not in str(caught.value)
 
@@ -204,7 +204,7 @@ def test_pickled_arrays_are_never_loaded(tmp_path):
     path = tmp_path / 'evil.npz'
     np.savez(path, vibration=np.array([{'a': 1}], dtype=object), sample_rate=1.0)
     with pytest.raises(RecordingError, match='pickled objects, which are never loaded'):
-        open_recording(path)
+        read(path)
 
 
 def npy_header(shape, descr='<f8'):
@@ -221,7 +221,7 @@ def test_a_shape_beyond_the_data_is_refused_before_allocation(tmp_path):
         archive.writestr('vibration.npy', npy_header((1 << 20, 1 << 20)) + bytes(800))
         archive.writestr('sample_rate.npy', npy_header(()) + struct.pack('<d', 1.0))
     with pytest.raises(RecordingError, match='the file holds 800'):
-        open_recording(path)
+        read(path)
 
 
 def test_zip_bomb_is_refused(tmp_path, monkeypatch):
@@ -229,7 +229,7 @@ def test_zip_bomb_is_refused(tmp_path, monkeypatch):
     path = save(tmp_path / 'bomb.npz', compress=True, vibration=np.zeros(1 << 20),
                 sample_rate=1.0)
     with pytest.raises(RecordingError, match='zip bomb'):
-        open_recording(path)
+        read(path)
 
 
 def peak_of(call):
@@ -252,7 +252,7 @@ def test_a_long_header_is_not_unpacked(tmp_path):
 
     def refused():
         with pytest.raises(RecordingError, match='EOF: reading array header'):
-            open_recording(path)
+            read(path)
     assert peak_of(refused) < 1 << 20
 
 
@@ -262,7 +262,7 @@ def test_zip_methods_that_numpy_does_not_write_are_refused(tmp_path):
         archive.writestr('vibration.npy', npy_header((1,)) + bytes(8))
         archive.writestr('sample_rate.npy', npy_header(()) + struct.pack('<d', 1.0))
     with pytest.raises(RecordingError, match='zip method 14 is not read'):
-        open_recording(path)
+        read(path)
 
 
 def test_flipped_bits_in_samples_are_found(tmp_path):
@@ -271,7 +271,7 @@ def test_flipped_bits_in_samples_are_found(tmp_path):
     data[4000] ^= 1
     path.write_bytes(data)
     with pytest.raises(RecordingError, match='CRC'):
-        open_recording(path)
+        read(path)
 
 
 # --- mat ----------------------------------------------------------------------------------------
@@ -287,20 +287,20 @@ def test_mat_round_trip(recording, tmp_path, compress):
         'pulses_per_revolution': 6, 'pulses_per_trigger': 3.0, 'ratio': 2.40789,
         'orders': [19, 38], 'channel_names': names, 'units': ['m/s^2', 'm/s^2', 'Pa   '],
         'description': 'a rig', 'not_ours': {'a': 1}}, do_compression=compress)
-    assert_same(open_recording(path), recording)
+    assert_same(read(path), recording)
 
 
 def test_mat_version_73_gets_a_clear_line(tmp_path):
     path = tmp_path / 'new.mat'
     path.write_bytes(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(512, b' '))
     with pytest.raises(RecordingError, match="save it with '-v7'"):
-        open_recording(path)
+        read(path)
 
 
 def test_old_mat_gets_a_clear_line(tmp_path):
     scipy.io.savemat(tmp_path / 'old.mat', {'vibration': np.ones((2, 90))}, format='4')
     with pytest.raises(RecordingError, match='no MATLAB file of version 5 to 7'):
-        open_recording(tmp_path / 'old.mat')
+        read(tmp_path / 'old.mat')
 
 
 @pytest.mark.parametrize('dtype', ['f4', 'f8', 'i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'i8', 'u8'])
@@ -309,13 +309,13 @@ def test_large_mat_of_any_number_type_is_mapped(rng, tmp_path, monkeypatch, dtyp
     vibration = rng.integers(0, 100, (3, 40_000)).astype(dtype)
     scipy.io.savemat(tmp_path / 'rig.mat', {'vibration': vibration, 'sample_rate': 1.0},
                      do_compression=True)
-    np.testing.assert_array_equal(open_recording(tmp_path / 'rig.mat').read(), vibration)
+    np.testing.assert_array_equal(read(tmp_path / 'rig.mat').read(), vibration)
 
 
 def test_mat_with_a_struct_for_vibration(tmp_path):
     scipy.io.savemat(tmp_path / 'bad.mat', {'vibration': {'x': 1.0}, 'sample_rate': 1.0})
     with pytest.raises(RecordingError, match='vibration: must be real numbers or text'):
-        open_recording(tmp_path / 'bad.mat')
+        read(tmp_path / 'bad.mat')
 
 
 def test_mat_bomb_is_refused(tmp_path):
@@ -323,7 +323,7 @@ def test_mat_bomb_is_refused(tmp_path):
     scipy.io.savemat(path, {'vibration': np.zeros((1, 1 << 24)), 'sample_rate': 1.0},
                      do_compression=True)
     with pytest.raises(RecordingError, match='zip bomb'):
-        open_recording(path)
+        read(path)
 
 
 def test_a_long_text_among_many_cells_is_refused(tmp_path):
@@ -333,7 +333,7 @@ def test_a_long_text_among_many_cells_is_refused(tmp_path):
 
     def refused():
         with pytest.raises(RecordingError, match='units: 400080000 bytes exceed its limit'):
-            open_recording(path)
+            read(path)
     assert peak_of(refused) < 1 << 24
 
 
@@ -342,7 +342,7 @@ def test_a_text_that_is_too_long_is_refused(tmp_path):
     scipy.io.savemat(path, {'vibration': np.zeros((1, 9)), 'sample_rate': 1.0,
                             'units': np.array(['a' * (1 << 20) + 'a'], dtype=object)})
     with pytest.raises(RecordingError, match='a text of 1048577 bytes exceeds its limit'):
-        open_recording(path)
+        read(path)
 
 
 # --- wav ----------------------------------------------------------------------------------------
@@ -356,7 +356,7 @@ def test_wav_with_one_channel_as_tach(rng, tmp_path, dtype):
         stored = rng.integers(limits.min, limits.max, (500, 3), dtype, endpoint=True)
         scale, zero = 2.0 ** (limits.bits - 1), 128.0 if dtype == np.uint8 else 0.0
     scipy.io.wavfile.write(tmp_path / 'rig.wav', 8000, stored)
-    opened = open_recording(tmp_path / 'rig.wav', channel_map=ChannelMap(tach='1'))
+    opened = read(tmp_path / 'rig.wav', tach_channel='1')
     assert (opened.sample_rate, opened.tach_rate) == (8000, 8000)
     assert opened.channel_names == ('channel 0', 'channel 2')
     wanted = ((stored.astype(np.float64) - zero) / scale).T
@@ -370,7 +370,7 @@ def test_wav_of_24_bits(tmp_path):
     with wave.open(str(tmp_path / 'rig.wav'), 'wb') as file:
         file.setparams((1, 3, 4000, 0, 'NONE', ''))
         file.writeframes(b''.join(value.to_bytes(3, 'little', signed=True) for value in values))
-    np.testing.assert_array_equal(open_recording(tmp_path / 'rig.wav').read()[0],
+    np.testing.assert_array_equal(read(tmp_path / 'rig.wav').read()[0],
                                   np.array(values) / 2.0**23)
 
 
@@ -378,7 +378,7 @@ def test_wav_cut_short_is_read_to_its_end(tmp_path):
     path = tmp_path / 'rig.wav'
     scipy.io.wavfile.write(path, 8000, np.arange(1000, dtype=np.int16))
     path.write_bytes(path.read_bytes()[:-501])
-    opened = open_recording(path)
+    opened = read(path)
     assert opened.samples == 749
     assert 'read to its end' in opened.remarks[0]
 
@@ -394,16 +394,16 @@ def test_wav_cut_short_is_read_to_its_end(tmp_path):
 def test_broken_wav(tmp_path, data, message):
     (tmp_path / 'bad.wav').write_bytes(data)
     with pytest.raises(RecordingError, match=message):
-        open_recording(tmp_path / 'bad.wav')
+        read(tmp_path / 'bad.wav')
 
 
 def test_unknown_channel_names_those_there_are(tmp_path):
     scipy.io.wavfile.write(tmp_path / 'rig.wav', 8000, np.zeros((10, 2), np.int16))
     with pytest.raises(RecordingError, match="no channel '2': there are channel 0, channel 1"):
-        open_recording(tmp_path / 'rig.wav', channel_map=ChannelMap(tach='2'))
+        read(tmp_path / 'rig.wav', tach_channel='2')
     scipy.io.wavfile.write(tmp_path / 'mono.wav', 8000, np.zeros(10, np.int16))
     with pytest.raises(RecordingError, match='no vibration left'):
-        open_recording(tmp_path / 'mono.wav', channel_map=ChannelMap(tach='0'))
+        read(tmp_path / 'mono.wav', tach_channel='0')
 
 
 # --- csv ----------------------------------------------------------------------------------------
@@ -419,35 +419,34 @@ def test_csv_with_times_and_a_tach(rng, tmp_path):
     a, b, key = rng.standard_normal((3, 1234)).round(6)
     times = 3.0 + np.arange(1234) / RATE
     path = table(tmp_path / 'rig.csv', (times, a, key, b), header='time,acc a,key,acc b')
-    opened = open_recording(path, channel_map=ChannelMap(tach='key'))
+    opened = read(path, tach_channel='key')
     assert opened.sample_rate == pytest.approx(RATE, rel=1e-9)
     assert (opened.start_time, opened.tach_rate) == (3.0, opened.sample_rate)
     assert opened.channel_names == ('acc a', 'acc b')
     np.testing.assert_array_equal(opened.read(), [a, b])
     np.testing.assert_array_equal(np.concatenate(list(opened.blocks(100)), axis=1), [a, b])
     np.testing.assert_array_equal(opened.read_tach(), key)
-    by_number = open_recording(path, channel_map=ChannelMap(vibration=('3',), time='0'))
+    by_number = read(path, vibration_channels=('3',), time_column='0')
     np.testing.assert_array_equal(by_number.read(), [b])
 
 
 def test_csv_of_a_german_spreadsheet(rng, tmp_path):
     a, b = rng.standard_normal((2, 50)).round(6)
     path = table(tmp_path / 'rig.csv', (a, b), header='a;b', delimiter=';', decimal=',')
-    np.testing.assert_array_equal(open_recording(path, sample_rate=RATE).read(), [a, b])
+    np.testing.assert_array_equal(read(path, sample_rate=RATE).read(), [a, b])
 
 
 @pytest.mark.parametrize(('rows', 'options', 'names'), [
     ('a,b,\n1,2,\n3,4,\n', {}, ('a', 'b')),
-    ('a,b,\n1,2,\n3,4,\n', {'vibration': ('a',)}, ('a',)),
-    ('a,b,\n1,2,x\n3,4,y\n', {'vibration': ('b', 'a')}, ('b', 'a')),
+    ('a,b,\n1,2,\n3,4,\n', {'vibration_channels': ('a',)}, ('a',)),
+    ('a,b,\n1,2,x\n3,4,y\n', {'vibration_channels': ('b', 'a')}, ('b', 'a')),
     ('time,a,b,\n0,1,2,\n0.1,3,4,\n', {}, ('a', 'b')),
-    ('time,a,b,\n0,1,2,\n0.1,3,4,\n', {'tach': 'b'}, ('a',)),
-    ('a,b,\n1,2,5\n3,4,6\n', {'vibration': ('2',), 'tach': 'a'}, ('',)),
+    ('time,a,b,\n0,1,2,\n0.1,3,4,\n', {'tach_channel': 'b'}, ('a',)),
+    ('a,b,\n1,2,5\n3,4,6\n', {'vibration_channels': ('2',), 'tach_channel': 'a'}, ('',)),
 ])
 def test_csv_column_without_name_need_not_be_numeric(tmp_path, rows, options, names):
     (tmp_path / 'rig.csv').write_text(rows)
-    opened = open_recording(tmp_path / 'rig.csv', sample_rate=10.0,
-                            channel_map=ChannelMap(**options))
+    opened = read(tmp_path / 'rig.csv', sample_rate=10.0, **options)
     assert opened.channel_names == names
     assert np.isfinite(opened.read()).all()
 
@@ -457,11 +456,11 @@ def test_csv_column_without_name_need_not_be_numeric(tmp_path, rows, options, na
 def test_csv_with_rounded_times_has_the_rate_that_is_given(tmp_path, start, rate, decimals):
     (tmp_path / 'rig.csv').write_text('time,a\n' + '\n'.join(
         f'{start + k / rate:.{decimals}f},{k}' for k in range(2560)))
-    opened = open_recording(tmp_path / 'rig.csv', sample_rate=rate)
+    opened = read(tmp_path / 'rig.csv', sample_rate=rate)
     assert (opened.sample_rate, opened.start_time) == (rate, start)
     np.testing.assert_array_equal(opened.read()[0], np.arange(2560))
-    with pytest.raises(RecordingError, match=r'sample_rate .* given, but the file says'):
-        open_recording(tmp_path / 'rig.csv', sample_rate=1.001 * rate)
+    with pytest.raises(RecordingError, match=r'sample_rate .* given, but the times'):
+        read(tmp_path / 'rig.csv', sample_rate=1.001 * rate)
 
 
 def test_csv_whose_times_are_not_steady_is_refused_with_the_given_rate(tmp_path):
@@ -469,17 +468,17 @@ def test_csv_whose_times_are_not_steady_is_refused_with_the_given_rate(tmp_path)
     times[500] += 0.006
     (tmp_path / 'rig.csv').write_text('time,a\n' + '\n'.join(f'{t:.4f},1' for t in times))
     with pytest.raises(RecordingError, match=r'row 500: time 5.006 s is no sample of a steady'):
-        open_recording(tmp_path / 'rig.csv', sample_rate=100.0).read()
+        read(tmp_path / 'rig.csv', sample_rate=100.0).read()
 
 
 def test_csv_without_header_and_with_a_text_column(tmp_path):
     path = tmp_path / 'rig.csv'
     path.write_text('1,2\n\n3,4\n')
-    opened = open_recording(path, sample_rate=10)
+    opened = read(path, sample_rate=10)
     assert opened.channel_names == ('0', '1')
     np.testing.assert_array_equal(opened.read(), [[1, 3], [2, 4]])
     path.write_text('a,state\n1,ok\n2,ok\n')
-    opened = open_recording(path, sample_rate=10, channel_map=ChannelMap(vibration=('a',)))
+    opened = read(path, sample_rate=10, vibration_channels=('a',))
     np.testing.assert_array_equal(opened.read(), [[1, 2]])
 
 
@@ -499,28 +498,80 @@ def test_csv_without_header_and_with_a_text_column(tmp_path):
 def test_broken_csv(tmp_path, text, options, message):
     (tmp_path / 'bad.csv').write_text(text)
     with pytest.raises(RecordingError, match=message):
-        open_recording(tmp_path / 'bad.csv', **options).read()
+        read(tmp_path / 'bad.csv', **options).read()
 
 
 def test_a_table_of_a_million_columns_gets_a_short_line(tmp_path):
     path = tmp_path / 'wide.csv'
     path.write_text('1,' * 1_000_000 + '1\n')
     with pytest.raises(RecordingError, match='needs 1 to 4096 channels'):
-        open_recording(path, sample_rate=1.0)
+        read(path, sample_rate=1.0)
     with pytest.raises(RecordingError, match='no time column') as refused:
-        open_recording(path)
+        read(path)
     assert len(str(refused.value)) < 1000
 
 
-def test_a_rate_that_contradicts_the_file_is_refused(recording, tmp_path):
+@pytest.mark.parametrize('suffix', ['npz', 'mat'])
+def test_given_fields_replace_those_of_the_file(recording, tmp_path, suffix):
+    path = tmp_path / f'rig.{suffix}'
+    fields = {'vibration': recording.read(), 'ratio': -1.0, 'units': 'g', 'sample_rate': RATE}
+    np.savez(path, **fields) if suffix == 'npz' else scipy.io.savemat(path, fields)
+    given = {'sample_rate': 500, 'start_time': 3, 'ratio': 2.5, 'orders': [20, 40],
+             'pulse_times': [3.0, 3.5], 'pulses_per_revolution': 8, 'description': 'rig 2',
+             'channel_names': ('x', 'y', 'z'), 'tach_rate': None}
+    opened = read(path, **given)
+    assert opened.duration == 10.0
+    assert (opened.start_time, opened.ratio, opened.orders) == (3.0, 2.5, (20.0, 40.0))
+    assert opened.pulse_times.tolist() == [3.0, 3.5]
+    assert (opened.pulses_per_revolution, opened.tach_rate) == (8, None)
+    assert (opened.description, opened.units) == ('rig 2', ('g', 'g', 'g'))
+    assert opened.channel_names == ('x', 'y', 'z')
+    np.testing.assert_array_equal(opened.read(), recording.read())
+
+
+def test_given_fields_of_a_wav_and_a_csv(recording, tmp_path):
+    scipy.io.wavfile.write(tmp_path / 'rig.wav', 100, recording.read().T)
+    opened = read(tmp_path / 'rig.wav', sample_rate=97656, tach_channel=2, orders=(7,))
+    assert (opened.sample_rate, opened.tach_rate, opened.orders) == (97656.0, 97656.0, (7.0,))
+    opened = read(table(tmp_path / 'rig.csv', recording.read()), sample_rate=RATE, start_time=7.0,
+                  vibration_channels='1', units='g')
+    assert (opened.start_time, opened.units, opened.channels) == (7.0, ('g',), 1)
+
+
+def test_a_sample_that_is_no_measurement_is_refused_with_its_file(tmp_path):
+    path = save(tmp_path / 'rig.npz', vibration=np.full((1, 9), 1e200), sample_rate=RATE)
+    with pytest.raises(RecordingError, match=f'^{path}: sample of 1e.200: must be within 1e.100'):
+        read(path).read()
+
+
+def test_a_missing_rate_can_be_given(recording, tmp_path):
+    path = save(tmp_path / 'rig.npz', vibration=recording.read())
+    assert read(path, sample_rate=RATE).sample_rate == RATE
+
+
+@pytest.mark.parametrize(('given', 'error', 'message'), [
+    ({'sampel_rate': 1.0}, ParameterError, 'no field sampel_rate: give some of sample_rate, '),
+    ({'vibration': [1.0]}, ParameterError, 'no field vibration'),
+    ({'ratio': 'two'}, RecordingError, 'rig.npz: ratio of type <U3: must be real numbers'),
+    ({'pulses_per_revolution': 1.5}, RecordingError, 'must be a whole number'),
+    ({'pulse_times': [[1.0, 2.0], [3.0, 4.0]]}, RecordingError, 'must be one row of numbers'),
+])
+def test_fields_that_cannot_be_given(recording, tmp_path, given, error, message):
     write_npz(tmp_path / 'rig.npz', recording)
-    with pytest.raises(RecordingError, match='500 Hz given, but the file says 2000'):
-        open_recording(tmp_path / 'rig.npz', sample_rate=500)
+    with pytest.raises(error, match=message):
+        read(tmp_path / 'rig.npz', **given)
+
+
+def test_a_rate_that_contradicts_the_messages_is_refused(recording, tmp_path):
+    pytest.importorskip('rosbags')
+    write_bag(tmp_path / 'bag', recording)
+    with pytest.raises(RecordingError, match=r'500.* Hz given, but the messages of /vib'):
+        read(tmp_path / 'bag', sample_rate=500)
 
 
 def test_channel_map_applies_to_arrays_too(recording, tmp_path):
     write_npz(tmp_path / 'rig.npz', recording)
-    opened = open_recording(tmp_path / 'rig.npz', channel_map=ChannelMap(('c', 'a'), tach='b'))
+    opened = read(tmp_path / 'rig.npz', vibration_channels=('c', 'a'), tach_channel='b')
     assert (opened.channel_names, opened.units) == (('c', 'a'), ('Pa', 'm/s^2'))
     np.testing.assert_array_equal(opened.read(), recording.read()[[2, 0]])
     np.testing.assert_array_equal(opened.read_tach(), recording.read()[1])
@@ -532,7 +583,7 @@ def test_what_is_no_recording(tmp_path, name):
     if name != 'nowhere.npz':
         (tmp_path / name).write_bytes(b'')
     with pytest.raises(RecordingError, match=r'no such file|is not one of \.npz'):
-        open_recording(tmp_path / name)
+        read(tmp_path / name)
 
 
 # --- bags ---------------------------------------------------------------------------------------
@@ -546,7 +597,7 @@ def test_bag_round_trip(recording, tmp_path, storage, tach_type):
               samples_per_block=300, namespace='/rig')
     suffix = {'mcap': '.mcap', 'sqlite3': '.db3'}[storage]
     for path in (tmp_path / 'bag', next((tmp_path / 'bag').glob(f'*{suffix}'))):
-        opened = open_recording(path)
+        opened = read(path)
         np.testing.assert_array_equal(opened.read(), recording.read())
         np.testing.assert_array_equal(opened.read_tach(), recording.read_tach())
         np.testing.assert_allclose(opened.pulse_times, recording.pulse_times, rtol=0, atol=0.6e-9)
@@ -559,8 +610,8 @@ def test_bag_of_float32_needs_a_rate(recording, tmp_path):
     write_bag(tmp_path / 'bag', replace(recording, tach=None, start_time=0.0),
               vibration_type='std_msgs/msg/Float32MultiArray')
     with pytest.raises(RecordingError, match='carries none: set the parameter sample_rate'):
-        open_recording(tmp_path / 'bag')
-    opened = open_recording(tmp_path / 'bag', sample_rate=RATE)
+        read(tmp_path / 'bag')
+    opened = read(tmp_path / 'bag', sample_rate=RATE)
     np.testing.assert_array_equal(opened.read(), recording.read().astype(np.float32))
 
 
@@ -571,7 +622,7 @@ def test_lost_samples_in_a_bag_are_nan(recording, tmp_path):
     vibration[1, 1407] = np.nan
     gappy = replace(recording, vibration=ArraySource(vibration))
     write_bag(tmp_path / 'bag', gappy, samples_per_block=100)
-    opened = open_recording(tmp_path / 'bag')
+    opened = read(tmp_path / 'bag')
     vibration[:, 1407] = np.nan
     np.testing.assert_array_equal(opened.read(), vibration)
     assert opened.remarks == ('/vibration: 402 lost samples are NaN',)
@@ -606,7 +657,7 @@ def float64_block(index, *, time=None, rate=RATE, shape=(2, 100), sizes=None, of
 def test_repeats_in_a_bag_are_left_out(tmp_path):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
                           [float64_block(index) for index in (500, 600, 600, 550, 650, 800)])
-    opened = open_recording(path)
+    opened = read(path)
     wanted = np.arange(500.0, 900.0)
     wanted[250:300] = np.nan
     np.testing.assert_array_equal(opened.read(), [wanted, wanted])
@@ -618,7 +669,7 @@ def test_repeats_in_a_bag_are_left_out(tmp_path):
 def test_a_bag_block_without_header_is_counted(tmp_path):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
                           [float64_block(index, offset=0) for index in (0, 100)])
-    np.testing.assert_array_equal(open_recording(path, sample_rate=RATE).read()[1], np.arange(200))
+    np.testing.assert_array_equal(read(path, sample_rate=RATE).read()[1], np.arange(200))
 
 
 @pytest.mark.parametrize(('second', 'message'), [
@@ -642,14 +693,14 @@ def test_bags_that_do_not_go_on(tmp_path, second, message):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
                           [float64_block(0), second])
     with pytest.raises(RecordingError, match=message):
-        open_recording(path, sample_rate=RATE if 'offset' in message else None)
+        read(path, sample_rate=RATE if 'offset' in message else None)
 
 
 def test_a_gap_at_an_absurd_rate_is_no_gap_to_fill(tmp_path):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray', [
         float64_block(index, time=index / 1e12, rate=1e12) for index in (0, 2**53 - 100)])
     with pytest.raises(RecordingError, match='more than 3600 s or 536870912 values'):
-        open_recording(path)
+        read(path)
 
 
 def test_a_type_that_only_bears_the_name_is_refused(tmp_path):
@@ -661,7 +712,7 @@ def test_a_type_that_only_bears_the_name_is_refused(tmp_path):
         connection = bag.add_connection('/vibration', kind, typestore=store)
         bag.write(connection, 0, store.serialize_cdr(store.types[kind](1.0), kind))
     with pytest.raises(RecordingError, match='is not that of ROS 2'):
-        open_recording(tmp_path / 'bag')
+        read(tmp_path / 'bag')
 
 
 def imu(stamp, *values):
@@ -687,22 +738,22 @@ def test_imu_bag_with_a_lost_message(tmp_path):
                           [imu(5.0 + 0.01 * k, 1.0 * k, 2.0 * k, 9.81) for k in (0, 1, 2, 4, 5)],
                           topic='imu/data')
     topic = ('/imu/data',)
-    opened = open_recording(path, sample_rate=100, channel_map=ChannelMap(vibration=topic))
+    opened = read(path, sample_rate=100, vibration_channels=topic)
     assert (opened.channel_names, opened.units[0]) == (('x', 'y', 'z'), 'm/s^2')
     assert opened.start_time == 5.0
     np.testing.assert_array_equal(opened.read()[:2], [[0, 1, 2, np.nan, 4, 5],
                                                       [0, 2, 4, np.nan, 8, 10]])
-    one = open_recording(path, sample_rate=100, channel_map=ChannelMap(vibration=(*topic, 'z')))
+    one = read(path, sample_rate=100, vibration_channels=(*topic, 'z'))
     assert one.channel_names == ('z',)
     with pytest.raises(RecordingError, match='no vibration topic among /imu/data'):
-        open_recording(path, sample_rate=100)
+        read(path, sample_rate=100)
 
 
 def test_samples_that_no_machine_has_end_a_recording(tmp_path):
     samples = np.ones((1, 100))
     samples[0, [40, 50]] = np.nan, -1e200
     write_npz(tmp_path / 'a.npz', Recording(ArraySource(samples), RATE))
-    opened = open_recording(tmp_path / 'a.npz')
+    opened = read(tmp_path / 'a.npz')
     assert next(opened.blocks(50)).shape == (1, 50)
     with pytest.raises(RecordingError, match=r'sample of -1e\+200: must be within 1e\+100'):
         opened.read()
@@ -715,16 +766,16 @@ def test_pulses_beyond_2038_need_an_array(tmp_path):
     with pytest.raises(RecordingError, match=r'pulse time 3800000000.0 s: .* set tach_type to'):
         write_bag(tmp_path / 'reference', late)
     write_bag(tmp_path / 'array', late, tach_type='std_msgs/msg/Float64MultiArray')
-    opened = open_recording(tmp_path / 'array')
+    opened = read(tmp_path / 'array')
     np.testing.assert_array_equal(opened.pulse_times, late.pulse_times)
 
 
 def test_imu_bag_is_played_by_its_stamps(tmp_path, rng):
     stamps = 100.0 + (np.arange(4000) + rng.uniform(-0.7, 0.7, 4000)) / 1000.0
-    opened = open_recording(imu_bag(tmp_path / 'jitter', stamps), sample_rate=1000.0)
+    opened = read(imu_bag(tmp_path / 'jitter', stamps), sample_rate=1000.0)
     assert (opened.samples, opened.remarks) == (4000, ())
     stamps = 100.0 + np.delete(np.arange(5000), [2500, 2501]) / 999.5
-    opened = open_recording(imu_bag(tmp_path / 'slow', stamps), sample_rate=1000.0)
+    opened = read(imu_bag(tmp_path / 'slow', stamps), sample_rate=1000.0)
     assert opened.remarks == ('/vibration: 2 lost samples are NaN',)
     assert np.flatnonzero(np.isnan(opened.read()[2])).tolist() == [2500, 2501]
 
@@ -733,20 +784,20 @@ def test_imu_bag_is_played_by_its_stamps(tmp_path, rng):
 def test_imu_bag_of_another_rate_is_refused_with_its_rate(tmp_path, source_rate):
     bag = imu_bag(tmp_path / 'bag', 5.0 + np.arange(3000) / source_rate)
     with pytest.raises(RecordingError, match=f'or sample_rate is not the {source_rate:g} Hz of'):
-        open_recording(bag, sample_rate=1000.0)
-    assert open_recording(bag, sample_rate=source_rate).samples == 3000
+        read(bag, sample_rate=1000.0)
+    assert read(bag, sample_rate=source_rate).samples == 3000
 
 
 def test_imu_bag_whose_stamps_jump_back_is_refused(tmp_path):
     bag = imu_bag(tmp_path / 'bag', np.concatenate([np.arange(100), np.arange(100)]) / 1000.0)
     with pytest.raises(RecordingError, match=r'stamps jump back to 0\.0 s: a second run; split'):
-        open_recording(bag, sample_rate=1000.0)
+        read(bag, sample_rate=1000.0)
 
 
 def test_repeats_in_an_imu_bag_are_left_out(tmp_path):
     messages = [imu(0.01 * k, 0.0, 0.0, k) for k in (0, 1, 1, 2, 3)]
     bag = write_messages(tmp_path / 'bag', 'sensor_msgs/msg/Imu', messages)
-    opened = open_recording(bag, sample_rate=100.0)
+    opened = read(bag, sample_rate=100.0)
     np.testing.assert_array_equal(opened.read()[2], np.arange(4.0))
     assert opened.remarks == ('/vibration: 1 repeated samples left out',)
 
@@ -759,7 +810,7 @@ def test_errors_of_the_bag_writer(recording, tmp_path):
     with pytest.raises(RecordingError, match='exists'):
         write_bag(tmp_path / 'bag', recording)
     with pytest.raises(RecordingError, match='topic /nowhere is not in the bag'):
-        open_recording(tmp_path / 'bag', channel_map=ChannelMap(vibration=('/nowhere',)))
+        read(tmp_path / 'bag', vibration_channels=('/nowhere',))
 
 
 # --- measured -----------------------------------------------------------------------------------
@@ -779,7 +830,7 @@ def test_errors_of_the_bag_writer(recording, tmp_path):
     ('uia_bearing_rig_1', 1, 1_228_800, 102, 1),
 ])
 def test_measured_recordings(shared_data, name, channels, samples, pulses, acquisitions):
-    opened = open_recording(shared_data / f'{name}.npz', acquisition=acquisitions - 1)
+    opened = read(shared_data / f'{name}.npz', acquisition=acquisitions - 1)
     assert (opened.channels, opened.samples, opened.acquisitions) == (
         channels, samples, acquisitions)
     assert (opened.pulse_times is None) == (pulses is None)
@@ -789,4 +840,4 @@ def test_measured_recordings(shared_data, name, channels, samples, pulses, acqui
 
 def test_trigger_edges_are_no_recording(shared_data):
     with pytest.raises(RecordingError, match='no vibration'):
-        open_recording(shared_data / 'engine_edges_civic_K20_cranking.npz')
+        read(shared_data / 'engine_edges_civic_K20_cranking.npz')

@@ -2,13 +2,13 @@
 
 import warnings
 
+from bag_writer import write_bag
 from hypothesis import example, given, HealthCheck, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings import (
-    ArraySource, open_recording, Recording, write_bag, write_npz)
+from sa_jitter_ros.recordings import ArraySource, read, Recording, write_npz
 import scipy.io
 import scipy.io.wavfile
 
@@ -63,7 +63,7 @@ def edited(data, edits):
 def refusal(path, **options):
     """Read a whole file and return the message it was refused with, '' if it was read."""
     try:
-        opened = open_recording(path, **options)
+        opened = read(path, **options)
         for block in opened.blocks(1000):
             assert len(block) == opened.channels
         opened.read_tach()

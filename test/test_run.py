@@ -1,13 +1,15 @@
-"""The script `run` where it cannot work: one clear line and exit status 2, nothing made."""
+"""The script `run`: what the quick tests leave out, and one clear line where it cannot work."""
 
 import os
 from pathlib import Path
+import re
 import shutil
 import subprocess
 
 import pytest
 
-RUN = Path(__file__).resolve().parents[1] / 'run'
+ROOT = Path(__file__).resolve().parents[1]
+RUN = ROOT / 'run'
 
 
 @pytest.fixture
@@ -76,3 +78,12 @@ def test_no_python(refusal):
 def test_distribution_that_is_named_but_not_sourced(refusal):
     line = refusal('test', tool='python3', script='exit 1', ROS_DISTRO='kilted')
     assert 'imports rclpy' in line
+
+
+def test_quick_leaves_out_the_marks_that_contributing_explains(pytestconfig):
+    marks = {line.partition(':')[0] for line in pytestconfig.getini('markers')
+             if line in (ROOT / 'pyproject.toml').read_text()}
+    found = re.search(r"quick='not \((.*)\)'", RUN.read_text())
+    assert set(found[1].split(' or ')) == marks
+    table = (ROOT / 'CONTRIBUTING.md').read_text().partition('| mark |')[2]
+    assert set(re.findall(r'(?m)^\| `(\w+)` \|', table)) == marks

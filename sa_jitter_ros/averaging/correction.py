@@ -1,15 +1,16 @@
 """An average with the errors of its pulses recovered from the vibration, and taken out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.laws import angle_law
+from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
-from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
-from sa_jitter_ros.averaging.shaft import AverageSettings, ShaftAverager, SynchronousAverage
+from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.pulses.angle_law import angle_law
 
 FloatArray = NDArray[np.float64]
 
@@ -17,23 +18,6 @@ _REACH = 0.02  # of a trigger cycle by which a corrected pulse may move
 # Phase in rad up to which the recovered errors may be uncertain at an order. Beyond it the noise
 # of the order itself has a say in them, and aligning noise to itself raises the amplitude.
 _UNCERTAIN = 0.3
-
-
-@dataclass(frozen=True)
-class Correction:
-    """
-    What the vibration tells about the pulses of an average.
-
-    `corrected` is the average between corrected pulses, the raw one where the recovery was refused
-    (`recovery.reason` says why). `attenuation` (channel, order) is raw over corrected amplitude;
-    the noise of the two is the same noise, so that its `attenuation_standard_error` is that of a
-    ratio of correlated amplitudes.
-    """
-
-    corrected: SynchronousAverage
-    recovery: PulseErrorRecovery
-    attenuation: FloatArray
-    attenuation_standard_error: FloatArray
 
 
 class CorrectingAverager:
@@ -63,33 +47,44 @@ class CorrectingAverager:
         reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
         return self._shaft.margin(period, rate) + reach
 
-    def update(self, cycle: CycleSamples) -> SynchronousAverage | None:
+    def update(self, cycle: CycleSamples) -> Average | None:
         """Take the next trigger cycle; returns an average, corrected, when one is due."""
         average = self._shaft.update(cycle)
         if not self.settings.correct_jitter:
             return average
         self._cycles.append(cycle)
+        return self._corrected(average)
+
+    def finish(self) -> Average | None:
+        """Return the average of the cycles of an unfinished block, None if there are none."""
+        average = self._shaft.finish()
+        return self._corrected(average) if self.settings.correct_jitter else average
+
+    def _corrected(self, average: Average | None) -> Average | None:
         if average is None:
             return None
         cycles, self._cycles = self._cycles, []
         return replace(average, correction=correct_average(average, cycles, self.settings))
 
 
-def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
+def correct_average(raw: Average, cycles: Sequence[CycleSamples],
                     settings: AverageSettings) -> Correction:
     """
     Recover the pulse errors of a block average and average its cycles again without them.
 
     `cycles` are the trigger cycles of `raw`, `settings` those it was made with.
     """
+    if len(cycles) < 2:
+        return _uncorrected(raw, 'one trigger cycle cannot be compared with itself: average more')
     law = angle_law('linear')  # whose error inside a cycle the recovery knows
     points = grid_points(max(cycle.period for cycle in cycles), cycles[0].rate)
     u = np.arange(points) / points
     grid = np.stack([cycle.at(law, u, method=settings.interpolation) for cycle in cycles])
     clock = settings.keyphasor_rate or cycles[0].rate
     recovery = recover_pulse_errors(
-        grid, periods=np.diff(raw.pulses), ratio=settings.cycles, first_angle=raw.angle,
-        also=settings.orders, declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+        grid, periods=np.diff(raw.pulses), cycle_length=settings.cycle_length,
+        first_angle=raw.first_angle, also=settings.orders,
+        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
     corrected = raw
     largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
     if largest > reach:
@@ -100,7 +95,7 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
         corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
     phase = np.zeros(len(raw.orders))
     if recovery.accepted:
-        frequency = raw.orders * settings.cycles / np.diff(raw.pulses).mean()
+        frequency = raw.orders * settings.cycle_length / np.diff(raw.pulses).mean()
         phase = 2.0 * np.pi * frequency * math.sqrt(np.mean(recovery.standard_errors**2))
         corrected = replace(corrected, amplitudes=np.where(
             phase <= _UNCERTAIN, corrected.amplitudes, np.nan))
@@ -109,15 +104,26 @@ def correct_average(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
         attenuation = np.abs(raw.amplitudes) / amplitude
         # The noises of raw and corrected are correlated by what the signal keeps, `attenuation`.
         error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
-    return Correction(corrected, recovery, attenuation,
-                      np.hypot(error, attenuation * phase**2 / 2.0))
+    return Correction(
+        corrected.waveform, corrected.amplitudes, corrected.noise, recovery.errors,
+        recovery.standard_errors, recovery.accepted, recovery.reason, attenuation,
+        np.hypot(error, attenuation * phase**2 / 2.0), corrected.cycle_amplitudes)
 
 
-def _average_again(raw: SynchronousAverage, cycles: Sequence[CycleSamples],
-                   settings: AverageSettings, pulses: FloatArray) -> SynchronousAverage:
+def _uncorrected(raw: Average, reason: str) -> Correction:
+    """Return the raw average as one that could not be corrected."""
+    unknown = np.full(raw.amplitudes.shape, np.nan)
+    return Correction(
+        raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
+        np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes)
+
+
+def _average_again(raw: Average, cycles: Sequence[CycleSamples],
+                   settings: AverageSettings, pulses: FloatArray) -> Average:
     """Average the same cycles between corrected pulses."""
-    again = replace(settings, samples_per_revolution=raw.waveform.shape[1])
-    shaft = ShaftAverager(again, first_cycle=round(raw.angle / settings.cycles))
+    again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
+                    trigger_cycles=raw.trigger_cycles)
+    shaft = ShaftAverager(again, first_cycle=round(raw.first_angle / settings.cycle_length))
     for index, cycle in enumerate(cycles):
         average = shaft.update(replace(cycle, pulses=pulses, first=index))
     assert average is not None

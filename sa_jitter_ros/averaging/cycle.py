@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.laws import AngleLaw, cycle_times
-from sa_jitter_ros.angle.resampling import interpolate, margin
+from sa_jitter_ros.pulses.angle_law import AngleLaw, cycle_times
+from sa_jitter_ros.pulses.resampling import interpolate, margin
 from scipy.fft import next_fast_len
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +32,9 @@ class CycleSamples:
 
     `samples` (sample, channel) of which the first is `lead` s after `start_time` (s), at `rate`
     (Hz); `pulses` (s) are those that the angle law reads, the cycle begins at `pulses[first]`.
-    Since 1970 so many seconds have gone by that one sum of the two would round by 0.1 us.
+    Since 1970 so many seconds have gone by that one sum of the two would round by 0.1 us. The
+    speed may ripple inside the cycle: at the fraction u the shaft is `ripple` u (1 - u) s earlier
+    than the angle law says.
     """
 
     samples: FloatArray
@@ -41,6 +43,7 @@ class CycleSamples:
     pulses: FloatArray
     first: int
     lead: float = 0.0
+    ripple: float = 0.0
 
     @property
     def period(self) -> float:
@@ -50,7 +53,10 @@ class CycleSamples:
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
         """Values (len(u), channel) at fractions `u` of the cycle."""
         pulses = (self.pulses - self.start_time) - self.lead
-        positions = cycle_times(law, pulses, self.first, u) * self.rate
+        times = cycle_times(law, pulses, self.first, u)
+        if self.ripple:
+            times = times - self.ripple * u * (1.0 - u)
+        positions = times * self.rate
         # a pulse on the first or last sample may round to just outside it
         np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
         return interpolate(self.samples, positions, method=method, cutoff=cutoff)

@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 Array = NDArray[Any]

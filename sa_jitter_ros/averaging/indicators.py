@@ -3,7 +3,7 @@ Condition indicators of a synchronous average: one number for each way a gear sh
 
 ``x`` is the average, ``d`` its difference and ``r`` its residual signal (`gear_signals`), ``s(.)``
 a standard deviation over one revolution (divisor n), ``mk(.)`` a central moment over one
-revolution and ``A`` peak amplitudes of lines. In the order of `INDICATORS`:
+revolution and ``A`` peak amplitudes of lines. In the order of `INDICATORS`::
 
     rms, peak, crest_factor   sqrt(mean x^2); max |x|; peak / rms. An offset of x counts.
     kurtosis                  m4(x) / s(x)^4; 3 for Gaussian noise. Dyer and Stewart (1978)
@@ -31,7 +31,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from sa_jitter_ros.averaging.gear_signals import GearSettings, separate
 from sa_jitter_ros.errors import SignalError
 

@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+# What an order leaks is that of the others, which leak, too: passes until it no longer matters.
+_PASSES = 6
+# Lines of the average beside an order that tell the noise: beyond the window's main lobe.
+_LOBE, _AROUND = 3, 150
+_OUTLIER = 3.0  # times the noise
 _MEDIAN_FROM = 8  # spectral lines from which on a median is worth its larger scatter
 
 
@@ -34,7 +39,7 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
     share = _leaking(orders, length)
     turn = np.exp(2j * np.pi * np.multiply.outer(angles, orders))[:, None, :]
     clean = cycles
-    for _ in range(2):
+    for _ in range(_PASSES):
         mean = np.nan_to_num(clean.mean(axis=0)) * turn
         leaked = np.concatenate((mean, np.conj(mean)), axis=-1) @ share
         clean = cycles - leaked / turn
@@ -70,3 +75,35 @@ def radial_noise(cycles: ComplexArray) -> FloatArray:
         upper = 1.0 / np.arange(lines // 2 + 1, lines + 1)
         factor = float(np.sum(upper) + 1.0 / lines)
     return np.asarray(np.sqrt(np.median(power, axis=0) / factor / count))
+
+
+def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float) -> FloatArray:
+    """
+    Return the noise (channel, order) of the mean of trigger cycles along the radius.
+
+    `grid` (cycle, point, channel) are successive cycles of `cycles` fundamental cycles without
+    their ends, of a band that ends at order `top`. It is what the spectrum holds in phase with the
+    order (errors of the pulses only turn it) apart from lines: other orders and tones.
+    """
+    flat = grid.reshape(-1, grid.shape[2]).T
+    window = np.hanning(flat.shape[1] + 1)[:-1]
+    turns = cycles / grid.shape[1] * np.arange(flat.shape[1])
+    lines = len(grid) * cycles
+    floors = []
+    for order in orders:
+        turned = flat * np.exp(-2j * np.pi * order * turns)
+        turned = turned * np.exp(-1j * np.angle(turned.mean(axis=1, keepdims=True)))
+        reach = int(np.clip((top - order) * lines, 4 * _LOBE, max(_AROUND, 100.0 * lines)))
+        spectrum = np.fft.rfft(2.0 * turned.real * window, axis=1)[:, _LOBE:reach]
+        floors.append(_without_lines(np.abs(spectrum) ** 2))
+    return np.sqrt(np.array(floors).T / (flat.shape[1] * np.sum(window**2)))
+
+
+def _without_lines(power: FloatArray) -> FloatArray:
+    """Return the mean of exponential values (row, value), of which outliers do not count."""
+    floor = np.median(power, axis=1) / np.log(2.0)
+    kept = 1.0 - _OUTLIER * np.exp(-_OUTLIER) / (1.0 - np.exp(-_OUTLIER))
+    for _ in range(10):
+        low = power < _OUTLIER * floor[:, None]
+        floor = np.sum(power, axis=1, where=low) / np.maximum(low.sum(axis=1), 1) / kept
+    return np.asarray(floor)

@@ -3,7 +3,7 @@ Recovery of the keyphasor's pulse errors from the vibration, after which they ca
 
 Where the vibration holds synchronous orders above the noise, every trigger cycle tells by how much
 its two pulses are wrong: it differs from the average by the derivative of the average times hat
-functions of the pulse errors (`pulse_error_model`). All channels and orders make one least-squares
+functions of the pulse errors (`pulse_error_fit`). All channels and orders make one least-squares
 problem whose normal matrix is tridiagonal, so that a Gauss-Newton step costs as much as there are
 pulses.
 
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from math import pi
 
 import numpy as np
-from sa_jitter_ros.averaging.pulse_error_fit import PulseErrorFit, PulseErrorProblem
-from sa_jitter_ros.averaging.pulse_error_model import ComplexArray, compress, FloatArray, nodes_for
+from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
+                                                     PulseErrorFit, PulseErrorProblem)
 from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
 from sa_jitter_ros.errors import ParameterError, SignalError
 
@@ -71,7 +71,7 @@ class PulseErrorRecovery:
     iterations: int
 
 
-def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: float,
+def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_length: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
                          orders: Sequence[float] = (), also: Sequence[float] = (),
                          most_orders: int = 12, with_ripple: bool = False) -> PulseErrorRecovery:
@@ -80,19 +80,19 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
 
     `cycles` (cycle, sample, channel) are its trigger cycles, sample i at the fraction u = i /
     samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
-    times (s). `ratio` is the length of a trigger cycle, `first_angle` the angle of the first
+    times (s). `cycle_length` is r, `first_angle` the angle of the first
     pulse, both in fundamental cycles. `declared_standard_deviation` (s) is that of the declared
     pulse error. `orders` restricts the recovery to these; without it, those integer orders and
     orders in `also` are taken that stand out most, at most `most_orders` and as many more as are
     not integer in `also`. `with_ripple` fits a speed ripple u (1 - u) of every cycle jointly.
 
     Raises `SignalError` for arrays that do not match or are not finite, `ParameterError` for a
-    ratio or standard deviation that is not positive.
+    cycle_length or standard deviation that is not positive.
     """
-    cycles, periods = _validated(cycles, periods, ratio, declared_standard_deviation)
-    declared = declared_standard_deviation * ratio / float(np.mean(periods))
+    cycles, periods = _validated(cycles, periods, cycle_length, declared_standard_deviation)
+    declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
     fit, gain, reason = _staged_fit(
-        cycles, ratio=ratio, first_angle=first_angle, orders=orders, also=also,
+        cycles, cycle_length=cycle_length, first_angle=first_angle, orders=orders, also=also,
         most_orders=most_orders, declared=declared, with_ripple=with_ripple)
     if fit is None:
         count, _, channels = cycles.shape
@@ -101,9 +101,9 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
             np.empty((channels, 0), np.complex128), np.empty(0), np.empty((channels, 0)),
             np.zeros(count), 0)
 
-    errors = fit.errors * float(np.mean(periods)) / ratio
+    errors = fit.errors * float(np.mean(periods)) / cycle_length
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
-        seconds = np.convolve(periods - np.diff(errors), (0.5, 0.5)) / ratio
+        seconds = np.convolve(periods - np.diff(errors), (0.5, 0.5)) / cycle_length
         seconds[[0, -1]] *= 2.0
         errors = fit.errors * seconds
     errors -= errors.mean()
@@ -114,10 +114,10 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, ratio: floa
     return PulseErrorRecovery(
         np.zeros_like(errors) if reason else errors, standard_errors, not reason, reason,
         fit.orders, fit.amplitudes.T, np.abs(gains.mean(axis=1)), fit.noise.T,
-        fit.ripple * periods / ratio, fit.iterations)
+        fit.ripple * periods / cycle_length, fit.iterations)
 
 
-def _validated(cycles: FloatArray, periods: FloatArray, ratio: float, declared: float
+def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, declared: float
                ) -> tuple[FloatArray, FloatArray]:
     cycles, periods = np.asarray(cycles, np.float64), np.asarray(periods, np.float64)
     if cycles.ndim != 3 or len(cycles) < 2 or not cycles.size or periods.shape != cycles.shape[:1]:
@@ -126,7 +126,7 @@ def _validated(cycles: FloatArray, periods: FloatArray, ratio: float, declared: 
     if not (np.isfinite(cycles).all() and np.isfinite(periods).all() and np.all(periods > 0.0)):
         raise SignalError('cycles or periods are not finite, or a period is not positive: drop '
                           'the trigger cycles that hold such values')
-    for name, value in (('ratio', ratio), ('declared_standard_deviation', declared)):
+    for name, value in (('cycle_length', cycle_length), ('declared_standard_deviation', declared)):
         if not (np.isfinite(value) and value > 0.0):
             raise ParameterError(f'{name} is {value}: give a positive number')
     return cycles, periods
@@ -146,7 +146,7 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
                 f'jitter, {declared:.3g} s, which {len(periods)} trigger cycles do not tell from '
                 "another shaft's order: average more trigger cycles, or validate the pulses")
     if np.any(np.diff(errors) >= periods):
-        return 'the recovered errors would swap pulses: check ratio and pulses'
+        return 'the recovered errors would swap pulses: check cycle_length and pulses'
     if gain < 1.0 - _LOSS:
         return (f'without the recovered errors the orders hold {gain:.2f} of their power, '
                 'weighted by order^2, where they should gain: the errors follow another '
@@ -154,7 +154,8 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
     return ''
 
 
-def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders: Sequence[float],
+def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
+                orders: Sequence[float],
                 also: Sequence[float], most_orders: int, declared: float, with_ripple: bool
                 ) -> tuple[PulseErrorFit | None, float, str]:
     """
@@ -163,8 +164,8 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
     Returns what the power of the orders gains by the errors, too, or why nothing can be fitted.
     """
     samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
-    given = np.unique([g for g in orders if 0.0 < g * ratio <= 0.5 * len(samples)])
-    search = None if len(orders) else LineSearch.of(samples, ratio, also)
+    given = np.unique([g for g in orders if 0.0 < g * cycle_length <= 0.5 * len(samples)])
+    search = None if len(orders) else LineSearch.of(samples, cycle_length, also)
     most = most_orders + sum(g != round(g) for g in set(also))
     rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
     known = given if search is None else search.orders
@@ -184,7 +185,8 @@ def _staged_fit(cycles: FloatArray, *, ratio: float, first_angle: float, orders:
         candidates = np.sort(candidates[room])
         if not len(candidates):
             break
-        model = compress(samples, ratio=ratio, first_angle=first_angle, orders=candidates,
+        model = compress(samples, cycle_length=cycle_length, first_angle=first_angle,
+                         orders=candidates,
                          spread=spread)
         significant = significant_orders(model, errors, tests=len(known), least=rounding)
         found = np.flatnonzero(significant.any(axis=1))

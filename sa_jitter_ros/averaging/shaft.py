@@ -6,107 +6,23 @@ it holds is bounded by the settings, and its result depends on the cycles alone.
 """
 
 from collections import deque
-from dataclasses import dataclass
 from fractions import Fraction
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.laws import angle_law, LAWS
-from sa_jitter_ros.angle.resampling import METHODS
+from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleSamples,
                                            exact_cycles, first_point, grid_points,
                                            needed_margin, on_grid, project, waveform_cutoff)
-from sa_jitter_ros.averaging.means import BlockMean, ExponentialMean, RunningMean, SlidingMean
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
-from sa_jitter_ros.errors import ParameterError, SignalError
-
-if TYPE_CHECKING:
-    from sa_jitter_ros.averaging.correction import Correction
+from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, RunningMean,
+                                                  SlidingMean)
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.pulses.angle_law import angle_law
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-AVERAGING = ('block', 'sliding', 'exponential')
-
-
-@dataclass(frozen=True)
-class AverageSettings:
-    """
-    How the trigger cycles of one shaft are averaged.
-
-    `cycles` is r, the fundamental cycles in a trigger cycle; `trigger_cycles` is N_t; `orders` are
-    multiples of the shaft; `samples_per_revolution` 0 chooses the waveform's grid. With
-    `correct_jitter` the pulse errors are recovered from the vibration (block averages only);
-    `keyphasor_rate` (Hz) declares how large they may be, 0 for a keyphasor sampled with the
-    vibration. Raises `ParameterError` for values that cannot be used.
-    """
-
-    cycles: float = 1.0
-    trigger_cycles: int = 40
-    orders: tuple[float, ...] = (1.0, 2.0, 3.0)
-    samples_per_revolution: int = 0
-    averaging: str = 'block'
-    law: str = 'linear'
-    interpolation: str = 'band_limited'
-    correct_jitter: bool = False
-    keyphasor_rate: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check every value."""
-        if not (math.isfinite(self.cycles) and self.cycles > 0.0):
-            raise ParameterError(f'a trigger cycle is {self.cycles} fundamental cycles long: give '
-                                 'a positive ratio')
-        if self.trigger_cycles < 1:
-            raise ParameterError(f'trigger_cycles is {self.trigger_cycles}: give at least 1')
-        if not self.orders or not all(math.isfinite(g) and g > 0.0 for g in self.orders):
-            raise ParameterError(f'orders are {list(self.orders)}: give positive numbers')
-        if self.samples_per_revolution < 0 or 0 < self.samples_per_revolution < 4:
-            raise ParameterError(f'samples_per_revolution is {self.samples_per_revolution}: give '
-                                 'at least 4, or 0 to choose it')
-        if self.correct_jitter and self.averaging != 'block':
-            raise ParameterError(f'correct_jitter with averaging {self.averaging!r}: pulse errors '
-                                 'are recovered per block; set averaging to block')
-        if not (math.isfinite(self.keyphasor_rate) and self.keyphasor_rate >= 0.0):
-            raise ParameterError(f'keyphasor_rate is {self.keyphasor_rate} Hz: give a positive '
-                                 "rate, or 0 for the vibration's")
-        if self.correct_jitter and self.trigger_cycles < 2:
-            raise ParameterError('correct_jitter with trigger_cycles 1: one cycle cannot be '
-                                 'compared with itself; give at least 2')
-        for name, value, known in (('averaging', self.averaging, AVERAGING),
-                                   ('angle_law', self.law, LAWS),
-                                   ('interpolation', self.interpolation, METHODS)):
-            if value not in known:
-                raise ParameterError(f'{name} is {value!r}: give one of {", ".join(known)}')
-
-
-@dataclass(frozen=True)
-class SynchronousAverage:
-    """
-    An average over consecutive trigger cycles.
-
-    Times in s, speed of the tach shaft in Hz. `waveform` and its `standard_error` are (channel,
-    angle) over whole fundamental cycles, NaN where none is whole; `amplitudes` (channel, order)
-    are complex peak amplitudes over whole trigger cycles, cos having phase 0 where the angle is 0
-    (NaN from the Nyquist frequency on), `noise` (channel, order) their standard deviation along
-    the radius. `angle` is that of the first pulse (fundamental cycles), `pulses` (N_t + 1,) in s;
-    `correction` is there where it was asked for.
-    """
-
-    start_time: float
-    end_time: float
-    sequence: int
-    trigger_cycles: int
-    fundamental_cycles: int
-    waveform: FloatArray
-    standard_error: FloatArray
-    orders: FloatArray
-    amplitudes: ComplexArray
-    noise: FloatArray
-    angle: float
-    pulses: FloatArray
-    correction: 'Correction | None' = None
 
 
 class ShaftAverager:
@@ -114,7 +30,7 @@ class ShaftAverager:
 
     def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
         self.settings = settings
-        self._law = angle_law(settings.law)
+        self._law = angle_law(settings.angle_law)
         self._cycle = first_cycle
         self._sequence = 0
         self._points = settings.samples_per_revolution
@@ -127,12 +43,20 @@ class ShaftAverager:
         self._start()
         return lost
 
+    def finish(self) -> Average | None:
+        """Return the average of the cycles of an unfinished block, None if there are none."""
+        if self.settings.averaging != 'block' or not self._counted:
+            return None
+        average = self._result()
+        self._start()
+        return average
+
     def change(self, settings: AverageSettings) -> bool:
         """Go on with other settings and the same angle; returns whether an average was lost."""
         lost = self.settings.averaging == 'block' and self._counted > 0
-        if settings.cycles != self.settings.cycles:
+        if settings.cycle_length != self.settings.cycle_length:
             self._cycle = 0
-        self.settings, self._law = settings, angle_law(settings.law)
+        self.settings, self._law = settings, angle_law(settings.angle_law)
         self._points = settings.samples_per_revolution
         self._start()
         return lost
@@ -141,30 +65,30 @@ class ShaftAverager:
         """Return how many samples a cycle of `period` s at `rate` Hz needs on either side."""
         points = self._points or self._chosen(period, rate)
         return needed_margin(self.settings.interpolation,
-                             waveform_cutoff(points, self.settings.cycles, period, rate))
+                             waveform_cutoff(points, self.settings.cycle_length, period, rate))
 
-    def update(self, cycle: CycleSamples) -> SynchronousAverage | None:
+    def update(self, cycle: CycleSamples) -> Average | None:
         """
         Take the next trigger cycle; returns an average when one is due.
 
         Raises `SignalError` when the shaft itself turns faster than the samples can follow.
         """
         settings = self.settings
-        if settings.cycles / cycle.period >= cycle.rate / 2.0:
+        if settings.cycle_length / cycle.period >= cycle.rate / 2.0:
             raise SignalError(
-                f'shaft frequency {settings.cycles / cycle.period:.6g} Hz is not below half the '
-                f'sampling rate of {cycle.rate:.6g} Hz: check ratio and pulses_per_revolution')
+                f'shaft frequency {settings.cycle_length / cycle.period:.6g} Hz is not below half '
+                f'the sampling rate of {cycle.rate:.6g} Hz: check ratio and pulses_per_revolution')
         if not self._counted:
             self._choose_grid(cycle)
         angle = self._angle(self._cycle)
         grid, first, points = self._resample(cycle, angle)
-        amplitudes = project(grid, settings.cycles, settings.orders, angle)
+        amplitudes = project(grid, settings.cycle_length, settings.orders, angle)
         amplitudes[:, self.beyond_nyquist(cycle.period, cycle.rate)] = np.nan
         if not self._counted:
             self._expect_from(angle)
         self._add_points(first, points, self._angle(self._cycle + 1))
         self._amplitude_mean.update(amplitudes)
-        self._amplitudes.append(amplitudes)
+        self._remember(amplitudes)
         self._pulses.append(float(cycle.pulses[cycle.first + 1]))
         if not self._counted:
             self._pulses.appendleft(float(cycle.pulses[cycle.first]))
@@ -180,31 +104,31 @@ class ShaftAverager:
 
     def _angle(self, cycle: int) -> Fraction:
         """Angle (fundamental cycles) at which a trigger cycle begins."""
-        return exact_cycles(self.settings.cycles) * cycle
+        return exact_cycles(self.settings.cycle_length) * cycle
 
     def beyond_nyquist(self, period: float, rate: float) -> NDArray[np.bool_]:
         """Which orders are at or above half the sampling rate."""
-        return np.asarray(np.array(self.settings.orders) * self.settings.cycles / period
+        return np.asarray(np.array(self.settings.orders) * self.settings.cycle_length / period
                           >= rate / 2.0)
 
     # --- the grid ---
 
     def _chosen(self, period: float, rate: float) -> int:
-        return choose_samples_per_revolution(self.settings.cycles, period, rate)
+        return choose_samples_per_revolution(self.settings.cycle_length, period, rate)
 
     def _choose_grid(self, cycle: CycleSamples) -> None:
         if self.settings.samples_per_revolution:
             return
         # A waveform keeps its length as long as it is neither coarser than the samples nor twice
         # as fine: subscribers like one shape.
-        needed = cycle.period * cycle.rate / self.settings.cycles
+        needed = cycle.period * cycle.rate / self.settings.cycle_length
         if not needed <= self._points <= 2.2 * needed:
             self._points = self._chosen(cycle.period, cycle.rate)
 
     def _resample(self, cycle: CycleSamples, angle: Fraction
                   ) -> tuple[FloatArray, int, FloatArray]:
         """Grid of the trigger cycle, both ends included; first waveform point, and the points."""
-        r, n, method = self.settings.cycles, self._points, self.settings.interpolation
+        r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
         cutoff = waveform_cutoff(n, r, cycle.period, cycle.rate)
         if on_grid(n, r) and cutoff == 1.0:
             count = round(n * r)
@@ -223,13 +147,32 @@ class ShaftAverager:
         self._counted = self._noise_due = 0
         self._noise: FloatArray = np.empty((0, 0))
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
-        self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycles, 1.0))
-        self._amplitudes: deque[ComplexArray] = deque(maxlen=settings.trigger_cycles)
+        self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))
+        self._amplitudes: ComplexArray = np.empty((0, 0, 0), np.complex128)
+        self._end = 0  # of those of cycles in `_amplitudes`
         self._pulses: deque[float] = deque(maxlen=settings.trigger_cycles + 1)
         self._wave: FloatArray = np.empty((0, 0))
         self._next_point = 0
         self._full = False  # all points of the waveform are there, but not its end
         self._first_whole = 0
+
+    def _remember(self, amplitudes: ComplexArray) -> None:
+        """Put a cycle's amplitudes behind those of the window, in memory that is never reused."""
+        if self._end == len(self._amplitudes):
+            kept = min(self._counted, self.settings.trigger_cycles - 1)
+            room = np.empty((max(2 * kept, 16), *amplitudes.shape), np.complex128)
+            if kept:
+                room[:kept] = self._amplitudes[self._end - kept:self._end]
+            self._amplitudes, self._end = room, kept
+        self._amplitudes[self._end] = amplitudes
+        self._end += 1
+
+    def _window(self) -> ComplexArray:
+        """Amplitudes (cycle, channel, order) of the latest N_t cycles, which must stay as is."""
+        count = min(self._counted, self.settings.trigger_cycles)
+        window = self._amplitudes[self._end - count:self._end]
+        window.flags.writeable = False
+        return window
 
     def _new_mean(self, cycles: float) -> RunningMean:
         if self.settings.averaging == 'exponential':
@@ -279,7 +222,7 @@ class ShaftAverager:
         self._wave_mean.forget(gone)
         self._first_whole += gone
 
-    def _result(self) -> SynchronousAverage:
+    def _result(self) -> Average:
         settings = self.settings
         shape = self._wave.shape
         count = self._wave_mean.count
@@ -289,22 +232,26 @@ class ShaftAverager:
         if settings.averaging == 'exponential':
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
-        average = SynchronousAverage(
+        pulses, cycles = np.array(self._pulses), self._window()
+        average = Average(
             start_time=self._pulses[0], end_time=self._pulses[-1], sequence=self._sequence,
-            trigger_cycles=settings.trigger_cycles, fundamental_cycles=count,
-            waveform=waveform.T, standard_error=error.T, orders=np.array(settings.orders),
+            trigger_cycles=len(cycles), fundamental_cycles=count, discarded_cycles=0,
+            trigger_speed=((pulses.size - 1) * settings.revolutions_per_trigger
+                           / (self._pulses[-1] - self._pulses[0])),
+            angle=np.arange(shape[0]) / max(shape[0], 1), waveform=waveform.T,
+            standard_error=error.T, orders=np.array(settings.orders),
             amplitudes=self._amplitude_mean.mean, noise=self._estimated_noise(),
-            angle=float(self._angle(self._cycle - len(self._amplitudes))),
-            pulses=np.array(self._pulses))
+            first_angle=float(self._angle(self._cycle - len(cycles))), pulses=pulses,
+            cycle_amplitudes=cycles)
         self._sequence += 1
         return average
 
     def _estimated_noise(self) -> FloatArray:
         """Noise of the mean; of a window that slides anew when an eighth of it is."""
         if self._counted >= self._noise_due:
-            orders, cycles = self.settings.orders, self.settings.cycles
-            amplitudes = np.array(self._amplitudes)
-            angles = cycles * (self._cycle - np.arange(len(amplitudes), 0, -1))
-            self._noise = radial_noise(without_leakage(amplitudes, orders, cycles, angles))
+            orders, cycle_length = self.settings.orders, self.settings.cycle_length
+            amplitudes = self._window()
+            angles = cycle_length * (self._cycle - np.arange(len(amplitudes), 0, -1))
+            self._noise = radial_noise(without_leakage(amplitudes, orders, cycle_length, angles))
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise

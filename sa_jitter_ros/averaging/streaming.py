@@ -8,17 +8,19 @@ cannot be had is discarded and counted; the unfinished averages end with it.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.laws import angle_law
-from sa_jitter_ros.angle.pulses import PulseCounts, PulseValidator, TriggerPulses
+from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
-from sa_jitter_ros.averaging.shaft import AverageSettings, SynchronousAverage
-from sa_jitter_ros.averaging.stretch import Stretch
-from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
+from sa_jitter_ros.averaging.segment import Segment
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.angle_law import angle_law
+from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
+from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 
@@ -55,18 +57,19 @@ class StreamingAverager:
     `add_samples` and `add_pulses` return the averages that became due, as (shaft, average) pairs;
     `messages` collects one clear line for everything that was wrong, to be taken with
     `take_messages`. Samples or pulses that wait for their counterpart are kept for
-    `timeline.buffer_seconds`.
+    `timeline.buffer_seconds`. An unfinished block average is dropped and counted where its trigger
+    cycles break off, with `keep_unfinished` returned as it is.
     """
 
     def __init__(self, shafts: dict[str, AverageSettings], *, validator: PulseValidator,
-                 timeline: VibrationTimeline) -> None:
+                 timeline: VibrationTimeline, keep_unfinished: bool = False) -> None:
         if not shafts:
             raise ParameterError('no shaft to average: name at least one')
         self.timeline, self.validator = timeline, validator
         self.counts = StreamCounts()
         self._pulse_counts = PulseCounts()  # of earlier validators
         self.shafts = {name: CorrectingAverager(settings) for name, settings in shafts.items()}
-        self._law = angle_law(next(iter(shafts.values())).law)
+        self._law = angle_law(next(iter(shafts.values())).angle_law)
         self._triggers: list[Trigger] = []  # of which the next cycle begins at _next
         self._next = 0
         self._run = 0  # where the run of the next cycle begins
@@ -74,11 +77,28 @@ class StreamingAverager:
         self._lead = np.inf  # s of samples before a cycle that its interpolation reads
         self._speed = 0, 0.0  # cycles and seconds since the last take_speed
         self._messages: list[str] = []
+        self._keep_unfinished = keep_unfinished
+        self._due: list[tuple[str, Average]] = []
+        self._ended = False
 
     @property
     def pulse_counts(self) -> PulseCounts:
         """What became of the pulses so far, whichever validator judged them."""
-        return self._pulse_counts + self.validator.counts
+        validator = self.validator
+        return self._pulse_counts + (validator.finish() if self._ended else validator.counts)
+
+    @property
+    def totals(self) -> dict[str, int]:
+        """Return everything that was dropped or lost so far, by the keys of the diagnostics."""
+        samples, pulses = self.timeline.counts, self.pulse_counts
+        return {
+            'samples_dropped': samples.samples_dropped, 'samples_lost': samples.samples_lost,
+            'pulses_dropped': (self.counts.pulses_dropped + pulses.doubles + pulses.early
+                               + pulses.out_of_order + pulses.non_finite + pulses.unlocked),
+            'cycles_dropped': self.counts.cycles_dropped + pulses.cycles_discarded,
+            'averages_dropped': self.counts.averages_dropped, 'gaps': samples.gaps,
+            'restarts': max(samples.restarts, pulses.restarts), 'repeats': samples.repeats,
+            'clock_deviation': samples.clock_deviation}
 
     def take_messages(self) -> list[str]:
         """Lines about what was wrong since the last call."""
@@ -86,14 +106,14 @@ class StreamingAverager:
         self._messages, self.timeline.messages = [], []
         return lines
 
-    def add_samples(self, block: SampleBlock) -> list[tuple[str, SynchronousAverage]]:
+    def add_samples(self, block: SampleBlock) -> list[tuple[str, Average]]:
         """Take a block; raises `SignalError` for one that cannot be used (it is counted)."""
         self.timeline.add(block)
         averages = self._process()
         self.timeline.bound()
         return averages
 
-    def add_pulses(self, times: FloatArray) -> list[tuple[str, SynchronousAverage]]:
+    def add_pulses(self, times: FloatArray) -> list[tuple[str, Average]]:
         """Take pulse times (s), in order of arrival."""
         triggers = self.validator.update(times)
         self._queue(triggers)
@@ -101,11 +121,26 @@ class StreamingAverager:
         self._bound_pulses()
         return averages
 
+    def finish(self) -> list[tuple[str, Average]]:
+        """Return the averages that become due because neither samples nor pulses follow."""
+        self._ended = True
+        self.timeline.close()
+        averages = self._process()
+        waiting = self._triggers[self._next:]
+        count = sum(not item.starts_run for item in waiting[1:])
+        if count:
+            self._discard(count, f'no vibration from {waiting[0].time:.6f} s on')
+        self._triggers.clear()
+        self._next = 0
+        self._begin_run()
+        due, self._due = self._due, []
+        return averages + due
+
     def change(self, shafts: dict[str, AverageSettings]) -> None:
         """Go on with other settings of the same shafts; unfinished averages are lost, counted."""
         lost = [self.shafts[name].change(settings) for name, settings in shafts.items()]
         self.counts.averages_dropped += sum(lost)
-        self._law = angle_law(next(iter(shafts.values())).law)
+        self._law = angle_law(next(iter(shafts.values())).angle_law)
 
     def change_pulses(self, validator: PulseValidator) -> None:
         """Go on with another validator: pulses so far are forgotten, the angle starts anew."""
@@ -159,8 +194,7 @@ class StreamingAverager:
 
     # --- cycles ---
 
-    def _process(self) -> list[tuple[str, SynchronousAverage]]:
-        averages: list[tuple[str, SynchronousAverage]] = []
+    def _process(self) -> list[tuple[str, Average]]:
         while len(self._triggers) - self._next >= 2:
             start, end = self._triggers[self._next:self._next + 2]
             if end.starts_run or end.epoch != start.epoch:
@@ -170,16 +204,30 @@ class StreamingAverager:
             first = self._next == self._run
             if not closed and after < (self._law.after_first if first else self._law.after):
                 break
-            stretch = self._locate(start, end)
-            if stretch is None:
+            segment = self._locate(start, end)
+            if segment is None:
                 break
-            if isinstance(stretch, str):
-                self._discard(1, stretch)
+            if isinstance(segment, str):
+                count = self._uncovered()
+                end = self._triggers[self._next + count]
+                self._discard(count, f'no gapless vibration from {start.time:.6f} s to '
+                              f'{end.time:.6f} s{segment}')
                 continue
-            averages += self._hand_over(stretch)
+            self._hand_over(segment)
             self._next += 1
         self._forget_used()
-        return averages
+        due, self._due = self._due, []
+        return due
+
+    def _uncovered(self) -> int:
+        """Return how many cycles from the next one on lack vibration that will not come."""
+        count = 1
+        for start, end in pairwise(self._triggers[self._next + 1:]):
+            if (end.starts_run or end.epoch != start.epoch
+                    or not isinstance(self._locate(start, end), str)):
+                break
+            count += 1
+        return count
 
     def _pulses_after(self) -> tuple[int, bool]:
         """Pulses of this run behind the next cycle, up to as many as a law reads; run closed."""
@@ -188,41 +236,39 @@ class StreamingAverager:
             if item.starts_run:
                 return count, True
             count += 1
-        return count, False
+        return count, self._ended
 
-    def _locate(self, start: Trigger, end: Trigger) -> Stretch | str | None:
-        """Stretch that covers a cycle; None to wait for it, or why it will not come."""
+    def _locate(self, start: Trigger, end: Trigger) -> Segment | str | None:
+        """Segment that covers a cycle; None to wait for it, a remedy if it will not come."""
         timeline = self.timeline
         if start.epoch > timeline.epoch:
             return None
         ahead = True
-        for stretch in timeline.stretches:
-            if stretch.epoch != start.epoch or not len(stretch.samples):
+        for segment in timeline.segments:
+            if segment.epoch != start.epoch or not len(segment.samples):
                 continue
-            low, high = stretch.position(start.time), stretch.position(end.time)
-            last = len(stretch.samples) - 1
+            low, high = segment.position(start.time), segment.position(end.time)
+            last = len(segment.samples) - 1
             ahead = low > last
             if low < -1e-6 or ahead:
                 continue
-            margin = max(item.margin(end.time - start.time, stretch.clock.rate)
+            margin = max(item.margin(end.time - start.time, segment.clock.rate)
                          for item in self.shafts.values())
-            if last >= high + margin or (stretch.closed and last >= high - 1e-6):
-                return stretch
-            if not stretch.closed:
+            if last >= high + margin or (segment.closed and last >= high - 1e-6):
+                return segment
+            if not segment.closed:
                 return None
             break
         if ahead and start.epoch == timeline.epoch:
             return None
-        remedy = ''
         if timeline.layout is not None:
             rate = timeline.layout[1]
             margin = max(item.margin(end.time - start.time, rate) for item in self.shafts.values())
             if end.time - start.time + 2 * margin / rate > timeline.buffer_seconds:
-                remedy = f' (raise buffer_seconds = {timeline.buffer_seconds:g} s, it is longer)'
-        return (f'no gapless vibration for the trigger cycle from {start.time:.6f} s to '
-                f'{end.time:.6f} s{remedy}')
+                return f' (raise buffer_seconds = {timeline.buffer_seconds:g} s, it is longer)'
+        return ''
 
-    def _hand_over(self, stretch: Stretch) -> list[tuple[str, SynchronousAverage]]:
+    def _hand_over(self, segment: Segment) -> None:
         """Give the next cycle to every shaft."""
         begin = max(self._run, self._next - self._law.before, 0)
         stop = self._next + 2
@@ -232,17 +278,17 @@ class StreamingAverager:
             stop += 1
         pulses = np.array([item.time for item in self._triggers[begin:stop]])
         first = self._next - begin
-        low, high = (stretch.position(float(pulse)) for pulse in pulses[first:first + 2])
-        self.timeline.counts.samples_dropped += stretch.use(low, high)
-        averages, failed, clock = [], '', stretch.clock
+        low, high = (segment.position(float(pulse)) for pulse in pulses[first:first + 2])
+        self.timeline.counts.samples_dropped += segment.use(low, high)
+        failed, clock = '', segment.clock
         self._lead = 0.0
         for name, shaft in self.shafts.items():
             margin = shaft.margin(float(pulses[first + 1] - pulses[first]), clock.rate)
             self._lead = max(self._lead, 1.5 * margin / clock.rate)
             offset = max(int(np.floor(low)) - margin, 0)
-            index = stretch.index + offset
+            index = segment.index + offset
             cycle = CycleSamples(
-                stretch.samples[offset:int(np.ceil(high)) + margin + 1], clock.time, clock.rate,
+                segment.samples[offset:int(np.ceil(high)) + margin + 1], clock.time, clock.rate,
                 pulses, first, lead=(index - clock.index) / clock.rate)
             try:
                 average = shaft.update(cycle)
@@ -251,14 +297,13 @@ class StreamingAverager:
                 failed = f'{name}: {error}'
                 continue
             if average is not None:
-                averages.append((name, average))
+                self._due.append((name, average))
         if failed:
             self.counts.cycles_dropped += 1
             self._messages.append(f'{failed}: trigger cycle discarded')
         self.counts.cycles += 1
         self._speed = (self._speed[0] + 1,
                        self._speed[1] + float(pulses[first + 1] - pulses[first]))
-        return averages
 
     def _discard(self, count: int, why: str) -> None:
         """Discard the next `count` cycles; the angle starts anew behind them."""
@@ -276,8 +321,11 @@ class StreamingAverager:
 
     def _begin_run(self) -> None:
         self._run, self._lead = self._next, np.inf
-        lost = [shaft.reset() for shaft in self.shafts.values()]
-        self.counts.averages_dropped += sum(lost)
+        for name, shaft in self.shafts.items():
+            average = shaft.finish() if self._keep_unfinished else None
+            if average is not None:
+                self._due.append((name, average))
+            self.counts.averages_dropped += shaft.reset()
 
     def _forget_used(self) -> None:
         """Forget samples before the next cycle and pulses that no law reads any more."""

@@ -17,7 +17,8 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.pulse_error_model import CompressedCycles, real_parts
+from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
+                                                     least_squares, real_parts)
 from scipy import stats
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
@@ -47,11 +48,12 @@ class LineSearch:
 
     spectra: ComplexArray
     orders: FloatArray
-    ratio: float
+    cycle_length: float
     first: int
 
     @classmethod
-    def of(cls, samples: FloatArray, ratio: float, also: Sequence[float] = ()) -> 'LineSearch':
+    def of(cls, samples: FloatArray, cycle_length: float, also: Sequence[float] = ()
+           ) -> 'LineSearch':
         """
         Prepare the search in `samples` (sample, cycle, channel) of trigger cycles.
 
@@ -64,9 +66,10 @@ class LineSearch:
         window = np.sin(pi * np.arange(points) / points) ** 2
         # A taper over the cycles keeps strong orders from showing at their neighbours.
         spectra = rfft(part * np.multiply.outer(window, _taper(part.shape[1]))[:, :, None], axis=0)
-        top = 0.4 * points / ratio
+        top = 0.4 * points / cycle_length
         others = [g for g in also if 0.0 < g <= top]
-        return cls(spectra, np.union1d(np.arange(1.0, int(top) + 1.0), others), ratio, first)
+        orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
+        return cls(spectra, orders, cycle_length, first)
 
     def strongest(self, errors: FloatArray, most: int, *, below: float
                   ) -> tuple[FloatArray, FloatArray]:
@@ -103,9 +106,9 @@ class LineSearch:
         """Return an array (order, channel), the power of orders `g` without `errors` (pulse,)."""
         count = self.spectra.shape[1]
         errors = errors[self.first:self.first + count + 1]
-        angle = self.ratio * (self.first + np.arange(count)) + errors[:-1]
-        position = np.outer(g, self.ratio + np.diff(errors))
-        nearest = np.rint(g * self.ratio).astype(np.intp)
+        angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
+        position = np.outer(g, self.cycle_length + np.diff(errors))
+        nearest = np.rint(g * self.cycle_length).astype(np.intp)
         phase = np.exp(-2j * pi * np.outer(g, angle)) / (1.0 if tapered else _taper(count))
         line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
         for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
@@ -120,22 +123,6 @@ class LineSearch:
 
 def _taper(count: int) -> FloatArray:
     return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
-
-
-def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
-    """Amplitudes (order, channel) that fit all cycles best (`Response.signal`)."""
-    f = signal.reshape(-1, signal.shape[2])
-    parts = np.linalg.lstsq(f.T @ f, f.T @ coefficients.reshape(len(f), -1), rcond=None)[0]
-    half = len(parts) // 2
-    return np.asarray(parts[:half] + 1j * parts[half:])
-
-
-def deviations(signal: FloatArray, residual: FloatArray) -> ComplexArray:
-    """Deviation of every cycle's amplitude (cycle, order, channel) that a residual amounts to."""
-    parts = np.matmul(signal.transpose(0, 2, 1), residual)
-    parts /= np.sum(signal * signal, axis=1)[:, :, None]
-    half = signal.shape[2] // 2
-    return np.asarray(parts[:, :half] + 1j * parts[:, half:])
 
 
 def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: int,

@@ -1,8 +1,8 @@
 """
-The vibration's time line: blocks in, stretches of consecutive samples out.
+The vibration's time line: blocks in, segments of consecutive samples out.
 
 The sample index decides continuity. Blocks that were received before, stray or malformed are
-dropped, a gap in the index ends a stretch, a source that starts again opens a new epoch; all is
+dropped, a gap in the index ends a segment, a source that starts again opens a new epoch; all is
 counted. Memory is bounded by `buffer_seconds`: the oldest samples go first.
 """
 
@@ -11,31 +11,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.sample_ledger import SampleLedger
-from sa_jitter_ros.averaging.stretch import Clock, Stretch
+from sa_jitter_ros.averaging.segment import SampleClock, SampleLedger, Segment
 from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.samples import finite_spans, SampleBlock
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class SampleBlock:
-    """
-    Consecutive samples of one source.
-
-    `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz,
-    `index` of the first sample, which counts on from block to block.
-    """
-
-    samples: FloatArray
-    start_time: float
-    sample_rate: float
-    index: int
-
-    @property
-    def end_index(self) -> int:
-        """Index of the sample after the last one."""
-        return self.index + int(self.samples.shape[1])
 
 
 @dataclass
@@ -69,7 +49,7 @@ def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
 @dataclass
 class VibrationTimeline:
     """
-    Takes blocks in any order of arrival and keeps `stretches` of consecutive samples.
+    Takes blocks in any order of arrival and keeps `segments` of consecutive samples.
 
     A header time more than half a sample off the clock of its run is counted. A block that is off
     by more than `time_tolerance` (s), lies wholly before the last one's start or contradicts the
@@ -80,13 +60,13 @@ class VibrationTimeline:
     time_tolerance: float = 0.01
     buffer_seconds: float = 5.0
     counts: TimelineCounts = field(default_factory=TimelineCounts)
-    stretches: list[Stretch] = field(default_factory=list)
+    segments: list[Segment] = field(default_factory=list)
     epoch: int = 0
     messages: list[str] = field(default_factory=list)
     _last: SampleBlock | None = None
     _suspect: SampleBlock | None = None
     _odd: tuple[int, float] | None = None
-    _clock: Clock | None = None
+    _clock: SampleClock | None = None
     _gap: tuple[int, int] = (0, 0)  # first index left out, and next one that came
     _ledger: SampleLedger = field(default_factory=SampleLedger)
 
@@ -125,22 +105,29 @@ class VibrationTimeline:
         else:
             self._continue(block)
 
+    def close(self) -> None:
+        """Take that no block follows."""
+        suspect, self._suspect = self._suspect, None
+        if suspect is not None:
+            self._drop(suspect, 'are repeated or out of order')
+        self._close()
+
     def release(self, epoch: int, before: float) -> None:
         """Forget the samples before the time `before` (s) of `epoch`; count those not averaged."""
-        for stretch in self.stretches:
-            if stretch.epoch < epoch:
-                self.counts.samples_dropped += stretch.trim(stretch.end_index)
-            elif stretch.epoch == epoch and np.isfinite(before):
-                self.counts.samples_dropped += stretch.trim(
-                    stretch.index + math.floor(stretch.position(before)))
+        for segment in self.segments:
+            if segment.epoch < epoch:
+                self.counts.samples_dropped += segment.trim(segment.end_index)
+            elif segment.epoch == epoch and np.isfinite(before):
+                self.counts.samples_dropped += segment.trim(
+                    segment.index + math.floor(segment.position(before)))
         self._tidy()
 
     def take(self) -> list[tuple[int, SampleBlock]]:
-        """Take all samples out: their epoch, and stretch by stretch what was held."""
+        """Take all samples out: their epoch, and segment by segment what was held."""
         taken = [(item.epoch, SampleBlock(item.samples.T, item.start_time, item.clock.rate,
                                           item.index))
-                 for item in self.stretches if len(item.samples)]
-        for item in self.stretches:
+                 for item in self.segments if len(item.samples)]
+        for item in self.segments:
             item.trim(item.end_index)
         self._tidy()
         return taken
@@ -153,8 +140,8 @@ class VibrationTimeline:
         the last samples before a restart may be lost.
         """
         found, away, following = max(earliest, self.epoch), np.inf, np.inf
-        for epoch in sorted({item.epoch for item in self.stretches}, reverse=True):
-            held = [item for item in self.stretches if item.epoch == epoch]
+        for epoch in sorted({item.epoch for item in self.segments}, reverse=True):
+            held = [item for item in self.segments if item.epoch == epoch]
             begin = min(item.start_time for item in held)
             end = max(item.end_time for item in held)
             distance = max(begin - time, time - end - max(end - following, 0.0), 0.0)
@@ -165,17 +152,19 @@ class VibrationTimeline:
 
     def bound(self) -> None:
         """Drop and count the oldest samples beyond `buffer_seconds`."""
-        for stretch in self.stretches:
-            excess = (sum(len(item.samples) for item in self.stretches)
-                      - round(self.buffer_seconds * stretch.clock.rate))
+        if math.isinf(self.buffer_seconds):
+            return
+        for segment in self.segments:
+            excess = (sum(len(item.samples) for item in self.segments)
+                      - round(self.buffer_seconds * segment.clock.rate))
             if excess <= 0:
                 break
-            self.counts.samples_dropped += stretch.trim(stretch.index + excess)
+            self.counts.samples_dropped += segment.trim(segment.index + excess)
         self._tidy()
 
     def _tidy(self) -> None:
-        self.stretches = [item for item in self.stretches
-                          if len(item.samples) or not item.closed]
+        self.segments = [item for item in self.segments
+                         if len(item.samples) or not item.closed]
 
     # --- continuity ---
 
@@ -246,7 +235,7 @@ class VibrationTimeline:
             self.counts.gaps += 1
             self.messages.append(f'source goes on at {block.start_time:.6f} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
-        self._clock = Clock(block.start_time, block.index, block.sample_rate)
+        self._clock = SampleClock(block.start_time, block.index, block.sample_rate)
         self._gap, self._ledger = (0, 0), SampleLedger()
         self._store(block.samples, block.index)
         self._last = block
@@ -256,7 +245,7 @@ class VibrationTimeline:
         first, end = self._gap
         if self._clock is not None and first <= block.index < end and abs(
                 block.start_time - self._clock.time_of(block.index)) <= self.time_tolerance:
-            for item in self.stretches:
+            for item in self.segments:
                 if item.clock is self._clock and item.index >= end:
                     self.counts.samples_dropped += item.trim(item.end_index)
             self._tidy()
@@ -283,8 +272,8 @@ class VibrationTimeline:
         self._last = block
 
     def _close(self) -> None:
-        if self.stretches:
-            self.stretches[-1].closed = True
+        if self.segments:
+            self.segments[-1].closed = True
 
     def _store(self, samples: FloatArray, index: int) -> None:
         """Keep the finite samples; a non-finite one leaves a gap."""
@@ -293,24 +282,23 @@ class VibrationTimeline:
         if every.all():
             self._put(samples, index)
             return
-        finite = np.asarray(every.all(axis=0))
-        bad = int(np.count_nonzero(~finite))
+        bad = int(np.count_nonzero(~every.all(axis=0)))
         channels = np.flatnonzero(~every.all(axis=1)).tolist()
         self.counts.non_finite += bad
         self.counts.samples_dropped += bad
         self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in '
                              f'channels {channels}: their cycles are discarded')
-        edges = np.flatnonzero(np.diff(np.concatenate(([False], finite, [False])).astype(np.int8)))
-        if not finite[0]:
+        spans = finite_spans(samples)
+        if not spans or spans[0][0] > 0:
             self._close()
-        for begin, end in edges.reshape(-1, 2):
-            self._put(samples[:, begin:end], index + int(begin))
-            if end < len(finite):
+        for begin, end in spans:
+            self._put(samples[:, begin:end], index + begin)
+            if end < samples.shape[1]:
                 self._close()
 
     def _put(self, samples: FloatArray, index: int) -> None:
         assert self._clock is not None
-        if self.stretches and not self.stretches[-1].closed:
-            self.stretches[-1].append(samples)
+        if self.segments and not self.segments[-1].closed:
+            self.segments[-1].append(samples)
         else:
-            self.stretches.append(Stretch(self._clock, self.epoch, index, samples))
+            self.segments.append(Segment(self._clock, self.epoch, index, samples))

@@ -7,21 +7,16 @@ acquisitions that the fit has not seen.
 """
 
 import argparse
-from collections.abc import Mapping, Sequence
-import json
-import os
+from collections.abc import Sequence
 from pathlib import Path
 import sys
-import tempfile
 
-from sa_jitter_ros.closure.html_report import report_files
-from sa_jitter_ros.closure.observation import Observation, observe
-from sa_jitter_ros.closure.report import summary
-from sa_jitter_ros.closure.trace import Trace, trace
-from sa_jitter_ros.commands.declaration import read_declaration
 from sa_jitter_ros.commands.parser import Parser
-from sa_jitter_ros.commands.recording_options import add_recording_options, open_with
+from sa_jitter_ros.commands.recording_options import add_recording_options, read_options
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.loop import close_loop, Loop
+from sa_jitter_ros.recordings import read
 
 
 def make_parser() -> Parser:
@@ -39,36 +34,19 @@ def make_parser() -> Parser:
     return parser
 
 
-def run(options: argparse.Namespace) -> Trace:
-    """Observe and trace; raises SaJitterError."""
+def run(options: argparse.Namespace) -> Loop:
+    """Close the loop on the recordings; raises SaJitterError."""
     def say(text: str) -> None:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
-    recordings = [open_with(options, path) for path in options.recordings]
+    recordings = [read(path, **read_options(options)) for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
     for name in declaration.unknown:
         print(f'close_loop: {options.declared}: {name} is no parameter of jitter_predictor, '
               'ignored', file=sys.stderr)
-    observations: list[Observation] = []
-    for path, recording in zip(options.recordings, recordings):
-        say(f'observing {path}')
-        observations.append(observe(
-            recording, declaration.model,
-            sources=observations[0].sources.tolist() if observations else ()))
-        say(f'{len(observations[-1].acquisitions)} acquisitions of '
-            f'{declaration.model.trigger_cycles} trigger cycles')
-    return trace(observations, recordings, declared=declaration.effects, progress=say)
-
-
-def write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write all files or none: they are complete before the first gets its name."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder, prefix='.close_loop.') as temporary:
-        for name, content in files.items():
-            (Path(temporary) / name).write_bytes(content)
-        for name in files:
-            os.replace(Path(temporary) / name, folder / name)
+    return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
+                      progress=say)
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -76,12 +54,11 @@ def main(args: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(args)
     try:
         found = run(options)
-        files = report_files(found, recordings=[str(path) for path in options.recordings])
-        write(options.output, files)
+        found.write(options.output)
     except (SaJitterError, OSError) as error:
         print(f'close_loop: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    print(summary(json.loads(files['report.json'])))
+    print(found)
     print(f'report: {options.output / "report.html"}')
     return 0
 

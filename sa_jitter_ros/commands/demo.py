@@ -19,9 +19,9 @@ from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.commands.demo_watcher import Watcher
 from sa_jitter_ros.commands.parser import Parser
-from sa_jitter_ros.commands.recording_options import (
-    add_recording_options, open_with, player_parameters)
+from sa_jitter_ros.commands.recording_options import add_recording_options, read_options
 from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.recordings import read
 
 START_TIMEOUT = 30.0  # s for discovery
 PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may hold thousands of pulses a second
@@ -35,7 +35,8 @@ def node_command(name: str, parameters: dict[str, object]) -> list[str]:
                f'from sa_jitter_ros.nodes.{name} import main; raise SystemExit(main())',
                '--ros-args', '--log-level', 'warn']
     for key, value in parameters.items():
-        text = f'[{", ".join(map(repr, value))}]' if isinstance(value, tuple) else str(value)
+        text = (f'[{", ".join(map(repr, value))}]' if isinstance(value, (list, tuple))
+                else str(value))
         command += ['-p', f'{key}:={text.lower() if isinstance(value, bool) else text}']
     return command
 
@@ -125,8 +126,10 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
     if refused:
         print(f'note: the correction of {refused} averages was refused: '
               f'{averager["shaft.refusal"]}')
-    if plan.note:
-        print(f'note: {plan.note}')
+    end = watcher.status.get(plan.source, {}).get('message', '')
+    for note in (plan.note, end if end.startswith('ended early') else ''):
+        if note:
+            print(f'note: {note}')
     last = {kind: items[-1] if items else None for kind, items in watcher.averages.items()}
     raw = last['synchronous_average']
     assert raw is not None
@@ -158,8 +161,8 @@ def main(args: Sequence[str] | None = None) -> int:
         plan = SIMULATED
         if options.recording:
             plan = plan_recording(
-                options.recording, open_with(options, options.recording),
-                keyphasor_rate=options.keyphasor_rate, parameters=player_parameters(options))
+                options.recording, read(options.recording, **read_options(options)),
+                keyphasor_rate=options.keyphasor_rate, parameters=read_options(options))
         options.output.mkdir(parents=True, exist_ok=True)  # before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')

@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
-from sa_jitter_ros.angle.pulses import PulseValidator
-from sa_jitter_ros.averaging.shaft import AverageSettings
-from sa_jitter_ros.averaging.streaming import StreamingAverager
-from sa_jitter_ros.averaging.timeline import SampleBlock, VibrationTimeline
+from sa_jitter_ros.averaging.averager import Averager
+from sa_jitter_ros.averaging.parameters import KeyphasorParameters
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.pulses.detection import detect_pulses
 from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
@@ -73,7 +71,7 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
     the keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
     """
     first, pulses = _pulses(recording)
-    triggers = _validator(recording).update(pulses)
+    triggers = _keyphasor(recording).validator().update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
     if len(cycles) < 4:
         raise RecordingError(f'{len(pulses)} pulses give {len(cycles)} trigger cycles in '
@@ -94,56 +92,47 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
                            **(parameters or {})},
         title=path.name, seconds=recording.duration,
         channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
-        speed=_share(recording) / period, keyphasor_rate=rate,
+        speed=_keyphasor(recording).revolutions_per_trigger / period, keyphasor_rate=rate,
         pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
         trigger_cycles=trigger_cycles,
         orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
         waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0, note=note)
 
 
-def _validator(recording: Recording) -> PulseValidator:
-    return PulseValidator(pulses_per_revolution=recording.pulses_per_revolution,
-                          pulses_per_trigger=recording.pulses_per_trigger)
+def _keyphasor(recording: Recording) -> KeyphasorParameters:
+    return KeyphasorParameters(pulses_per_revolution=recording.pulses_per_revolution,
+                               pulses_per_trigger=recording.pulses_per_trigger)
 
 
-def _share(recording: Recording) -> float:
-    """Revolutions of the tach shaft in a trigger cycle."""
-    return (recording.pulses_per_trigger or recording.pulses_per_revolution
-            ) / recording.pulses_per_revolution
-
-
-def _pulses(recording: Recording) -> tuple[SampleBlock, FloatArray]:
+def _pulses(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Vibration and pulse times of the first seconds."""
     count = round(LOOK * recording.sample_rate)
     samples = next(recording.blocks(count))
-    block = SampleBlock(samples, recording.start_time, recording.sample_rate, 0)
     end = recording.start_time + samples.shape[1] / recording.sample_rate
     times = recording.pulse_times
     if times is None:
         times = recording.reference_pulse_times
     if times is not None:
-        return block, times[times <= end]
+        return samples, times[times <= end]
     if recording.tach is None or recording.tach_rate is None:
         raise RecordingError('no keyphasor: neither pulse times nor a tach waveform; averaging '
                              'needs one (of a .wav or .csv give --tach-channel)')
     waveform = next(recording.tach_blocks(math.ceil(LOOK * recording.tach_rate)))
-    detector = KeyphasorDetector()
-    found = detector.update(waveform[0], recording.start_time, recording.tach_rate)
-    return block, np.concatenate((found, detector.flush()))
+    return samples, detect_pulses(
+        waveform[0], recording.tach_rate, start_time=recording.start_time)
 
 
-def _strongest_orders(recording: Recording, block: SampleBlock, pulses: FloatArray,
+def _strongest_orders(recording: Recording, samples: FloatArray, pulses: FloatArray,
                       trigger_cycles: int) -> tuple[float, ...]:
     """Orders that stand out most in the first average."""
-    averager = StreamingAverager(
-        {'shaft': AverageSettings(cycles=recording.ratio * _share(recording),
-                                  trigger_cycles=trigger_cycles)},
-        validator=_validator(recording),
-        timeline=VibrationTimeline(buffer_seconds=2.0 * LOOK))
-    averages = averager.add_pulses(pulses) + averager.add_samples(block)
+    averages = Averager(
+        recording.sample_rate, start_time=recording.start_time, ratio=recording.ratio,
+        pulses_per_revolution=recording.pulses_per_revolution,
+        pulses_per_trigger=recording.pulses_per_trigger, trigger_cycles=trigger_cycles,
+    ).update(samples, pulses)
     if not averages:
         return (1.0, 2.0, 3.0)
-    waveform = averages[0][1].waveform
+    waveform = averages[0].waveform
     amplitude = np.abs(np.fft.rfft(waveform, axis=1)).max(axis=0)[1:waveform.shape[1] // 3]
     strongest = np.sort(np.argsort(amplitude)[-ORDERS:]) + 1
     return tuple(float(order) for order in strongest)

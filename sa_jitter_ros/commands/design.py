@@ -6,37 +6,42 @@ Settings that are given are assessed; those that are left out are chosen so that
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import replace
-import math
 from pathlib import Path
 import sys
+from typing import Any
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogFormatter
+from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 import numpy as np
 from sa_jitter_ros.commands.parser import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.statistics.design import (
-    assess, Assessment, design_grid, required_keyphasor_rate, required_trigger_cycles)
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.comb import Leakage
+from sa_jitter_ros.prediction.design import (
+    Design, design, design_grid, RATE_DISTRIBUTIONS, required_keyphasor_rate)
+from sa_jitter_ros.prediction.detectability import detection_probability
 
-DISTRIBUTIONS = ('uniform', 'normal', 'triangular')
 EXAMPLES = """examples:
   rate and revolutions for the first two harmonics of a 19-tooth mesh, 3 % and 1 %:
-    design --orders 19 38 --trigger-speed 41.5 --ratio 2.40789 --attenuation 0.03 --variation 0.01
+    design --orders 19 38 --trigger-speed 41.5 --ratio 2.40789 --loss 0.03 --variation 0.01
   what a keyphasor sampled at 23438 Hz and 41 revolutions give:
     design --orders 19 38 --trigger-speed 41.5 --ratio 2.40789 --keyphasor-rate 23438
            --trigger-cycles 41
+  revolutions that keep a mesh order of the other shaft and mains hum out, and whether a change
+  of 5 % shows at one false alarm in a hundred averages:
+    design --orders 19 38 --trigger-speed 41.5 --ratio 2.40789 --others 18.6886 --tones 50
+           --change 0.05 --false-alarm-rate 0.01
 """
 
-_ANY_RATE = 1e12  # Hz; stands for the rate until it is chosen
-_ANY_CYCLES = 100
-_STEPS = np.array([1.0, 2.0, 5.0])
+_STEPS = (1.0, 2.0, 5.0)
 _KEPT = '#d9ead3'
+_BEST = 5  # numbers of trigger cycles to name
+_CHANGES = 25  # points of a curve
+_LEAST_SHARE = 1e-6  # shown of an exact notch
 
 
 def make_parser() -> Parser:
-    """Return the parser of the command line."""
+    """Return the parser of the command line; its names are the keywords of `design`."""
     parser = Parser(prog='design', description=__doc__, epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     machine = parser.add_argument_group('machine and average')
@@ -50,9 +55,9 @@ def make_parser() -> Parser:
                          help='keyphasor pulses per revolution of the tach shaft (1)')
     machine.add_argument('--pulses-per-trigger', type=int, default=0, metavar='N',
                          help='pulses per trigger cycle (all of a revolution)')
-    machine.add_argument('--jitter-distribution', choices=DISTRIBUTIONS, default='uniform',
-                         help='law of the pulse error, as wide as the keyphasor rate makes it '
-                         '(uniform)')
+    machine.add_argument('--jitter-distribution', choices=RATE_DISTRIBUTIONS, default='uniform',
+                         help='distribution of the pulse error, as wide as the keyphasor rate '
+                         'makes it (uniform)')
     machine.add_argument('--noise-std', type=float, default=0.0, metavar='X',
                          help='standard deviation of white noise per vibration sample, in units '
                          "of the component's amplitude (0)")
@@ -64,98 +69,128 @@ def make_parser() -> Parser:
     settings.add_argument('--trigger-cycles', type=int, metavar='N',
                           help='trigger cycles in an average')
     limits = parser.add_argument_group('limits')
-    limits.add_argument('--attenuation', type=float, default=0.05, metavar='X',
-                        help='largest loss of mean amplitude, a fraction (0.05)')
-    limits.add_argument('--variation', type=float, default=0.05, metavar='X',
-                        help='largest coefficient of variation of the amplitude, a fraction '
-                        '(0.05)')
+    limits.add_argument('--loss', '--attenuation', dest='maximum_loss', type=float, default=0.05,
+                        metavar='X', help='largest loss of mean amplitude, a fraction (0.05)')
+    limits.add_argument('--variation', dest='maximum_variation', type=float, default=0.05,
+                        metavar='X', help='largest coefficient of variation of the amplitude, a '
+                        'fraction (0.05)')
+    interference = parser.add_argument_group('interfering components')
+    interference.add_argument(
+        '--others', type=float, nargs='+', default=(), metavar='ORDER',
+        help='orders of other shafts, as multiples of the shaft of interest')
+    interference.add_argument('--tones', type=float, nargs='+', default=(), metavar='HZ',
+                              help='tones of fixed frequency, Hz')
+    detection = parser.add_argument_group('detection of a change')
+    detection.add_argument('--change', type=float, metavar='X',
+                           help='relative change of an order that one average must show: 0.05 is '
+                           '5 %% up, -0.05 5 %% down')
+    detection.add_argument('--false-alarm-rate', type=float, metavar='P',
+                           help='share of averages without a change that may raise an alarm')
     parser.add_argument('--output', type=Path, default=Path('design.png'), metavar='FILE',
                         help='figure to write, png, pdf or svg (design.png)')
     return parser
 
 
-def settle(options: argparse.Namespace) -> DeclaredModel:
-    """Return the model with the settings given or chosen; raises SaJitterError."""
-    for name in ('attenuation', 'variation'):
-        if not 0.0 < getattr(options, name) < 1.0:
-            raise ParameterError(f'--{name} is {getattr(options, name)}: give a fraction between '
-                                 '0 and 1, both excluded')
-    model = DeclaredModel(
-        keyphasor_rate=_ANY_RATE if options.keyphasor_rate is None else options.keyphasor_rate,
-        trigger_speed=options.trigger_speed,
-        trigger_cycles=(_ANY_CYCLES if options.trigger_cycles is None
-                        else options.trigger_cycles),
-        orders=tuple(options.orders), ratio=options.ratio,
-        pulses_per_revolution=options.pulses_per_revolution,
-        pulses_per_trigger=options.pulses_per_trigger,
-        jitter_distribution=options.jitter_distribution, noise_std=options.noise_std,
-        sample_rate=options.sample_rate)
-    if options.keyphasor_rate is None:
-        rate = _round_up(required_keyphasor_rate(model, options.attenuation))
-        model = replace(model, keyphasor_rate=rate)
-    if options.trigger_cycles is None:
-        model = replace(model, trigger_cycles=required_trigger_cycles(model, options.variation))
-    return model
-
-
-def table(model: DeclaredModel, result: Assessment, options: argparse.Namespace) -> str:
+def table(found: Design, options: argparse.Namespace) -> str:
     """Return the settings and what they mean for each order, as lines."""
-    def source(value: object, limit: str) -> str:
-        return 'given' if value is not None else f'chosen for {limit}'
-
+    model = found.model
     revolutions = model.trigger_cycles * model.trigger_revolutions
-    rate = source(options.keyphasor_rate, f'an attenuation of at most {options.attenuation:g}')
-    cycles = source(options.trigger_cycles, f'a variation of at most {options.variation:g}')
+    rate = ('given' if options.keyphasor_rate is not None
+            else f'chosen for a loss of at most {options.maximum_loss:g}')
+    cycles = ('given' if options.trigger_cycles is not None
+              else f'chosen for a variation of at most {options.maximum_variation:g}'
+              + (' and for what interferes' if found.leakage else ''))
+    detection = '' if found.detection is None else f'  {_percent(options.change):>6} detected'
     lines = [
-        f'keyphasor rate   {model.keyphasor_rate:g} Hz ({rate})',
-        f'trigger cycles   {model.trigger_cycles} ({cycles})',
+        f'keyphasor rate   {found.keyphasor_rate:g} Hz ({rate})',
+        f'trigger cycles   {found.trigger_cycles} ({cycles})',
         f'an average takes {revolutions:g} revolutions of the tach shaft, {model.duration:.4g} s',
         '',
-        '   order  frequency Hz  attenuation  coefficient of variation  limits']
-    for order, attenuation, variation in zip(
-            result.order, result.attenuation, result.coefficient_of_variation):
-        broken = [name for name, value in (('attenuation', attenuation), ('variation', variation))
-                  if value > getattr(options, name)]
-        lines.append(f'{order:8g}  {order * model.fundamental_frequency:12.6g}  '
-                     f'{attenuation:11.5f}  {variation:24.5f}  '
+        f'   order  frequency Hz     loss  coefficient of variation{detection}  limits']
+    for i, order in enumerate(found.orders):
+        loss, variation = found.loss[i], found.variation[i]
+        broken = [name for name, value, limit in (
+            ('loss', loss, options.maximum_loss),
+            ('variation', variation, options.maximum_variation)) if value > limit]
+        detected = '' if found.detection is None else f'  {found.detection[i]:15.4f}'
+        lines.append(f'{order:8g}  {order * model.fundamental_frequency:12.6g}  {loss:7.5f}  '
+                     f'{variation:24.5f}{detected}  '
                      f'{"kept" if not broken else " and ".join(broken) + " broken"}')
+    if found.leakage is not None:
+        lines += ['', *leakage_table(found.leakage, found, options)]
     return '\n'.join(lines)
 
 
-def draw(model: DeclaredModel, options: argparse.Namespace) -> Figure:
-    """Return iso-lines over keyphasor rate and trigger cycles for the highest order."""
-    needed = required_keyphasor_rate(model, options.attenuation)
+def leakage_table(left: Leakage, found: Design, options: argparse.Namespace) -> list[str]:
+    """Return what is left of interfering components, and better numbers of cycles, as lines."""
+    names = [*(f'order {order:g}' for order in options.others),
+             *(f'{tone:g} Hz (order {order:.4g})' for tone, order in zip(
+                 options.tones, left.orders[len(options.others):]))]
+    width = max(len(name) for name in ('interfering', *names))
+    lines = ['share of each interfering component that is left at most',
+             f'{"interfering":{width}}' + ''.join(
+                 f'  {f"at order {order:g}":>14}' for order in found.orders)
+             + '  in the waveform']
+    for name, shares, waveform in zip(names, left.share, left.waveform_share):
+        lines.append(f'{name:{width}}' + ''.join(f'  {share:14.5f}' for share in shares)
+                     + f'  {waveform:15.5f}')
+    best = left.best(_BEST)
+    lines += ['', f'numbers of trigger cycles from {left.candidates[0]} to {left.candidates[-1]} '
+              'that leave least at the orders:',
+              'trigger cycles ' + ''.join(f'{count:10d}' for count in best),
+              'largest share  ' + ''.join(
+                  f'{left.largest_share[count - left.candidates[0]]:10.5f}' for count in best)]
+    return lines
+
+
+def draw(found: Design, options: argparse.Namespace) -> Figure:
+    """Return the figure: limits, and where asked for interfering components and detection."""
+    panels = 1 + (found.leakage is not None) + (found.detection is not None)
+    figure = Figure(figsize=(8.0, 5.6 + 3.0 * (panels - 1)), dpi=120, layout='constrained')
+    first, *rest = figure.subplots(panels, squeeze=False,
+                                   height_ratios=(5.6, *[3.0] * (panels - 1)))[:, 0]
+    draw_limits(first, found, options)
+    if found.leakage is not None:
+        draw_leakage(rest[0], found.leakage)
+    if found.detection is not None:
+        draw_detection(rest[-1], found, found.detection, options)
+    return figure
+
+
+def draw_limits(axes: Axes, found: Design, options: argparse.Namespace) -> None:
+    """Draw iso-lines over keyphasor rate and trigger cycles for the highest order."""
+    model = found.model
+    needed = required_keyphasor_rate(model, options.maximum_loss)
     rates = np.geomspace(min(needed, model.keyphasor_rate) / 3.0,
                          max(needed, model.keyphasor_rate) * 4.0, 20)
     cycles = np.unique(np.geomspace(max(model.trigger_cycles / 4.0, 1.0),
                                     max(model.trigger_cycles * 8.0, 80.0), 14).astype(int))
     grid = design_grid(model, rates, cycles)
     kilo = 1e-3 * rates
-    figure = Figure(figsize=(8.0, 5.6), dpi=120, layout='constrained')
-    axes = figure.add_subplot(
-        xscale='log', yscale='log', xlabel='trigger cycles in an average',
-        ylabel='keyphasor rate / kHz', xlim=(cycles[0], cycles[-1]), ylim=(kilo[0], kilo[-1]))
+    axes.set(xscale='log', yscale='log', xlabel='trigger cycles in an average',
+             ylabel='keyphasor rate / kHz', xlim=(cycles[0], cycles[-1]),
+             ylim=(kilo[0], kilo[-1]))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter('{x:g}')
         axis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
-    worst = np.maximum(grid.attenuation / options.attenuation,
-                       grid.coefficient_of_variation / options.variation)
+    worst = np.maximum(grid.loss / options.maximum_loss,
+                       grid.variation / options.maximum_variation)
     axes.contourf(cycles, kilo, worst, levels=[0.0, 1.0], colors=[_KEPT])
-    for level in _levels(grid.attenuation, options.attenuation):
-        last = np.flatnonzero(grid.attenuation[:, 0] > level)[-1]  # it depends on the rate alone
+    for level in _levels(grid.loss, options.maximum_loss):
+        last = np.flatnonzero(grid.loss[:, 0] > level)[-1]  # it depends on the rate alone
         around = slice(last, last + 2)
-        rate = np.interp(-level, -grid.attenuation[around, 0], kilo[around])
+        rate = np.interp(-level, -grid.loss[around, 0], kilo[around])
         axes.axhline(rate, color='tab:red', linestyle='dashed',
-                     linewidth=_width(level, options.attenuation))
+                     linewidth=_width(level, options.maximum_loss))
         axes.text(1.01, rate, _percent(level), color='tab:red', fontsize=8, va='center',
                   transform=axes.get_yaxis_transform())
-    levels = _levels(grid.coefficient_of_variation, options.variation)
+    levels = _levels(grid.variation, options.maximum_variation)
     if levels:
-        lines = axes.contour(cycles, kilo, grid.coefficient_of_variation, levels=levels,
-                             colors='tab:blue',
-                             linewidths=[_width(level, options.variation) for level in levels])
+        lines = axes.contour(cycles, kilo, grid.variation, levels=levels, colors='tab:blue',
+                             linewidths=[_width(level, options.maximum_variation)
+                                         for level in levels])
         axes.clabel(lines, fmt=_percent, fontsize=8)
-    axes.plot([], [], color='tab:red', linestyle='dashed', label='attenuation')
+    axes.plot([], [], color='tab:red', linestyle='dashed', label='loss')
     axes.plot([], [], color='tab:blue', label='coefficient of variation')
     axes.fill([], [], color=_KEPT, label='both limits (bold) kept')
     axes.plot(model.trigger_cycles, 1e-3 * model.keyphasor_rate, 'k*', markersize=13,
@@ -164,30 +199,60 @@ def draw(model: DeclaredModel, options: argparse.Namespace) -> Figure:
     axes.set_title(f'order {max(model.orders):g} at '
                    f'{max(model.orders) * model.fundamental_frequency:.5g} Hz, '
                    f'{model.jitter_distribution} pulse errors')
-    return figure
+
+
+def draw_leakage(axes: Axes, left: Leakage) -> None:
+    """Draw the largest share of an interfering component over the number of trigger cycles."""
+    axes.semilogy(left.candidates, 1e2 * np.maximum(left.largest_share, _LEAST_SHARE), '.-',
+                  color='tab:blue', linewidth=0.8)
+    axes.plot(left.trigger_cycles, 1e2 * max(np.max(left.share), _LEAST_SHARE), 'k*',
+              markersize=13, linestyle='none', label='these settings')
+    axes.set(xlabel='trigger cycles in an average', ylabel='largest share left / %',
+             title='interfering components in the amplitudes of the orders')
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.yaxis.set_major_locator(LogLocator(subs=_STEPS))
+    axes.yaxis.set_major_formatter('{x:g}')
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+
+
+def draw_detection(
+    axes: Axes, found: Design, detection: np.ndarray, options: argparse.Namespace,
+) -> None:
+    """Draw the probability to detect a change over its size."""
+    changes = np.linspace(0.0, 2.0 * options.change, _CHANGES)
+    changes = changes[changes >= -1.0]
+    curves = detection_probability(found.model, changes, options.false_alarm_rate)
+    for order, curve in zip(found.orders, curves):
+        axes.plot(1e2 * changes, curve, label=f'order {order:g}')
+    axes.plot(np.full(detection.size, 1e2 * options.change), detection, 'k*',
+              markersize=9, linestyle='none', label=f'change of {_percent(options.change)}')
+    axes.axhline(options.false_alarm_rate, color='0.5', linestyle='dotted',
+                 label=f'false-alarm rate {options.false_alarm_rate:g}')
+    axes.set(xlabel='change of the component / %', ylabel='probability to detect it',
+             ylim=(0.0, 1.02), title='detection by one average')
+    axes.grid(alpha=0.3)
+    axes.legend(loc='center right' if options.change > 0.0 else 'center left', fontsize=8)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Choose or assess, print a table and write the figure; returns the exit status."""
     options = make_parser().parse_args(args)
+    keywords: dict[str, Any] = vars(options).copy()
+    output = keywords.pop('output')
     try:
         known = Figure().canvas.get_supported_filetypes()
-        if options.output.suffix.lstrip('.').lower() not in known:
-            raise ParameterError(f'--output {options.output}: end the name in .png, .pdf or .svg')
-        model = settle(options)
-        print(table(model, assess(model), options))
-        draw(model, options).savefig(options.output)
+        if output.suffix.lstrip('.').lower() not in known:
+            raise ParameterError(f'--output {output}: end the name in .png, .pdf or .svg')
+        found = design(**keywords)
+        print(table(found, options))
+        draw(found, options).savefig(output)
     except (SaJitterError, OSError) as error:
         print(f'design: {error}', file=sys.stderr)
         return 2
-    print(f'\nfigure: {options.output}')
+    print(f'\nfigure: {output}')
     return 0
-
-
-def _round_up(rate: float) -> float:
-    """Round up to four digits, which never breaks a limit."""
-    unit = 10.0 ** (math.floor(math.log10(rate)) - 3)
-    return float(f'{math.ceil(rate / unit) * unit:.4g}')
 
 
 def _percent(level: float) -> str:

@@ -7,8 +7,8 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.statistics.moments import noise_line_variance
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.moments import noise_line_variance
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 from scipy import stats
 
 _SIGNIFICANT = 1e-4

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.statistics.angle_error import unit_nodes
+from sa_jitter_ros.prediction.angle_error import unit_nodes
 
 Array = NDArray[Any]
 

@@ -8,12 +8,11 @@ from typing import ClassVar
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.effects.pulse_covariance import (
-    fit_memory, goodness_of_fit, memory_p_value)
+from sa_jitter_ros.effects.pulse_covariance import fit_memory, goodness_of_fit, memory_p_value
 from sa_jitter_ros.effects.slope_test import require_tach_side
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianPulseJitter
-from sa_jitter_ros.statistics.distributions import Normal
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter
+from sa_jitter_ros.prediction.distributions import Normal
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 _FORGOTTEN = 1e-3
 _SIGNIFICANT = 0.01  # the better of two explanations, not the existence of one
@@ -21,7 +20,7 @@ _SIGNIFICANT = 0.01  # the better of two explanations, not the existence of one
 
 @dataclass(frozen=True)
 class CorrelatedJitter(Effect):
-    """Normal errors of `std` s, pulses k apart correlated by `correlation`^k."""
+    """Normal errors of `std` s, pulses k apart correlated by `correlation^k`."""
 
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'

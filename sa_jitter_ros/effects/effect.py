@@ -14,9 +14,9 @@ from typing import Any, ClassVar, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
-from sa_jitter_ros.statistics.moments import AverageMoments
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess
+from sa_jitter_ros.prediction.moments import AverageMoments
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 if TYPE_CHECKING:
     from sa_jitter_ros.effects.evidence import Evidence, Finding

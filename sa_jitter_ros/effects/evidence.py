@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
-from sa_jitter_ros.effects.prediction import known_errors
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.with_effects import known_errors
 
 Array = NDArray[Any]
 

@@ -10,9 +10,9 @@ from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import (
     fit_covariance, goodness_of_fit, memory_p_value, white)
 from sa_jitter_ros.effects.slope_test import require_tach_side
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, IndependentPulseJitter
-from sa_jitter_ros.statistics.distributions import Normal
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.prediction.distributions import Normal
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 _HINT = 0.05  # the p value of a memory that is hardly chance, and no proof
 _DECIDER = 'more acquisitions, or longer ones'

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 _SIGNIFICANT = 1e-4
 _MOST = 1e6

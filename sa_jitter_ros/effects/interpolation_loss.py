@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.angle.resampling import gain as interpolator_gain
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.resampling import gain as interpolator_gain
 
 METHODS = ('band_limited', 'linear', 'cubic', 'spline')
 

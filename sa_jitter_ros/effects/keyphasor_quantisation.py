@@ -14,8 +14,8 @@ import numpy as np
 from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, parameter, Pulses, require_in_turn)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.statistics.distributions import Normal
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.distributions import Normal
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 from scipy import stats
 
 _PHASES, _SEED = 128, 6

@@ -8,10 +8,10 @@ import numpy as np
 from sa_jitter_ros.effects.effect import (
     Array, Effect, mean_period, most_scenarios, parameter, Pulses)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
-from sa_jitter_ros.effects.loss_moments import loss_moments
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess
-from sa_jitter_ros.statistics.moments import AverageMoments
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess
+from sa_jitter_ros.prediction.loss_moments import loss_moments
+from sa_jitter_ros.prediction.moments import AverageMoments
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 _SCENARIOS, _SEED = 256, 4
 

@@ -11,8 +11,8 @@ from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
 from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
 from sa_jitter_ros.effects.slope_test import slope_test
-from sa_jitter_ros.statistics.angle_error import AngleErrorProcess, GaussianAngleError
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 _NARROW = 0.05
 _SIGNIFICANT = 1e-3

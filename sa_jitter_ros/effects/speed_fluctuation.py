@@ -9,10 +9,9 @@ from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, fading, ripple_of_acceleration, slow_memory)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
-from sa_jitter_ros.statistics.angle_error import (
-    AngleErrorProcess, GaussianAngleError, unit_nodes)
-from sa_jitter_ros.statistics.prediction import DeclaredModel
-from sa_jitter_ros.statistics.pulse_weights import Covariance, PulseWeights
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError, unit_nodes
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights
 from scipy import stats
 
 _SIGNIFICANT = 1e-4

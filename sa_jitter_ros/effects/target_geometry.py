@@ -15,7 +15,7 @@ from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, parameter, Pulses, require_in_turn)
 from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.prediction.prediction import DeclaredModel
 from scipy import stats
 
 _LONGEST = 24
@@ -25,7 +25,7 @@ _FEWEST = 3  # acquisitions
 
 @dataclass(frozen=True)
 class TargetGeometry(Effect):
-    """Pulse k comes late by `pulse_angles`[k mod n] rad of the tach shaft."""
+    """Pulse k comes late by `pulse_angles[k mod n]` rad of the tach shaft."""
 
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.publisher import Publisher
+from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.gear_signals import GearSettings
 from sa_jitter_ros.averaging.indicators import INDICATORS, RunningIndicators
-from sa_jitter_ros.averaging.shaft import SynchronousAverage
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import (AMPLITUDE_FIELDS, AverageHeader, AverageMessage,
@@ -36,29 +36,27 @@ class ShaftOutput:
         if gear != self._gear:
             self._gear, self._indicators = gear, RunningIndicators(gear)
 
-    def publish(self, average: SynchronousAverage, share: float) -> None:
-        """Publish one average; `share` is the tach revolutions in a trigger cycle."""
+    def publish(self, average: Average) -> None:
+        """Publish one average."""
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
-            average.fundamental_cycles,
-            average.trigger_cycles * share / (average.end_time - average.start_time))
+            average.fundamental_cycles, average.trigger_speed)
         self._send('synchronous_average', header, average.waveform)
         self._send('standard_error', header, average.standard_error)
         self._send('order_amplitude', header, amplitude_table(average), AMPLITUDE_FIELDS)
         self.published += 1
         correction = average.correction
-        if correction is not None and not correction.recovery.accepted:
+        if correction is not None and not correction.accepted:
             self.refused += 1
-            self.refusal = correction.recovery.reason
+            self.refusal = correction.reason
         elif correction is not None:
-            recovery = correction.recovery
-            self._send('corrected_average', header, correction.corrected.waveform)
+            self._send('corrected_average', header, correction.waveform)
             self._send('pulse_error', header, np.stack(
-                (average.pulses, recovery.errors, recovery.standard_errors), axis=1),
+                (average.pulses, correction.pulse_errors, correction.standard_errors), axis=1),
                 PULSE_ERROR_FIELDS)
-        best = correction.corrected if correction is not None else average
-        if np.isfinite(best.waveform).all():
-            self._indicate(header, best.waveform)
+        waveform = average.waveform if correction is None else correction.waveform
+        if np.isfinite(waveform).all():
+            self._indicate(header, waveform)
 
     def _indicate(self, header: AverageHeader, waveform: FloatArray) -> None:
         """Publish the condition indicators, of the corrected average where there is one."""
@@ -77,18 +75,18 @@ class ShaftOutput:
         self._publishers[kind].publish(encode_average(kind, AverageMessage(header, values, names)))
 
 
-def amplitude_table(average: SynchronousAverage) -> FloatArray:
+def amplitude_table(average: Average) -> FloatArray:
     """Channel x order x `AMPLITUDE_FIELDS`; NaN where there is no correction."""
     table = np.full((*average.amplitudes.shape, len(AMPLITUDE_FIELDS)), np.nan)
     table[..., 0] = average.orders
     table[..., 1] = np.abs(average.amplitudes)
     table[..., 2] = np.angle(average.amplitudes)
     table[..., 7] = average.noise
-    if average.correction is not None and average.correction.recovery.accepted:
+    if average.correction is not None and average.correction.accepted:
         correction = average.correction
-        table[..., 3] = np.abs(correction.corrected.amplitudes)
-        table[..., 4] = np.angle(correction.corrected.amplitudes)
+        table[..., 3] = np.abs(correction.amplitudes)
+        table[..., 4] = np.angle(correction.amplitudes)
         table[..., 5] = correction.attenuation
         table[..., 6] = correction.attenuation_standard_error
-        table[..., 7] = correction.corrected.noise  # jitter does not scatter it any more
+        table[..., 7] = correction.noise  # jitter does not scatter it any more
     return table

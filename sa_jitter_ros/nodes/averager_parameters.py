@@ -1,16 +1,17 @@
 """Parameters of the averager, and what they mean to the core."""
 
+from dataclasses import fields, replace
 from math import prod
 
-from sa_jitter_ros.angle.laws import LAWS
-from sa_jitter_ros.angle.pulses import PulseValidator
-from sa_jitter_ros.angle.resampling import METHODS
+from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
 from sa_jitter_ros.averaging.gear_signals import GearSettings
-from sa_jitter_ros.averaging.shaft import AverageSettings, AVERAGING
+from sa_jitter_ros.averaging.parameters import KeyphasorParameters
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.nodes.parameters import Parameter, Values
+from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.parameters import Parameter, RATIO
+from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
+from sa_jitter_ros.pulses.resampling import METHODS
 
-RATIOS = (1e-3, 1e3)  # beyond them one shaft hardly turns while the other is averaged
 PARAMETERS = (
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration',
               read_only=True),
@@ -46,7 +47,7 @@ PARAMETERS = (
     Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
               maximum=1000000),
     Parameter('averaging', 'block', 'kind of average', choices=AVERAGING),
-    Parameter('angle_law', 'linear', 'angle between pulses', choices=LAWS),
+    Parameter('angle_law', 'linear', 'angle between pulses', choices=ANGLE_LAWS),
     Parameter('correct_jitter', False, 'recover the pulse errors from the vibration'),
     Parameter('keyphasor_rate', 0.0, 'rate at which the keyphasor is sampled: how large pulse '
               'errors may be; 0 for that of the vibration', unit='Hz', minimum=0.0),
@@ -57,8 +58,7 @@ PARAMETERS = (
 def shaft_parameters(name: str) -> tuple[Parameter, ...]:
     """Parameters of one shaft."""
     return (
-        Parameter(f'{name}.ratio', 1.0, 'speed of the shaft over that of the tach shaft',
-                  above=0.0),
+        replace(RATIO, name=f'{name}.ratio'),
         Parameter(f'{name}.ratio_teeth', [], 'tooth counts [driver, driven, ...] that make the '
                   'ratio instead', minimum=1, element=int),
         Parameter(f'{name}.samples_per_revolution', 0, 'points of the waveform, 0 to choose',
@@ -83,16 +83,15 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
             raise ParameterError(f'{name}.ratio_teeth has {len(teeth)} tooth counts: give pairs '
                                  'of driver and driven')
         ratio = prod(teeth[::2]) / prod(teeth[1::2])
-    if not RATIOS[0] <= ratio <= RATIOS[1]:
-        raise ParameterError(f'{name}: a ratio of {ratio:.3g}: give one from {RATIOS[0]:g} to '
-                             f'{RATIOS[1]:g}')
-    return AverageSettings(
-        cycles=ratio * trigger_share(values), trigger_cycles=values['trigger_cycles'],
-        orders=tuple(values[f'{name}.orders']),
-        samples_per_revolution=values[f'{name}.samples_per_revolution'],
-        averaging=values['averaging'], law=values['angle_law'],
-        interpolation=values['interpolation'], correct_jitter=values['correct_jitter'],
-        keyphasor_rate=values['keyphasor_rate'])
+    try:
+        return keyphasor_parameters(values).average(
+            ratio=ratio, orders=values[f'{name}.orders'],
+            samples_per_revolution=values[f'{name}.samples_per_revolution'],
+            **{key: values[key] for key in (
+                'trigger_cycles', 'averaging', 'angle_law', 'interpolation', 'correct_jitter',
+                'keyphasor_rate')})
+    except ParameterError as error:
+        raise ParameterError(f'{name}: {error}') from None
 
 
 def one_ratio(values: Values, name: str) -> ParameterError:
@@ -101,24 +100,10 @@ def one_ratio(values: Values, name: str) -> ParameterError:
                           f'{values[f"{name}.ratio_teeth"]}: give one of them')
 
 
-def trigger_share(values: Values) -> float:
-    """Tach revolutions in a trigger cycle; raises `ParameterError`."""
-    revolution, trigger = values['pulses_per_revolution'], values['pulses_per_trigger']
-    if trigger > revolution:
-        raise ParameterError(f'pulses_per_trigger is {trigger} of {revolution} '
-                             'pulses_per_revolution: give at most that many')
-    return float((trigger or revolution) / revolution)
-
-
-def pulse_validator(values: Values) -> PulseValidator:
-    """Return the validator of the tach pulses; raises `ParameterError`."""
-    return PulseValidator(
-        pulses_per_revolution=values['pulses_per_revolution'],
-        pulses_per_trigger=values['pulses_per_trigger'] or None,
-        missing_teeth=values['missing_teeth'], missing_pulses=values['missing_pulses'],
-        maximum_missing=values['maximum_missing'],
-        interval_tolerance=values['interval_tolerance'],
-        minimum_interval=values['minimum_interval'], time_tolerance=values['time_tolerance'])
+def keyphasor_parameters(values: Values) -> KeyphasorParameters:
+    """Return what is known of the keyphasor; raises `ParameterError`."""
+    return KeyphasorParameters(**{
+        item.name: values[item.name] for item in fields(KeyphasorParameters)})
 
 
 def gear_settings(values: Values, name: str) -> GearSettings:

@@ -22,7 +22,8 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.nodes.parameters import Parameter, ParameterSet
+from sa_jitter_ros.nodes.parameters import ParameterSet
+from sa_jitter_ros.parameters import Parameter
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
                    'clock_deviation', 'messages_rejected')
@@ -55,14 +56,16 @@ class MonitoringNode(Node):
     A node of this package: described parameters, diagnostics, and no message that can kill it.
 
     `counts` are cumulative; a subclass updates them (in `update_counts`, called before they are
-    published) and says in `summary` what it is doing. A count that grew makes the status WARN, a
-    publisher of an input whose quality of service does not fit makes it ERROR.
+    published) and says in `summary` what it is doing. A count that grew makes the status WARN. A
+    publisher of an input whose quality of service does not fit makes it ERROR, and so does each
+    text in `faults` for as long as it is there.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter], **node_kwargs: Any) -> None:
         super().__init__(name, **node_kwargs)
         self.parameters = ParameterSet(self, parameters)
         self.counts: dict[str, int] = dict.fromkeys(DIAGNOSTIC_KEYS, 0)
+        self.faults: dict[str, str] = {}
         self._unfit: dict[Subscription, str] = {}  # and the policy that does not fit
         self._reported = dict(self.counts)
         self._last_warning = ''
@@ -150,7 +153,7 @@ class MonitoringNode(Node):
         status = DiagnosticStatus(level=DiagnosticStatus.OK, message=text, hardware_id='',
                                   name=self.get_fully_qualified_name().lstrip('/'))
         grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
-        faults = self._misfits()
+        faults = [*self.faults.values(), *self._misfits()]
         if faults:
             status.level, status.message = DiagnosticStatus.ERROR, '; '.join(faults)
         elif grown or self._last_warning:

@@ -6,18 +6,19 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.effects import EFFECTS, parameter_ranges
+from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
-from sa_jitter_ros.nodes.effect_parameters import effect_parameters
-from sa_jitter_ros.nodes.parameters import Parameter, require_shaft_names, Values
+from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
+from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,
     Keyphasor, make_effects, mesh, Torsion)
 from sa_jitter_ros.simulation.pulse_effects import JITTER_DISTRIBUTIONS
-from sa_jitter_ros.simulation.sinusoids import NOTHING
+from sa_jitter_ros.simulation.sinusoids import ZERO
 
 FIXED: dict[str, Any] = {'read_only': True}
 PARAMETERS = (
@@ -129,7 +130,7 @@ def machine_of(values: Values) -> Gearbox:
         shafts={shaft: values[f'{shaft}.ratio'] for shaft in values['shafts']},
         speed=list(zip(profile[::2], profile[1::2])) or [(0.0, values['speed'])],
         fluctuation=band_limited(std=std, band=tuple(band), seed=seed, name='fluctuation')
-        if std else NOTHING,
+        if std else ZERO,
         torsion=(Torsion(values['torsion_order'], values['torsion_amplitude']),)
         if values['torsion_amplitude'] else (),
         keyphasor=Keyphasor(

@@ -7,6 +7,8 @@ each; their layouts only this module knows. A message that does not follow the l
 `MessageError`. Arrays are in C order; infinities are never published (NaN instead).
 """
 
+from __future__ import annotations
+
 import array
 from dataclasses import astuple, dataclass
 import math
@@ -14,11 +16,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.recordings import message_layouts
 from sa_jitter_ros.recordings.message_layouts import (
-    BlockDecoder, decode_array, FLOAT32, FLOAT64, IMU, INDEX_BASE, TIME_REFERENCE, whole)
+    decode_array, FLOAT32, FLOAT64, IMU, INDEX_BASE, TIME_REFERENCE, whole)
+from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
 
@@ -126,29 +128,6 @@ def encode_array(values: FloatArray, labels: tuple[str, ...],
     return _build(Float64MultiArray(), 'd', values, labels, finite)
 
 
-class SampleDecoder:
-    """
-    Decode `vibration` or `tach_waveform` messages of one type into `SampleBlock`s.
-
-    `kind` is a key of `SAMPLE_TYPES`; the rest, the errors as well, are those of `BlockDecoder`.
-    """
-
-    def __init__(self, kind: str, *, sample_rate: float, start_time: float = 0.0,
-                 imu_axis: str = 'z') -> None:
-        self._decoder = BlockDecoder(kind, sample_rate=sample_rate, start_time=start_time,
-                                     imu_axis=imu_axis)
-
-    @property
-    def counted(self) -> bool:
-        """Whether messages without header were counted."""
-        return self._decoder.counted
-
-    def decode(self, message: Float64MultiArray | Float32MultiArray | Imu) -> SampleBlock:
-        """Return the block that a message holds."""
-        block = self._decoder.decode(message)
-        return SampleBlock(block.samples, block.start_time, block.sample_rate, block.index)
-
-
 def encode_samples(block: SampleBlock) -> Float64MultiArray:
     """Encode a block as Float64MultiArray with header [time, sample rate, index]."""
     return _build(Float64MultiArray(), 'd', block.samples, ('channel', 'sample'),
@@ -162,6 +141,7 @@ def encode_samples_float32(block: SampleBlock) -> Float32MultiArray:
                   (float(high), float(low)))
 
 
+SampleDecoder = message_layouts.SampleDecoder
 decode_time = message_layouts.decode_time
 decode_pulse_reference = message_layouts.decode_pulse_reference
 decode_pulse_array = message_layouts.decode_pulse_array

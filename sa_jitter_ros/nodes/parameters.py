@@ -1,14 +1,13 @@
 """
-Declare, read and check parameters: described, ranged, kind to integers.
+The parameters of a node: declared to ROS, read, and checked when they change.
 
-A node lists its parameters as `Parameter` specifications. `ParameterSet` declares them (a float
-takes an integer, a float list an integer list, from `-p`, YAML and services), warns of overrides
-that match nothing, and on a change hands the whole new configuration first to `check`, whose
-`SaJitterError` refuses the change with its reason, and once it is set to `apply`.
+A node lists its parameters as `Parameter`. `ParameterSet` declares them (a float takes an integer,
+a float list an integer list, from `-p`, YAML and services) and warns of overrides that match none.
+It gives the whole new configuration to `check` before a change, which raises a `SaJitterError` to
+refuse it with a reason, and to `apply` after it.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 import math
 import re
 from typing import Any
@@ -18,102 +17,33 @@ from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescr
 from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.parameters import Parameter
 
 Values = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """
-    Specification of one parameter.
-
-    The default's type is the parameter's type; `[0.0]`-like defaults make lists, and `element`
-    gives the type of a list whose default is empty. `minimum` and `maximum` bound a number or
-    every element of a list, `above` is an open lower bound, `choices` are the values a string may
-    take.
-    """
-
-    name: str
-    default: Any
-    description: str
-    unit: str = ''
-    minimum: float | None = None
-    maximum: float | None = None
-    above: float | None = None
-    choices: tuple[str, ...] = ()
-    read_only: bool = False
-    element: type = float
-
-    @property
-    def is_list(self) -> bool:
-        """Whether the value is a list."""
-        return isinstance(self.default, list)
-
-    @property
-    def kind(self) -> type:
-        """Type of the value, or of a list's elements."""
-        if self.is_list:
-            return type(self.default[0]) if self.default else self.element
-        return type(self.default)
-
-    def convert(self, value: Any) -> Any:
-        """Return the value as this parameter's type, or raise `ParameterError`."""
-        if self.is_list:
-            if isinstance(value, (str, bytes)) or not hasattr(value, '__len__'):
-                raise ParameterError(f'{self.name} is {value!r}: give a list of '
-                                     f'{self.kind.__name__}')
-            return [self._convert_one(item) for item in value]
-        return self._convert_one(value)
-
-    def _convert_one(self, value: Any) -> Any:
-        kind: Any = self.kind
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if kind is str and isinstance(value, int) and not isinstance(value, bool):
-            value = str(value)  # `-p tach_channel:=2` means the name 2
-        if type(value) is not kind:
-            raise ParameterError(f'{self.name} is {value!r} ({type(value).__name__}): '
-                                 f'give {kind.__name__}')
-        if kind in (int, float):
-            self._check_range(value)
-        elif self.choices and value not in self.choices:
-            raise ParameterError(f'{self.name} is {value!r}: give one of '
-                                 f'{", ".join(self.choices)}')
-        return value
-
-    def _check_range(self, value: float) -> None:
-        unit = f' {self.unit}' if self.unit else ''
-        if not math.isfinite(value):
-            raise ParameterError(f'{self.name} is {value}{unit}: give a finite number')
-        if self.above is not None and not value > self.above:
-            raise ParameterError(f'{self.name} is {value}{unit}: give more than {self.above}')
-        if self.minimum is not None and value < self.minimum:
-            raise ParameterError(f'{self.name} is {value}{unit}: give at least {self.minimum}')
-        if self.maximum is not None and value > self.maximum:
-            raise ParameterError(f'{self.name} is {value}{unit}: give at most {self.maximum}')
-
-    def descriptor(self) -> ParameterDescriptor:
-        """Descriptor for `ros2 param describe`."""
-        text = self.description + (f' [{self.unit}]' if self.unit else '')
-        limits = []
-        if self.choices:
-            limits.append(f'one of {", ".join(self.choices)}')
-        if self.above is not None:
-            limits.append(f'more than {self.above}')
-        # Typing is dynamic so that an integer can reach a float and be converted.
-        descriptor = ParameterDescriptor(
-            description=text, read_only=self.read_only, dynamic_typing=True,
-            additional_constraints='; '.join(limits))
-        if self.minimum is not None or self.maximum is not None:
-            low = -math.inf if self.minimum is None else self.minimum
-            high = math.inf if self.maximum is None else self.maximum
-            if self.kind is float:
-                descriptor.floating_point_range = [FloatingPointRange(
-                    from_value=max(low, -1.7e308), to_value=min(high, 1.7e308))]
-            elif self.kind is int:
-                descriptor.integer_range = [IntegerRange(
-                    from_value=int(max(low, -2**63)), to_value=int(min(high, 2**63 - 1)))]
-        return descriptor
+def descriptor_of(item: Parameter) -> ParameterDescriptor:
+    """Return the descriptor for `ros2 param describe`."""
+    text = item.description + (f' [{item.unit}]' if item.unit else '')
+    limits = []
+    if item.choices:
+        limits.append(f'one of {", ".join(item.choices)}')
+    if item.above is not None:
+        limits.append(f'more than {item.above}')
+    # Typing is dynamic so that an integer can reach a float and be converted.
+    descriptor = ParameterDescriptor(
+        description=text, read_only=item.read_only, dynamic_typing=True,
+        additional_constraints='; '.join(limits))
+    if item.minimum is not None or item.maximum is not None:
+        low = -math.inf if item.minimum is None else item.minimum
+        high = math.inf if item.maximum is None else item.maximum
+        if item.kind is float:
+            descriptor.floating_point_range = [FloatingPointRange(
+                from_value=max(low, -1.7e308), to_value=min(high, 1.7e308))]
+        elif item.kind is int:
+            descriptor.integer_range = [IntegerRange(
+                from_value=int(max(low, -2**63)), to_value=int(min(high, 2**63 - 1)))]
+    return descriptor
 
 
 def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.parameter.Parameter:
@@ -123,14 +53,6 @@ def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.para
                  str: rclpy.Parameter.Type.STRING_ARRAY}
         return rclpy.parameter.Parameter(name, kinds[element], value)
     return rclpy.parameter.Parameter(name, value=value)
-
-
-def require_shaft_names(parameter: str, names: Sequence[str]) -> None:
-    """Raise `ParameterError` unless there are names, different ones that topics can have."""
-    wrong = [name for name in names if not re.fullmatch('[a-z][a-z0-9_]*', name)]
-    if wrong or not names or len(set(names)) < len(names):
-        raise ParameterError(f'{parameter} is {", ".join(map(repr, names))}: give different names '
-                             'of small letters, digits and underscores')
 
 
 def require_node_name(parameter: str, name: str) -> None:
@@ -153,17 +75,18 @@ class ParameterSet:
         """Declare; raises `ParameterError` for an override of wrong type or range."""
         for item in specifications:
             value = item.convert(self._node._parameter_overrides[item.name].value
-                                 if self.given(item.name) else item.default)
+                                 if item.name in self.given else item.default)
             self._node.declare_parameter(
-                item.name, value, item.descriptor(), ignore_override=True)
+                item.name, value, descriptor_of(item), ignore_override=True)
             if value == [] and not item.read_only:  # rclpy takes an empty list for bytes
                 self._node.set_parameters([as_ros_parameter(item.name, value, item.kind)])
             self._specifications[item.name] = item
 
-    def given(self, name: str) -> bool:
-        """Whether the user gave a parameter at the start, even if it is the default."""
-        override = self._node._parameter_overrides.get(name)
-        return override is not None and override.value is not None
+    @property
+    def given(self) -> frozenset[str]:
+        """Names that the user gave at the start, even those of defaults and of no parameter."""
+        return frozenset(name for name, override in self._node._parameter_overrides.items()
+                         if override.value is not None)
 
     def values(self) -> Values:
         """Every parameter's converted value."""

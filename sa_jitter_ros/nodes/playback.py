@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.timeline import SampleBlock
-from sa_jitter_ros.errors import MessageError, SaJitterError
+from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
-from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference,
-                                          encode_samples, encode_samples_float32, known_type,
-                                          PULSE_TYPES, SAMPLE_TYPES)
-from sa_jitter_ros.nodes.parameters import as_ros_parameter, Parameter, Values
-from sensor_msgs.msg import TimeReference
+from sa_jitter_ros.nodes.messages import (
+    encode_samples, encode_samples_float32, known_type, SAMPLE_TYPES)
+from sa_jitter_ros.nodes.parameters import as_ros_parameter, Values
+from sa_jitter_ros.nodes.pulse_output import PulseOutput, TACH_TYPE
+from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
 
 FloatArray = NDArray[np.float64]
@@ -36,8 +36,7 @@ PLAYBACK_PARAMETERS = (
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
               'tach_waveform: std_msgs/Float64MultiArray or std_msgs/Float32MultiArray',
               read_only=True),
-    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
-              'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
+    TACH_TYPE,
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses',
               read_only=True),
 )
@@ -76,18 +75,6 @@ class Pacer:
         self._due -= lag
 
 
-def finite_blocks(block: SampleBlock) -> tuple[SampleBlock, ...]:
-    """Return the stretches of a block without NaN or infinity: a gap is what is not sent."""
-    finite = np.isfinite(block.samples).all(axis=0)
-    if finite.all():
-        return (block,)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(np.int8)))
-    return tuple(
-        SampleBlock(block.samples[:, start:stop], block.start_time + start / block.sample_rate,
-                    block.sample_rate, block.index + int(start))
-        for start, stop in edges.reshape(-1, 2))
-
-
 class PlaybackNode(MonitoringNode):
     """Publishes the portions of a stream at a pace; a subclass gives them by `portions`."""
 
@@ -99,16 +86,14 @@ class PlaybackNode(MonitoringNode):
                         else encode_samples_float32)
         self._sample_type = SAMPLE_TYPES[kind]
         self._vibration = self.create_output(self._sample_type, 'vibration', INPUT_QOS)
-        self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
-        self._keyphasor = values['keyphasor']
-        self._pulse: Any = None  # publishers, where there is something to publish
+        self._keyphasor, self._tach_type = values['keyphasor'], values['tach_type']
+        self._tach_pulse: PulseOutput | None = None  # where there is something to publish
         self._waveform: Any = None
         self._pacer = Pacer(values['rate'])
         self._playing, self._started = values['playing'], False
         self._born, self._rest = time.monotonic(), 0.0
         self._wait = values['wait_seconds']
         self._sent = 0.0
-        self._sent_pulses = 0
         self._progress_time = -math.inf
         self._stream: Iterator[Portion] | None = None
 
@@ -138,7 +123,7 @@ class PlaybackNode(MonitoringNode):
               waveform: bool) -> None:
         """Make the keyphasor's publishers and start the timer; call last in `__init__`."""
         if pulses:
-            self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
+            self._tach_pulse = PulseOutput(self, self._tach_type)
         if waveform:
             self._waveform = self.create_output(self._sample_type, 'tach_waveform', INPUT_QOS)
         self._portion_seconds, self._portion_bytes = portion_seconds, portion_bytes
@@ -153,6 +138,7 @@ class PlaybackNode(MonitoringNode):
         """Take over values that changed."""
         if values['playing'] and not self._playing and self._stream is None:
             self._stream = self.portions()  # it had ended: play it again
+            self.faults.pop('stream', None)
         self._playing = values['playing']
         self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
         self._pacer.run(time.monotonic(), rate=values['rate'],
@@ -176,8 +162,8 @@ class PlaybackNode(MonitoringNode):
                 if self._sent >= due or not self._send_next():
                     break
         except SaJitterError as error:
-            self.faults['stream'] = str(error)
-            self.get_logger().error(str(error))
+            self.faults['stream'] = f'ended early: {error}'
+            self.get_logger().error(self.faults['stream'])
             self._end()
             return
         lag = due - self._sent
@@ -191,9 +177,9 @@ class PlaybackNode(MonitoringNode):
 
     def _may_start(self) -> bool:
         """Start once the outputs that matter have subscribers, or after the waiting time."""
-        tach = [item for item in (self._pulse, self._waveform) if item is not None]
-        heard = self._vibration.get_subscription_count() > 0 and (
-            not tach or any(item.get_subscription_count() > 0 for item in tach))
+        tach = [] if self._tach_pulse is None else [self._tach_pulse.subscribers]
+        tach += [] if self._waveform is None else [self._waveform.get_subscription_count()]
+        heard = self._vibration.get_subscription_count() > 0 and (not tach or any(tach))
         now = time.monotonic()
         self._started = heard or now - self._born >= self._wait
         if self._started:
@@ -208,30 +194,22 @@ class PlaybackNode(MonitoringNode):
             self._stream = self.portions()
             portion = next(self._stream, None)
         if portion is None:
-            self.get_logger().info(f'end: {self.progress(self._sent)}, {self._sent_pulses} pulses')
+            self.get_logger().info(
+                f'end: {self.progress(self._sent)}, {self._pulses_sent()} pulses')
             self._end()
             return False
         for block in portion.vibration:
             self._vibration.publish(self._encode(block))
         for block in portion.waveform:
             self._waveform.publish(self._encode(block))
-        self._send_pulses(portion.pulses)
+        if self._tach_pulse is not None:
+            self.counts['pulses_dropped'] += self._tach_pulse.publish(
+                portion.pulses, self._keyphasor)
         self._sent += portion.seconds
         return True
 
-    def _send_pulses(self, times: FloatArray) -> None:
-        if self._pulse_type is not TimeReference:
-            if times.size:
-                self._pulse.publish(encode_pulse_array(times))
-            self._sent_pulses += times.size
-            return
-        for pulse in times.tolist():
-            try:
-                self._pulse.publish(encode_pulse_reference(pulse, self._keyphasor))
-                self._sent_pulses += 1
-            except MessageError as error:  # beyond what the message holds
-                self.counts['pulses_dropped'] += 1
-                self.warn(str(error))
+    def _pulses_sent(self) -> int:
+        return 0 if self._tach_pulse is None else self._tach_pulse.published
 
     def _end(self) -> None:
         self._stream = None
@@ -248,4 +226,4 @@ class PlaybackNode(MonitoringNode):
         state = ('ended' if self._stream is None else 'stopped' if not self._playing
                  else 'playing' if self._started else 'waiting for subscribers')
         return f'{state}, {self.progress(self._sent)}', {
-            'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': str(self._sent_pulses)}
+            'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': str(self._pulses_sent())}

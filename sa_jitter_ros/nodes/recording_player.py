@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.timeline import SampleBlock
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
-from sa_jitter_ros.nodes.parameters import Parameter
-from sa_jitter_ros.nodes.playback import finite_blocks, PlaybackNode, Portion
-from sa_jitter_ros.recordings import ChannelMap, open_recording, Recording
+from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
+from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 
@@ -47,11 +47,10 @@ class RecordingPlayer(PlaybackNode):
         if not values['recording']:
             raise ParameterError("recording is '': give a file, as in --ros-args -p "
                                  'recording:=rig.npz')
-        self._recording = recording = open_recording(
-            values['recording'], acquisition=values['acquisition'],
-            sample_rate=values['sample_rate'] or None, keyphasor=values['recorded_keyphasor'],
-            channel_map=ChannelMap(tuple(values['vibration_channels']), values['tach_channel'],
-                                   values['time_column']))
+        self._recording = recording = read(
+            values['recording'], keyphasor=values['recorded_keyphasor'],
+            sample_rate=values['sample_rate'] or None, **{name: values[name] for name in (
+                'acquisition', 'vibration_channels', 'tach_channel', 'time_column')})
         for remark in recording.remarks:
             self.warn(remark)
         self._pulse_times, self._with_waveform = keyphasor_of(recording, values['tach'])
@@ -124,15 +123,14 @@ def passage(recording: Recording, pulse_times: FloatArray | None, with_waveform:
         stop_time = origin + done / rate
         low, high = np.searchsorted(pulses, [start_time, stop_time])
         start_time = stop_time
-        vibration = finite_blocks(SampleBlock(block, origin + (first + start) / rate, rate,
-                                              first + start))
+        vibration = SampleBlock(
+            block, origin + (first + start) / rate, rate, first + start).finite_parts()
         counts['samples_dropped'] += block.shape[1] - sum(
             item.samples.shape[1] for item in vibration)
         tach_index = round(start / rate * tach_rate)
         samples = waveform.take(round(done / rate * tach_rate) - tach_index)
         index = tach_first + tach_index
-        tach = (finite_blocks(SampleBlock(samples, origin + index / tach_rate, tach_rate, index))
-                if samples.shape[1] else ())
+        tach = SampleBlock(samples, origin + index / tach_rate, tach_rate, index).finite_parts()
         yield Portion(block.shape[1] / rate, vibration, tach, pulses[low:high] + shift)
     counts['pulses_dropped'] += int(np.count_nonzero(pulses >= start_time))
 

@@ -13,22 +13,21 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
-from sa_jitter_ros.closure.candidates import SIGNIFICANT
-from sa_jitter_ros.closure.online import (Average, Batch, compare, declared_by, Published,
-                                          require_comparable)
-from sa_jitter_ros.closure.online_trace import trace_averages
-from sa_jitter_ros.closure.report import report
-from sa_jitter_ros.closure.trace import Trace
-from sa_jitter_ros.effects import Effect, enabled_effects
+from sa_jitter_ros.declaration import declaration_of, predictor_parameters, SHAFTS
+from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.errors import MessageError, SaJitterError
-from sa_jitter_ros.nodes import jitter_predictor
+from sa_jitter_ros.inference.candidates import SIGNIFICANT
+from sa_jitter_ros.inference.online import (
+    Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
+from sa_jitter_ros.inference.online_trace import trace_averages
+from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
-from sa_jitter_ros.nodes.effect_parameters import effect_parameters
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)
-from sa_jitter_ros.nodes.parameters import (as_ros_parameter, Parameter, require_node_name,
-                                            require_shaft_names, Values)
-from sa_jitter_ros.statistics.prediction import DeclaredModel
+from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name, Values
+from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String
 
 PARAMETERS = (
@@ -39,7 +38,6 @@ PARAMETERS = (
               minimum=2, maximum=10000),
     Parameter('close_loop', False, "set the predictor's effect parameters to what was found"),
 )
-_PREDICTOR = (*jitter_predictor.PARAMETERS, *effect_parameters())
 _TICK = 0.1  # s between looks at what has come
 _PATIENCE = 3.0  # s to look for the predictor
 _ANSWER = 15.0  # s to wait for its answer: it predicts anew first
@@ -73,7 +71,9 @@ class ResidualAnalyser(MonitoringNode):
         self._missing_effect = self.create_output(String, 'missing_effect', LATCHED_QOS)
         self.create_input(Float64MultiArray, f'{shaft}/order_amplitude', self._on_average)
         self.create_input(Float64MultiArray, f'{shaft}/pulse_error', self._on_pulse_error)
-        self.create_input(Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS)
+        # A predictor of several shafts publishes one prediction for each.
+        for topic in ('prediction', f'{shaft}/prediction'):
+            self.create_input(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
         self.create_steady_timer(_TICK, lambda: self._step())
         self.parameters.watch(check=lambda values: None, apply=self._apply)
 
@@ -142,32 +142,42 @@ class ResidualAnalyser(MonitoringNode):
             table, len(averages), found.chi2_per_dof, found.p_value, found.rms)))
         self._ask(averages, self._prediction)
 
-    def _ask(self, averages: Sequence[Average], prediction: Published) -> None:
+    def _ask(self, averages: Sequence[ReceivedAverage], prediction: Published) -> None:
         """Get what the predictor declares; without an answer, what its prediction tells of it."""
         def without() -> None:
             self.warn(f'{self._predictor_name} does not answer: its prediction is taken for that '
                       'of independent jitter without effects; start it, or set predictor')
             self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
 
-        def answered(response: Any) -> None:
-            types = {value.type for value in response.values}
-            if len(response.values) < len(_PREDICTOR) or ParameterType.PARAMETER_NOT_SET in types:
-                without()  # it is the name of another node
-                return
-            model, effects = self._declared(response)
-            self._trace(lambda: trace_averages(averages, model, declared=effects))
-        self._request(lambda: self._predictor.get_parameters([item.name for item in _PREDICTOR]),
-                      answered, without)
+        def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
+            def answered(response: Any) -> None:
+                unset = ParameterType.PARAMETER_NOT_SET in {item.type for item in response.values}
+                if unset or len(response.values) < len(parameters):
+                    if others:
+                        ask(*others)
+                    else:
+                        without()  # it is the name of another node
+                    return
+                model, effects = self._declared(parameters, response)
+                self._trace(lambda: trace_averages(averages, model, declared=effects))
+            names = [item.name for item in parameters]
+            self._request(lambda: self._predictor.get_parameters(names), answered, without)
 
-    def _declared(self, response: Any) -> tuple[DeclaredModel, tuple[Effect, ...]]:
+        shaft = self._values['shaft']
+        ask(predictor_parameters(), predictor_parameters([shaft], [f'{shaft}.ratio']))
+
+    def _declared(self, parameters: Sequence[Parameter], response: Any
+                  ) -> tuple[DeclaredModel, tuple[Effect, ...]]:
         """Return the predictor's model and its effects, less those that were set here."""
         values: Values = {}
-        for item, value in zip(_PREDICTOR, response.values):
+        for item, value in zip(parameters, response.values):
             known = parameter_value_to_python(value)
             values[item.name] = list(known) if item.is_list else known
+        values[SHAFTS.name] = [self._values['shaft']]
         self._added = {name for name in self._added if values[f'effects.{name}.enabled']}
         values.update({f'effects.{name}.enabled': False for name in self._added})
-        return jitter_predictor.declared_model(values), enabled_effects(values)
+        declaration = declaration_of(values)
+        return declaration.model, declaration.effects
 
     def _trace(self, work: Callable[[], Trace]) -> None:
         """Trace in a thread, so that the executor goes on."""
@@ -286,7 +296,7 @@ class _Job:
             self.error = repr(error)
 
 
-def average_of(message: AverageMessage) -> Average:
+def average_of(message: AverageMessage) -> ReceivedAverage:
     """Return the average that a message of order amplitudes tells; raises MessageError."""
     header, table = message.header, message.values
     if len(table) == 0 or not (
@@ -294,9 +304,10 @@ def average_of(message: AverageMessage) -> Average:
         raise MessageError(f'{len(table)} channels from {header.start_time} to {header.end_time} '
                            's: send at least one of an average of some trigger cycles')
     raw, corrected = (table[..., k] * np.exp(1j * table[..., k + 1]) for k in (1, 3))
-    return Average(header.start_time, header.end_time, header.trigger_cycles,
-                   header.fundamental_cycles, header.mean_trigger_speed, table[0, :, 0], raw,
-                   corrected, table[..., 5], table[..., 6], table[..., 7])
+    return ReceivedAverage(
+        header.start_time, header.end_time, header.trigger_cycles, header.fundamental_cycles,
+        header.mean_trigger_speed, table[0, :, 0], raw, corrected, table[..., 5], table[..., 6],
+        table[..., 7])
 
 
 def main(args: Sequence[str] | None = None) -> int:

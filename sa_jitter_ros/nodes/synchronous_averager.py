@@ -5,18 +5,19 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.averaging.shaft import SynchronousAverage
+from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
-from sa_jitter_ros.nodes.averager_parameters import (gear_settings, one_ratio, PARAMETERS,
-                                                     pulse_validator, shaft_parameters,
-                                                     shaft_settings, trigger_share)
+from sa_jitter_ros.nodes.averager_parameters import (gear_settings, keyphasor_parameters,
+                                                     one_ratio, PARAMETERS, shaft_parameters,
+                                                     shaft_settings)
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node, UNCOUNTED
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
                                           PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
-from sa_jitter_ros.nodes.parameters import require_shaft_names, Values
+from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.parameters import require_shaft_names
 from std_msgs.msg import Float64, Float64MultiArray
 
 
@@ -31,7 +32,7 @@ class SynchronousAverager(MonitoringNode):
             self.parameters.declare(shaft_parameters(name))
         values = self.parameters.values()
         for name in names:
-            if values[f'{name}.ratio_teeth'] and self.parameters.given(f'{name}.ratio'):
+            if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
                 raise one_ratio(values, name)
         self._shafts = {name: ShaftOutput(self, name) for name in names}
         self._averager = self._build(values)
@@ -57,22 +58,21 @@ class SynchronousAverager(MonitoringNode):
     def _build(self, values: Values) -> StreamingAverager:
         return StreamingAverager(
             {name: shaft_settings(values, name) for name in self._shafts},
-            validator=pulse_validator(values),
+            validator=keyphasor_parameters(values).validator(),
             timeline=VibrationTimeline(time_tolerance=values['time_tolerance'],
                                        buffer_seconds=values['buffer_seconds']))
 
     def _check(self, values: Values) -> None:
-        pulse_validator(values)
+        keyphasor_parameters(values).validator()
         for name in self._shafts:
             shaft_settings(values, name)
             gear_settings(values, name)
 
     def _apply(self, values: Values) -> None:
         before, self._values = self._values, values
-        if any(values[key] != before[key] for key in (
-                'pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth', 'missing_pulses',
-                'maximum_missing', 'interval_tolerance', 'minimum_interval')):
-            self._averager.change_pulses(pulse_validator(values))
+        keyphasor = keyphasor_parameters(values)
+        if keyphasor != keyphasor_parameters(before):
+            self._averager.change_pulses(keyphasor.validator())
         changed = {name: shaft_settings(values, name) for name in self._shafts}
         if changed != {name: shaft_settings(before, name) for name in self._shafts}:
             self._averager.change(changed)
@@ -109,10 +109,10 @@ class SynchronousAverager(MonitoringNode):
     def _on_pulse_array(self, message: Float64MultiArray) -> None:
         self._publish(self._averager.add_pulses(decode_pulse_array(message)))
 
-    def _publish(self, averages: Sequence[tuple[str, SynchronousAverage]]) -> None:
-        share = trigger_share(self._values)
+    def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
+        share = keyphasor_parameters(self._values).revolutions_per_trigger
         for name, average in averages:
-            self._shafts[name].publish(average, share)
+            self._shafts[name].publish(average)
         speed = self._averager.take_speed() * share
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
@@ -126,17 +126,8 @@ class SynchronousAverager(MonitoringNode):
         averager = self._averager
         if self._decoder.counted:
             self.show_warning(UNCOUNTED)
-        samples, pulses = averager.timeline.counts, averager.pulse_counts
-        self.counts.update(
-            samples_dropped=samples.samples_dropped,
-            pulses_dropped=(averager.counts.pulses_dropped + self._other_keyphasors
-                            + pulses.doubles + pulses.early + pulses.out_of_order
-                            + pulses.non_finite + pulses.unlocked),
-            cycles_dropped=averager.counts.cycles_dropped + pulses.cycles_discarded,
-            gaps=samples.gaps, restarts=max(samples.restarts, pulses.restarts),
-            clock_deviation=samples.clock_deviation,
-            averages_dropped=averager.counts.averages_dropped, repeats=samples.repeats,
-            samples_lost=samples.samples_lost)
+        self.counts.update(averager.totals)
+        self.counts['pulses_dropped'] += self._other_keyphasors
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Say how far the averages are and what the pulses look like."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.keyphasor import KeyphasorDetector
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
-from sa_jitter_ros.errors import MessageError, SignalError
-from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode, run_node, UNCOUNTED
-from sa_jitter_ros.nodes.messages import (encode_pulse_array, encode_pulse_reference, known_type,
-                                          PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
-from sa_jitter_ros.nodes.parameters import Parameter, Values
-from sensor_msgs.msg import TimeReference
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.nodes.base import MonitoringNode, run_node, UNCOUNTED
+from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES, SampleDecoder
+from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.nodes.pulse_output import PulseOutput, TACH_TYPE
+from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.pulses.detection import KeyphasorDetector
 
 FloatArray = NDArray[np.float64]
 
@@ -26,8 +26,7 @@ BURST_PERIOD = 0.01  # s
 PARAMETERS = (
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of tach_waveform',
               read_only=True),
-    Parameter('tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse; choose '
-              'std_msgs/Float64MultiArray above some hundred pulses a second', read_only=True),
+    TACH_TYPE,
     Parameter('sample_rate', 0.0, 'sampling rate where messages carry none, 0 if they do',
               unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
     Parameter('start_time', 0.0, 'time of sample 0 where messages carry none', unit='s',
@@ -76,7 +75,6 @@ class TachDetector(MonitoringNode):
         super().__init__('tach_detector', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
         waveform_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
-        self._pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._values, self._keyphasor = values, values['keyphasor']
         self._decoder = SampleDecoder(waveform_type, sample_rate=values['sample_rate'],
                                       start_time=values['start_time'],
@@ -85,10 +83,10 @@ class TachDetector(MonitoringNode):
         self._detector = detector_of(values)
         self._rate = 0.0  # of the run that the detector follows
         self._epoch = 0
-        self._pulses = self._unsent = 0
+        self._pulses = self._refused = 0
         self._too_close = self._unused = 0  # of detectors before
         self._waiting: deque[float] = deque()
-        self._pulse = self.create_output(self._pulse_type, 'tach_pulse', INPUT_QOS)
+        self._output = PulseOutput(self, values['tach_type'])
         self.create_input(SAMPLE_TYPES[waveform_type], 'tach_waveform', self._on_waveform)
         self.create_steady_timer(BURST_PERIOD, self._send_waiting)
         self.parameters.watch(check=detector_of, apply=self._apply)
@@ -131,22 +129,18 @@ class TachDetector(MonitoringNode):
 
     def _publish(self, times: FloatArray) -> None:
         self._pulses += len(times)
-        if self._pulse_type is TimeReference:
+        if self._output.single:
             self._waiting.extend(times.tolist())
             self._send_waiting()
-        elif len(times):
-            self._pulse.publish(encode_pulse_array(times))
+        else:
+            self._send(times)
 
     def _send_waiting(self) -> None:
-        count = max(BURST, len(self._waiting) // 100)
-        for _ in range(min(count, len(self._waiting))):
-            try:
-                pulse = encode_pulse_reference(self._waiting.popleft(), self._keyphasor)
-            except MessageError as error:
-                self._unsent += 1
-                self.warn(f'tach_pulse: {error}')
-                continue
-            self._pulse.publish(pulse)
+        count = min(max(BURST, len(self._waiting) // 100), len(self._waiting))
+        self._send(np.array([self._waiting.popleft() for _ in range(count)]))
+
+    def _send(self, times: FloatArray) -> None:
+        self._refused += self._output.publish(times, self._keyphasor)
 
     def update_counts(self) -> None:
         """Gather the counts of the core."""
@@ -155,7 +149,7 @@ class TachDetector(MonitoringNode):
         samples, state = self._timeline.counts, self._detector.state
         self.counts.update(
             samples_dropped=samples.samples_dropped + self._unused,
-            pulses_dropped=self._too_close + state.too_close + self._unsent,
+            pulses_dropped=self._too_close + state.too_close + self._refused,
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
             samples_lost=samples.samples_lost)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
+import math
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.bag_limits import check_inflation
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.message_layouts import (
-    Block, BlockDecoder, decode_pulse_array, decode_pulse_reference)
+    decode_pulse_array, decode_pulse_reference, SampleDecoder, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (
     FloatArray, MAX_PULSES, rechunk, Recording, recording_errors)
-from sa_jitter_ros.recordings.stamp_counter import TIME_TOLERANCE
+from sa_jitter_ros.samples import SampleBlock
 
 FLOAT64 = 'std_msgs/msg/Float64MultiArray'
 FLOAT32 = 'std_msgs/msg/Float32MultiArray'
@@ -30,6 +31,7 @@ SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
 PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
 MAX_GAP = 3600.0  # s
 MAX_LOST = 1 << 29  # samples of all channels that a gap may hold
+SAME_RATE = 1e-6  # relative
 _IMU_AXES = 'xyz'
 _FILL = 65_536
 
@@ -102,6 +104,10 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
                 raise RecordingError('no vibration topic among '
                                      f'{", ".join(sorted(reader.topics)) or "none"}')
             extent = _measure(reader, vibration, sample_rate)
+            if sample_rate is not None and not math.isclose(extent.rate, sample_rate,
+                                                            rel_tol=SAME_RATE):
+                raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
+                                     f'{vibration} say {extent.rate} Hz: leave it out')
             tach_extent = _measure(reader, tach, sample_rate) if tach else None
             pulse_times, remarks = _pulses(reader, pulses, keyphasor) if pulses else (None, ())
         source = BagSource(path, vibration, sample_rate, extent.channels, extent.samples)
@@ -125,10 +131,10 @@ class _Run:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        self.first: Block | None = None
+        self.first: SampleBlock | None = None
         self.received = self.repeated = self.lost = 0
 
-    def continuous(self, blocks: Iterator[Block]) -> Iterator[FloatArray]:
+    def continuous(self, blocks: Iterator[SampleBlock]) -> Iterator[FloatArray]:
         """Iterate over the samples in order of their index, NaN where they were lost."""
         for block in blocks:
             first = self.first = self.first or block
@@ -152,7 +158,7 @@ class _Run:
                   (self.repeated, 'repeated samples left out'))
         return tuple(f'{self.topic}: {count} {text}' for count, text in counts if count)
 
-    def _check(self, first: Block, block: Block) -> None:
+    def _check(self, first: SampleBlock, block: SampleBlock) -> None:
         count, passed = block.index - first.index, block.start_time - first.start_time
         if len(block.samples) != len(first.samples) or block.sample_rate != first.sample_rate:
             raise RecordingError(
@@ -226,10 +232,10 @@ def _messages(reader: Any, topic: str) -> Iterator[Any]:
         yield _types().deserialize_cdr(data, connection.msgtype)
 
 
-def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[Block]:
+def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[SampleBlock]:
     """Iterate over the sample blocks of a topic as its messages hold them."""
-    decoder = BlockDecoder(reader.topics[topic].msgtype.replace('/msg/', '/'),
-                           sample_rate=sample_rate or 0.0, imu_axis=_IMU_AXES)
+    decoder = SampleDecoder(reader.topics[topic].msgtype.replace('/msg/', '/'),
+                            sample_rate=sample_rate or 0.0, imu_axis=_IMU_AXES)
     for message in _messages(reader, topic):
         with _message_errors(topic):
             block = decoder.decode(message)

@@ -12,7 +12,7 @@ import struct
 from typing import BinaryIO
 
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.npz_format import IN_MEMORY_BYTES, MAX_INFLATION
+from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES, MAX_INFLATION
 
 _BLOCK = 1 << 17
 _MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50

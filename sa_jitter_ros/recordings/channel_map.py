@@ -1,10 +1,33 @@
 """Which channels of a file are vibration and which one is the tach."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.recording import ChannelSelection, Recording
+from sa_jitter_ros.recordings.recording import FloatArray, Recording, SampleSource
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelSelection:
+    """Some channels of another source, in the order of `rows`."""
+
+    source: SampleSource
+    rows: tuple[int, ...]
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+        return len(self.rows)
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return self.source.samples
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        for block in self.source.blocks(samples_per_block):
+            yield block[list(self.rows)]
 
 
 @dataclass(frozen=True)

@@ -101,13 +101,13 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             rate = (samples - 1) / (end_time - start_time)
             if sample_rate is not None:  # times are rounded, so it is the better of the two
                 if not abs((end_time - start_time) * sample_rate - (samples - 1)) < 1.0:
-                    raise RecordingError(f'sample_rate {sample_rate} Hz given, but the file says '
-                                         f'{rate} Hz')
+                    raise RecordingError(f'sample_rate {sample_rate} Hz given, but the times of '
+                                         f'the file say {rate} Hz: leave it out')
                 rate = sample_rate
         if rate is None:
             raise RecordingError(
-                f'no time column among {", ".join(names)}: name it in the channel map or give '
-                'sample_rate')
+                f'no time column among {", ".join(names)}: give its name as time_column, '
+                'or the sample_rate')
         source = CsvSource(path, delimiter, has_header, columns, samples, times, start_time, rate)
         return channel_map.select(Recording(
             source, rate, start_time=start_time,

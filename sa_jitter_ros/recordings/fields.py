@@ -1,12 +1,12 @@
 """The named fields that `.npz` and `.mat` recordings share, from raw arrays to a `Recording`."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.angle.keyphasor import counter_pulses
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.pulses.detection import counter_pulses
 from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
 
 MAX_SAMPLE_BYTES = 1 << 40
@@ -16,9 +16,6 @@ MAX_FIELD_BYTES = 1 << 20
 RawArray = NDArray[Any]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
 PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
-FIELDS = (
-    *SAMPLE_FIELDS, *PULSE_FIELDS, 'sample_rate', 'tach_rate', 'pulses_per_revolution',
-    'pulses_per_trigger', 'ratio', 'orders', 'channel_names', 'units', 'start_time', 'description')
 
 
 def size_limit(name: str) -> int:
@@ -29,7 +26,7 @@ def size_limit(name: str) -> int:
 
 
 def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray], *,
-                          acquisition: int) -> Recording:
+                          acquisition: int, given: Mapping[str, Any]) -> Recording:
     """
     Build a recording from named arrays.
 
@@ -40,11 +37,13 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     Parameters
     ----------
     names
-        The fields there are; unknown ones are ignored.
+        The fields that the file holds; unknown ones are ignored.
     load
-        Gives the array of a name.
+        Returns the array of a name.
     acquisition
         Number of the acquisition, from 0.
+    given
+        Values of `converted_fields` that replace those of the file.
 
     Raises
     ------
@@ -55,12 +54,14 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     if 'vibration' not in names:
         raise RecordingError(
             f'no vibration among {sorted(names)}: needs vibration (channel x sample)')
-    if 'sample_rate' not in names:
-        raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz')
+    if 'sample_rate' not in {*names, *given}:
+        raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz to the '
+                             'file, or give sample_rate')
     vibration = _samples('vibration', load('vibration'))
     tach = _samples('tach', load('tach')) if 'tach' in names else None
-    labels = _strings('channel_names', load('channel_names')) if 'channel_names' in names else ()
-    units = _strings('units', load('units')) if 'units' in names else ()
+    values = converted_fields({name: load(name) for name in CONVERTED
+                               if name in names and name not in given})
+    values.update(given)
     acquisitions = 1
     if tach is not None and len(tach) > 1:
         if len(tach) != len(vibration):
@@ -74,33 +75,22 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     if acquisitions > 1:
         row = slice(acquisition, acquisition + 1)
         vibration, tach = vibration[row], None if tach is None else tach[row]
-        labels = labels[row]
-        units = units[row] if len(units) > 1 else units
-
-    def number(name: str, default: float) -> float:
-        return _number(name, load(name)) if name in names else default
-
-    def count(name: str) -> int | None:
-        return _count(name, load(name)) if name in names else None
-
-    start_time = number('start_time', 0.0)
-    tach_rate = number('tach_rate', 0.0) if 'tach_rate' in names else None
-    pulse_times = {name: _vector(name, load(name)) for name in PULSE_FIELDS if name in names}
-    if 'tach_count' in names and tach is None and 'pulse_times' not in names:
+        for name in ('channel_names', 'units'):
+            if len(values.get(name, ())) > 1:
+                values[name] = values[name][row]
+    if 'tach_count' in names and tach is None and 'pulse_times' not in values:
+        tach_rate = values.get('tach_rate')
         if tach_rate is None or not tach_rate > 0:
             raise RecordingError('tach_count without a positive tach_rate: add its rate in Hz')
-        pulse_times['pulse_times'] = _counted_pulses(load('tach_count'), start_time, tach_rate)
-    return Recording(
-        ArraySource(vibration), number('sample_rate', 0.0), channel_names=labels, units=units,
-        start_time=start_time, tach=None if tach is None else ArraySource(tach),
-        tach_rate=tach_rate, pulse_times=pulse_times.get('pulse_times'),
-        pulses_per_revolution=count('pulses_per_revolution') or 1,
-        pulses_per_trigger=count('pulses_per_trigger'), ratio=number('ratio', 1.0),
-        orders=tuple(_vector('orders', load('orders')).tolist()) if 'orders' in names else (),
-        reference_pulse_times=pulse_times.get('reference_pulse_times'),
-        description=(' '.join(_strings('description', load('description')))
-                     if 'description' in names else ''),
-        acquisitions=acquisitions)
+        values['pulse_times'] = _counted_pulses(
+            load('tach_count'), values.get('start_time', 0.0), tach_rate)
+    return Recording(ArraySource(vibration), tach=None if tach is None else ArraySource(tach),
+                     acquisitions=acquisitions, **values)
+
+
+def converted_fields(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return fields of `CONVERTED` as `Recording` holds them; raises RecordingError."""
+    return {name: CONVERTED[name](name, np.asarray(value)) for name, value in values.items()}
 
 
 def _real(name: str, array: RawArray) -> RawArray:
@@ -162,3 +152,14 @@ def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatA
         raise RecordingError(f'tach_count counts {rises.sum():.0f} pulses: at most {MAX_PULSES}')
     return counter_pulses(np.append(0.0, np.cumsum(rises)).astype(np.int64),
                           start_time=start_time, sample_rate=rate)
+
+
+# The fields that are not samples, each with what makes a value of `Recording` from its array.
+CONVERTED: Mapping[str, Callable[[str, RawArray], Any]] = {
+    'sample_rate': _number, 'tach_rate': _number, 'start_time': _number, 'ratio': _number,
+    'pulses_per_revolution': _count, 'pulses_per_trigger': _count,
+    'pulse_times': _vector, 'reference_pulse_times': _vector,
+    'orders': lambda name, array: tuple(_vector(name, array).tolist()),
+    'channel_names': _strings, 'units': _strings,
+    'description': lambda name, array: ' '.join(_strings(name, array))}
+FIELDS = (*SAMPLE_FIELDS, *CONVERTED)

@@ -6,7 +6,6 @@ decoded by the same rules. What does not follow a layout raises `MessageError`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
-from sa_jitter_ros.recordings.stamp_counter import StampCounter
+from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 
@@ -24,20 +23,10 @@ IMU = 'sensor_msgs/Imu'
 TIME_REFERENCE = 'sensor_msgs/TimeReference'
 INDEX_BASE = 1 << 24  # largest power of two below which every integer is a float32
 _LARGEST = 1 << 32  # elements, of an empty array as well: numpy knows no larger shapes
-
-
-@dataclass(frozen=True)
-class Block:
-    """
-    Consecutive samples as a message holds them.
-
-    `samples` (channel, sample); `start_time` (s) and `index` of the first one, `sample_rate` (Hz).
-    """
-
-    samples: FloatArray
-    start_time: float
-    sample_rate: float
-    index: int
+TIME_TOLERANCE = 0.01  # s; a clock that jumps back by more starts a new run
+LOSS = 0.75  # samples later than the clock that is followed: more than jitter of 0.7 brings
+FOLLOW = 0.05  # share of a deviation that the clock takes over: at 3 % of another rate it lags 0.6
+EVIDENCE = 13.0  # of lateness, in variances: white jitter brings as much once in 1e8 stamps
 
 
 def decode_array(message: Any, labels: tuple[str, ...],
@@ -107,9 +96,55 @@ def decode_pulse_array(message: Any) -> FloatArray:
     return times
 
 
-class BlockDecoder:
+class StampCounter:
     """
-    Decode `vibration` or `tach_waveform` messages of one type into `Block`s.
+    Counts samples by their stamps; a loss is a lasting step of the stamps by whole samples.
+
+    The stamps are compared with a clock that follows them slowly, so that a source whose rate is
+    up to 3 % off `sample_rate` (Hz) loses nothing, and neither does jitter of up to 0.7 samples,
+    as the next stamp comes early. Where stamps are steady, a loss is seen at once; where they are
+    noisy, it takes the evidence of some stamps (Page's test), and the gap stands that much later.
+    `restarts` counts jumps back, from which on samples are counted anew.
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        self.restarts = 0
+        self._rate = sample_rate
+        self._last: float | None = None  # stamp
+        self._start(0.0)
+
+    def _start(self, time: float) -> None:
+        self._index, self._expected = 0, time
+        self._late, self._variance = 0.0, 0.01  # samples and samples^2, against the clock
+        self._surplus, self._doubtful = 0.0, 0  # lateness, and of how many stamps
+
+    def index(self, time: float) -> int:
+        """Return the index of the next sample, stamped `time` (s)."""
+        if self._last is None:
+            self._start(time)
+        elif time < self._last - max(TIME_TOLERANCE, 1.0 / self._rate):
+            self.restarts += 1
+            self._start(time)
+        late = (time - self._expected) * self._rate
+        self._surplus = max(0.0, self._surplus + late - LOSS)
+        self._doubtful = self._doubtful + 1 if self._surplus else 0
+        lost = 0
+        if self._surplus > EVIDENCE * self._variance:
+            lost = max(1, round(LOSS + self._surplus / self._doubtful))
+            self._surplus, self._doubtful = 0.0, 0
+        gain = max(FOLLOW, 1.0 / (self._index + 1.0))
+        # Of differences, as another rate is no noise; with steps, so that bursts are no losses.
+        self._variance += gain * (0.5 * (late - self._late)**2 - self._variance)
+        late -= lost
+        found = self._index + lost
+        self._index, self._late, self._last = found + 1, late, time
+        self._expected += (lost + 1 + gain * late) / self._rate
+        return found
+
+
+class SampleDecoder:
+    """
+    Decode `vibration` or `tach_waveform` messages of one type to `SampleBlock`.
 
     `kind` is `FLOAT64`, `FLOAT32` or `IMU`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz,
     0 for unknown) and `start_time` (s) serve where the message does not carry them. Messages
@@ -122,7 +157,7 @@ class BlockDecoder:
                  imu_axis: str = 'z') -> None:
         if not imu_axis or not set(imu_axis) <= set('xyz') or len(set(imu_axis)) < len(imu_axis):
             raise ParameterError(f'imu_axis is {imu_axis!r}: give different ones of x, y and z')
-        decoders: dict[str, Callable[[Any], Block]] = {
+        decoders: dict[str, Callable[[Any], SampleBlock]] = {
             FLOAT64: self._float64, FLOAT32: self._float32, IMU: self._imu}
         self._decode = decoders[kind]
         self._rate, self._start_time = sample_rate, start_time
@@ -137,7 +172,7 @@ class BlockDecoder:
         """How often the stamps of Imu messages jumped back."""
         return self._stamps.restarts
 
-    def decode(self, message: Any) -> Block:
+    def decode(self, message: Any) -> SampleBlock:
         """Return the block that a message holds."""
         block = self._decode(message)
         check_times('time of the first sample', block.start_time, MessageError)
@@ -151,13 +186,13 @@ class BlockDecoder:
         check_rate('sample_rate', self._rate, MessageError)
         return self._rate
 
-    def _count(self, samples: FloatArray) -> Block:
+    def _count(self, samples: FloatArray) -> SampleBlock:
         rate, index = self._known_rate(), self._next_index
         self._next_index += samples.shape[1]
         self.counted = True
-        return Block(samples, self._start_time + index / rate, rate, index)
+        return SampleBlock(samples, self._start_time + index / rate, rate, index)
 
-    def _float64(self, message: Any) -> Block:
+    def _float64(self, message: Any) -> SampleBlock:
         if message.layout.data_offset == 0:
             return self._count(_samples(message, 0)[1])
         header, samples = _samples(message, 3)
@@ -166,18 +201,19 @@ class BlockDecoder:
             raise MessageError(f'header time {time} s, rate {rate} Hz: send a finite time and a '
                                'positive rate')
         check_rate('sampling rate in the header', rate, MessageError)
-        return Block(samples, time, rate, whole('index of the first sample', float(header[2])))
+        return SampleBlock(samples, time, rate,
+                           whole('index of the first sample', float(header[2])))
 
-    def _float32(self, message: Any) -> Block:
+    def _float32(self, message: Any) -> SampleBlock:
         if message.layout.data_offset == 0:
             return self._count(_samples(message, 0)[1])
         header, samples = _samples(message, 2)
         high, low = (whole('index of the first sample', float(item)) for item in header)
         index = whole('index of the first sample', high * INDEX_BASE + low)
         rate = self._known_rate()
-        return Block(samples, self._start_time + index / rate, rate, index)
+        return SampleBlock(samples, self._start_time + index / rate, rate, index)
 
-    def _imu(self, message: Any) -> Block:
+    def _imu(self, message: Any) -> SampleBlock:
         rate = self._known_rate()
         time = decode_time(message.header.stamp.sec, message.header.stamp.nanosec)
         vector = message.linear_acceleration
@@ -185,7 +221,7 @@ class BlockDecoder:
         if (time, *values) != self._imu_last:  # a repeat keeps its index
             self._imu_index = self._stamps.index(time)
         self._imu_last = time, *values
-        return Block(np.array(values)[:, None], time, rate, self._imu_index)
+        return SampleBlock(np.array(values)[:, None], time, rate, self._imu_index)
 
 
 def _samples(message: Any, header_size: int) -> tuple[FloatArray, FloatArray]:

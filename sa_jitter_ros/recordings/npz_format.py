@@ -5,6 +5,7 @@ Large members are not loaded: a stored one is mapped where it lies, a deflated o
 into an unnamed temporary file (in `$TMPDIR`) and mapped there.
 """
 
+from collections.abc import Mapping
 from io import BytesIO
 from math import prod
 import os
@@ -19,15 +20,14 @@ from numpy.lib import format as npy
 from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields, size_limit
+from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES, MAX_INFLATION
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
-IN_MEMORY_BYTES = 64 << 20
-MAX_INFLATION = 200  # measured signals shrink a few fold; only a bomb shrinks more than this
 _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
 
 
-def open_npz(path: Path, *, acquisition: int = 0) -> Recording:
+def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any]) -> Recording:
     """
     Open an `.npz` recording; fields as in `recording_from_fields`.
 
@@ -37,7 +37,8 @@ def open_npz(path: Path, *, acquisition: int = 0) -> Recording:
     with recording_errors(path), zipfile.ZipFile(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
         return recording_from_fields(
-            names, lambda name: _member(archive, path, name), acquisition=acquisition)
+            names, lambda name: _member(archive, path, name), acquisition=acquisition,
+            given=given)
 
 
 def write_npz(path: str | os.PathLike[str], recording: Recording, *,

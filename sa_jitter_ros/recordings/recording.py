@@ -56,29 +56,6 @@ class ArraySource:
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelSelection:
-    """Some channels of another source, in the order of `rows`."""
-
-    source: SampleSource
-    rows: tuple[int, ...]
-
-    @property
-    def channels(self) -> int:
-        """Return the number of channels."""
-        return len(self.rows)
-
-    @property
-    def samples(self) -> int:
-        """Return the number of samples of each channel."""
-        return self.source.samples
-
-    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        for block in self.source.blocks(samples_per_block):
-            yield block[list(self.rows)]
-
-
-@dataclass(frozen=True, eq=False)
 class Recording:
     """
     One recording of a machine: vibration, its keyphasor and what is known about both.
@@ -121,6 +98,8 @@ class Recording:
         How many separate acquisitions the file holds (this is one of them).
     remarks
         What the reader had to do to the data, one sentence each.
+    path
+        File or folder that error messages name; '' for a recording that is not of a file.
 
     Raises
     ------
@@ -145,6 +124,7 @@ class Recording:
     description: str = ''
     acquisitions: int = 1
     remarks: tuple[str, ...] = ()
+    path: str = ''
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other, and fill in names and units."""
@@ -208,11 +188,11 @@ class Recording:
         Each block is `channel` x `sample`; all but the last hold `samples_per_block` samples.
         Raises RecordingError where the file turns out to be broken.
         """
-        return _guarded_blocks(self.vibration, samples_per_block)
+        return self._checked(self.vibration, samples_per_block)
 
     def tach_blocks(self, samples_per_block: int = 65_536) -> Iterator[FloatArray]:
         """Iterate over the tach waveform as `blocks` does (`1` x `sample`); empty without one."""
-        return iter(()) if self.tach is None else _guarded_blocks(self.tach, samples_per_block)
+        return iter(()) if self.tach is None else self._checked(self.tach, samples_per_block)
 
     def read(self) -> FloatArray:
         """Read the whole vibration into memory, `channel` x `sample`."""
@@ -223,25 +203,31 @@ class Recording:
         blocks = [block[0] for block in self.tach_blocks()]
         return np.concatenate(blocks) if blocks else np.empty(0)
 
+    def _checked(self, source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
+        if samples_per_block < 1:
+            raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
+        return _checked_blocks(source.blocks(samples_per_block), self.path)
+
 
 @contextmanager
-def recording_errors(path: Path) -> Iterator[None]:
+def recording_errors(path: str | Path) -> Iterator[None]:
     """
-    Turn whatever a parser throws at a broken file into a RecordingError with one line.
+    Turn whatever a parser raises on a broken file into a RecordingError of one line.
 
     Parsers of zip, MATLAB, sqlite and MCAP files document no closed set of exceptions for hostile
     bytes, hence the broad clause.
     """
+    place = f'{path}: ' if str(path) else ''
     try:
         yield
     except RecordingError as error:
-        if str(error).startswith(f'{path}: '):
+        if str(error).startswith(place):
             raise
-        raise RecordingError(f'{path}: {_line(error)}') from error
+        raise RecordingError(f'{place}{_line(error)}') from error
     except Exception as error:
         reason = _line(error) or 'no reason given'
         raise RecordingError(
-            f'{path}: cannot be read ({type(error).__name__}: {reason})') from error
+            f'{place}cannot be read ({type(error).__name__}: {reason})') from error
 
 
 def _line(error: Exception) -> str:
@@ -268,16 +254,11 @@ def rechunk(pieces: Iterator[FloatArray], samples_per_block: int) -> Iterator[Fl
         yield np.concatenate(held, axis=1)
 
 
-def _guarded_blocks(source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
-    if samples_per_block < 1:
-        raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
-    return _checked(source.blocks(samples_per_block))
-
-
-def _checked(blocks: Iterator[FloatArray]) -> Iterator[FloatArray]:
-    for block in blocks:
-        check_samples(block, RecordingError)
-        yield block
+def _checked_blocks(blocks: Iterator[FloatArray], path: str) -> Iterator[FloatArray]:
+    with recording_errors(path):
+        for block in blocks:
+            check_samples(block, RecordingError)
+            yield block
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -1,4 +1,19 @@
-"""Machines whose truth is known."""
+"""
+Simulated gearboxes whose angle, pulses and amplitudes are known exactly.
+
+>>> from sa_jitter_ros.simulation import ExcessJitter, Gearbox, mesh
+>>> gearbox = Gearbox(mesh('output', teeth=19, harmonics=(1.0, 0.5)), sample_rate=20e3,
+...                   shafts={'output': 2.5}, speed=[(0.0, 25.0)], seed=1,
+...                   effects=[ExcessJitter(std=2e-5)])
+>>> vibration = gearbox.vibration(0, 20_000)
+>>> vibration.shape
+(1, 20000)
+>>> pulses = gearbox.pulses(0.0, 1.0)
+>>> bool(abs(pulses.errors).max() < 2e-4)
+True
+>>> abs(gearbox.amplitude(38.0, 'output'))
+array([0.5])
+"""
 
 from sa_jitter_ros.simulation.components import ChippedTooth, Component, mesh
 from sa_jitter_ros.simulation.effect import Effect, Setting
@@ -6,10 +21,16 @@ from sa_jitter_ros.simulation.effects import EFFECTS, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
+from sa_jitter_ros.simulation.pulse_effects import (
+    ClockSkew, CorrelatedJitter, DeclaredJitter, ExcessJitter, KeyphasorQuantisation,
+    MissingPulses, TargetGeometry)
 from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
+from sa_jitter_ros.simulation.vibration_effects import (
+    AdditiveNoise, AmplitudeModulation, InterferingTone, InterpolationLoss, PhaseWander,
+    SpeedFluctuation)
 
-__all__ = ['EFFECTS', 'AdditiveNoise', 'ChippedTooth', 'Component', 'DeclaredJitter', 'Effect',
-           'Gearbox', 'Keyphasor', 'Motion', 'Pulses', 'Setting', 'SinusoidSum', 'Torsion',
-           'band_limited', 'make_effects', 'mesh']
+__all__ = ['EFFECTS', 'AdditiveNoise', 'AmplitudeModulation', 'ChippedTooth', 'ClockSkew',
+           'Component', 'CorrelatedJitter', 'DeclaredJitter', 'Effect', 'ExcessJitter', 'Gearbox',
+           'InterferingTone', 'InterpolationLoss', 'Keyphasor', 'KeyphasorQuantisation',
+           'MissingPulses', 'Motion', 'PhaseWander', 'Pulses', 'Setting', 'SinusoidSum',
+           'SpeedFluctuation', 'TargetGeometry', 'Torsion', 'band_limited', 'make_effects', 'mesh']

@@ -1,4 +1,4 @@
-"""What a machine's vibration is made of: orders of its shafts, and local faults."""
+"""Components of the vibration of a machine: orders of its shafts, and local faults."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 
 ComplexArray = NDArray[np.complex128]
 
-MAX_WIDTH = 0.15  # beyond it the fault's neighbours of the next revolution would count
+MAX_WIDTH = 0.15  # beyond it bursts of more than the next revolutions would overlap
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class ChippedTooth:
     A burst once a revolution of a shaft, where the broken tooth passes.
 
     It is amplitude x exp(-x^2/2) x cos(2 pi order (angle - place)), x = (angle - place) / `width`,
-    so that an order of the mesh is weakened or strengthened over `width` revolutions around
-    `place`. The order is whole and the width at most 0.15.
+    angles in revolutions: added to a mesh it weakens or strengthens the mesh over about `width`
+    revolutions around `place`. The order is a whole number, the width at most 0.15.
     """
 
     shaft: str

@@ -1,4 +1,4 @@
-"""What an effect is: one hook of `Effect` overridden, and what it may know of its machine."""
+"""The base of simulated effects, and the properties of the machine that they may use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.motion import Motion
 from sa_jitter_ros.simulation.random_streams import FloatArray
-from sa_jitter_ros.simulation.sinusoids import band_limited, NOTHING, SinusoidSum
+from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum, ZERO
 
 IndexArray = NDArray[np.int64]
 Signal = Callable[[FloatArray], FloatArray]
@@ -18,9 +18,10 @@ Signal = Callable[[FloatArray], FloatArray]
 @dataclass(frozen=True, eq=False)
 class Setting:
     """
-    What an effect may know of its machine.
+    Properties of the machine that effects may use.
 
-    `trigger_rate` is the nominal rate of trigger cycles in Hz, `motion` that of the tach shaft.
+    `sample_rate` of the vibration and `trigger_rate`, the nominal rate of trigger cycles, in Hz;
+    `motion` of the tach shaft.
     """
 
     seed: int
@@ -32,14 +33,14 @@ class Setting:
 
 
 class Effect:
-    """An effect that does nothing; the base of all."""
+    """An effect that changes nothing; each effect overrides the methods that it needs."""
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation of the speed."""
-        return NOTHING
+        return ZERO
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
-        """Return what is added to a shaft's angle as its vibration shows it, rad."""
+        """Return the angle in rad that is added to the angle of a shaft in its vibration."""
         return 0.0
 
     def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
@@ -48,11 +49,11 @@ class Effect:
 
     def sampled(self, setting: Setting, signal: Signal, start: int,
                 stop: int) -> FloatArray | None:
-        """Return `channel` x `sample` of a signal, None to leave the sampling to others."""
+        """Return samples `start` to `stop` of a signal, None where the effect does not sample."""
         return None
 
     def added(self, setting: Setting, start: int, stop: int) -> FloatArray | float:
-        """Return what is added to samples `start` to `stop`, `channel` x `sample`."""
+        """Return a signal (`channel` x `sample`) to add to samples `start` to `stop`."""
         return 0.0
 
     def pulse_delay(self, setting: Setting, index: IndexArray,
@@ -61,11 +62,11 @@ class Effect:
         return 0.0
 
     def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
-        """Return the times as the clock of the keyphasor's acquisition gives them."""
+        """Return `times` (s) as the acquisition clock of the keyphasor measures them."""
         return times
 
     def kept(self, setting: Setting, index: IndexArray) -> NDArray[np.bool_]:
-        """Return which pulses are seen."""
+        """Return which pulses are measured."""
         return np.ones(index.shape, dtype=np.bool_)
 
 

@@ -1,4 +1,4 @@
-"""The effects by the names that the predictor's parameters have."""
+"""The simulated effects under the names of the predictor's parameters."""
 
 from collections.abc import Mapping
 from dataclasses import fields

@@ -1,8 +1,8 @@
 """
-A gearbox whose truth is known: vibration and keyphasor pulses, exact at the true angle.
+A simulated gearbox: vibration and keyphasor pulses, exact at its true angle.
 
-Samples and pulses depend on the seed and their number only, never on the blocks they are read in:
-they are evaluated in chunks at fixed places, one of which is held.
+Samples and pulses depend on the seed and their index only, not on the blocks in which they are
+read: they are evaluated in chunks at fixed places, and the last chunk is kept.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from sa_jitter_ros.simulation.effect import Effect, require_number, Setting
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
 from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
-from sa_jitter_ros.simulation.sinusoids import NOTHING, SinusoidSum
+from sa_jitter_ros.simulation.sinusoids import SinusoidSum, ZERO
 
 CHUNK = 4096
 _PULSE_MARGIN = 3  # pulses beyond a window whose errors may carry them into it
@@ -36,25 +36,25 @@ class Gearbox:
     Parameters
     ----------
     components
-        What the vibration consists of.
+        Orders that the vibration consists of.
     sample_rate
-        Of the vibration, Hz.
+        Sampling rate of the vibration, Hz.
     shafts
         Speed of each shaft over that of the tach shaft.
     speed
         Speed profile of the tach shaft: pairs of time (s) and speed (Hz), linear between them.
     fluctuation
-        Relative random speed fluctuation, as from `band_limited`.
+        Relative speed fluctuation as a function of time, as `band_limited` makes it.
     torsion
-        Twists of the tach shaft.
+        Torsional oscillations of the tach shaft.
     keyphasor
         The target and the waveform of its probe.
     faults
         Chipped teeth.
     effects
-        What else happens, in this order: declared jitter and noise, undeclared effects.
+        Declared jitter and noise first, then undeclared effects; applied in this order.
     seed
-        Of all that is random.
+        Seed of all random numbers.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class Gearbox:
     sample_rate: float
     shafts: Mapping[str, float] = field(default_factory=lambda: {'shaft': 1.0})
     speed: Sequence[tuple[float, float]] = ((0.0, 25.0),)
-    fluctuation: SinusoidSum = NOTHING
+    fluctuation: SinusoidSum = ZERO
     torsion: Sequence[Torsion] = ()
     keyphasor: Keyphasor = field(default_factory=Keyphasor)
     faults: Sequence[ChippedTooth] = ()
@@ -87,7 +87,7 @@ class Gearbox:
         sizes = {len(part.amplitudes) for part in parts} | {
             len(component.phases) for component in self.components}
         if len(sizes) != 1 or 0 in sizes:
-            raise ParameterError(f'components of {sorted(sizes)} channels: must all be of one '
+            raise ParameterError(f'components of {sorted(sizes)} channels: give all the same '
                                  'number')
         self.setting  # noqa: B018 (an impossible motion must fail here)
 
@@ -102,7 +102,7 @@ class Gearbox:
 
     @cached_property
     def setting(self) -> Setting:
-        """Return what the effects may know of this machine."""
+        """Return the properties of this machine that effects may use."""
         keyphasor = self.keyphasor
         motion = Motion(self.speed, self.fluctuation, self.torsion,
                         -0.25 / keyphasor.pulses_per_revolution)
@@ -132,13 +132,14 @@ class Gearbox:
         """
         total = np.zeros(self.channels, dtype=np.complex128)
         for component in self.components:
-            own = component.order * self.shafts[component.shaft] / self.shafts[shaft]
-            if math.isclose(own, order, rel_tol=1e-9):
+            of_shaft = component.order * self.shafts[component.shaft] / self.shafts[shaft]
+            if math.isclose(of_shaft, order, rel_tol=1e-9):
                 total += component.phasor
         for fault in self.faults:
-            own = order * self.shafts[shaft] / self.shafts[fault.shaft]
-            whole = round(own)
-            total += fault.phasor(whole if math.isclose(own, whole, rel_tol=1e-9) else own)
+            of_fault = order * self.shafts[shaft] / self.shafts[fault.shaft]
+            whole = round(of_fault)
+            total += fault.phasor(
+                whole if math.isclose(of_fault, whole, rel_tol=1e-9) else of_fault)
         return total
 
     # --- signals ----------------------------------------------------------------------------
@@ -153,7 +154,7 @@ class Gearbox:
             yield self.vibration(start, min(start + samples_per_block, stop))
 
     def tach_waveform(self, start: int, stop: int) -> FloatArray:
-        """Return samples `start` to `stop` of the keyphasor's waveform, taken at its own rate."""
+        """Return samples `start` to `stop` of the keyphasor waveform, at `keyphasor.rate`."""
         return np.asarray(self._waveform.read(start, stop)[0])
 
     def pulses(self, start: float, stop: float) -> Pulses:
@@ -165,7 +166,7 @@ class Gearbox:
         return Pulses(pulses.index[found], pulses.times[found], pulses.true_times[found])
 
     def _pulses_around(self, start: float, stop: float) -> tuple[Pulses, NDArray[np.bool_]]:
-        """Return consecutive pulses that reach beyond a window, and which of them are seen."""
+        """Return consecutive pulses that reach beyond a window, and which of them are measured."""
         setting, count = self.setting, self.keyphasor.pulses_per_revolution
         edges = np.array([start, stop])
         slack = 2.0 * float(np.abs(self._observed(edges) - edges).max())
@@ -215,29 +216,29 @@ class Gearbox:
             wander = sum(effect.source_angle(self.setting, shaft, times)
                          for effect in self.effects)
             angle = ratio * tach_angle + wander / (2.0 * np.pi)
-            own = np.zeros_like(total)
+            part = np.zeros_like(total)
             if components:
                 cycles = np.multiply.outer([item.order for item in components], angle)
                 phasors = np.exp(2j * np.pi * (cycles % 1.0))
-                own += (np.array([item.phasor for item in components]).T @ phasors).real
+                part += (np.array([item.phasor for item in components]).T @ phasors).real
             for fault in faults:
-                own += np.multiply.outer(fault.amplitudes, fault.burst(angle))
+                part += np.multiply.outer(fault.amplitudes, fault.burst(angle))
             for effect in self.effects:
-                own *= effect.gain(self.setting, shaft, times)
-            total += own
+                part *= effect.gain(self.setting, shaft, times)
+            total += part
         return total
 
     def _waveform_chunk(self, start: int, stop: int) -> FloatArray:
         keyphasor, motion = self.keyphasor, self.setting.motion
         times = np.arange(start, stop) / keyphasor.rate
         pulses, kept = self._pulses_around(times[0], times[-1])
-        # Between two pulses the waveform is late by what the line between their errors says.
+        # Between two pulses the delay of the waveform is interpolated between their errors.
         true_times = times - np.interp(times, pulses.times, pulses.errors)
         phase = keyphasor.pulses_per_revolution * motion.angle(true_times)
         pulse = np.floor(phase + 0.25)
-        seen = kept[np.clip(pulse - pulses.index[0], 0, kept.size - 1).astype(np.int64)]
+        measured = kept[np.clip(pulse - pulses.index[0], 0, kept.size - 1).astype(np.int64)]
         # A missing pulse leaves the waveform where it is just before one: low, or in the middle.
-        within = np.where(seen, phase - pulse, 0.0 if keyphasor.waveform == 'sine' else 0.74)
+        within = np.where(measured, phase - pulse, 0.0 if keyphasor.waveform == 'sine' else 0.74)
         rise: FloatArray | float = 0.0
         if keyphasor.rise_time > 0.0:
             pulse_rate = keyphasor.pulses_per_revolution * motion.speed(true_times)
@@ -248,7 +249,7 @@ class Gearbox:
 
 
 class _Chunks:
-    """Reads any stretch from chunks at fixed places, and holds the last chunk."""
+    """Reads any range of samples from chunks at fixed places, and keeps the last chunk."""
 
     def __init__(self, evaluate: Callable[[int, int], FloatArray]) -> None:
         self._evaluate = evaluate

@@ -1,4 +1,4 @@
-"""The keyphasor: pulses with known errors, and the waveform they are detected from."""
+"""The keyphasor: pulses with known errors, and the waveform of its probe."""
 
 from dataclasses import dataclass
 
@@ -13,10 +13,10 @@ WAVEFORMS = ('ttl', 'sine')
 @dataclass(frozen=True, eq=False)
 class Pulses:
     """
-    Pulses as they were measured, and the truth about them.
+    Measured pulses and their true times.
 
-    Pulse `index` is due at `true_times` (s), where the tach shaft has turned by `index` pulses; it
-    was measured at `times`, `errors` later.
+    The tach shaft has turned by `index` pulses at `true_times` (s); the keyphasor measured
+    `times` (s) instead.
     """
 
     index: IndexArray

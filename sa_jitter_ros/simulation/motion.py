@@ -1,5 +1,5 @@
 """
-How the tach shaft turns: speed profile, random fluctuation and torsion, exactly invertible.
+Motion of the tach shaft: speed profile, random fluctuation and torsion, exactly invertible.
 
 The angle is a chain of increasing maps, angle(t) = torsion(profile(warp(t))), each with an exact
 derivative, so that both the angle of any time and the time of any angle hold to rounding.
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.random_streams import FloatArray
-from sa_jitter_ros.simulation.sinusoids import NOTHING, SinusoidSum
+from sa_jitter_ros.simulation.sinusoids import SinusoidSum, ZERO
 
-MAX_FLUCTUATION = 0.9  # a bound ten standard deviations out, never reached
+MAX_FLUCTUATION = 0.9  # of the bound, about ten standard deviations, that is never reached
 MAX_TORSION = 0.5
 _PICARD_STEPS = 6
 _NEWTON_STEPS = 6
@@ -23,7 +23,7 @@ _NEWTON_STEPS = 6
 @dataclass(frozen=True)
 class Torsion:
     """
-    A twist of the tach shaft locked to its angle: `amplitude` rad, `order` times a revolution.
+    A torsional oscillation of the tach shaft: `amplitude` rad, `order` times a revolution.
 
     `phase` in rad, of a sine.
     """
@@ -36,7 +36,7 @@ class Torsion:
 @dataclass(frozen=True, eq=False)
 class Motion:
     """
-    The turning of the tach shaft.
+    Motion of the tach shaft: its angle at any time, and the time of any angle.
 
     Parameters
     ----------
@@ -46,19 +46,19 @@ class Motion:
     fluctuation
         Relative speed fluctuation as a function of time.
     torsion
-        Twists of the shaft.
+        Torsional oscillations of the shaft.
     start_angle
         Angle at time 0, revolutions.
 
     Raises
     ------
     ParameterError
-        If the profile is no profile or the shaft would turn backwards.
+        If the profile is malformed or the shaft would turn backwards.
 
     """
 
     points: Sequence[tuple[float, float]]
-    fluctuation: SinusoidSum = NOTHING
+    fluctuation: SinusoidSum = ZERO
     torsion: Sequence[Torsion] = ()
     start_angle: float = 0.0
     _times: FloatArray = field(init=False, repr=False)
@@ -67,7 +67,7 @@ class Motion:
     _warp: SinusoidSum = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the shaft turns forwards and sum up the profile."""
+        """Check that the shaft turns forwards, and integrate the profile."""
         points = np.array(self.points, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
             raise ParameterError(f'speed profile {self.points}: give pairs of time in s and '

@@ -1,4 +1,4 @@
-"""Effects on the keyphasor's pulses: when they come, what the clock says, and whether at all."""
+"""Effects on the pulses of the keyphasor: their times, the clock that measures them, losses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum
 from scipy.special import ndtri
 
-MAX_CORRELATION = 0.9999  # beyond it the process remembers more pulses than are worth drawing
+MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones to draw
 JITTER_DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 
 
@@ -69,7 +69,7 @@ class ExcessJitter(Effect):
 
 @dataclass(frozen=True)
 class CorrelatedJitter(Effect):
-    """Normal errors of `std` s, pulses k apart correlated by `correlation`^k."""
+    """Normal errors of `std` s, pulses k apart correlated by `correlation^k`."""
 
     std: float
     correlation: float
@@ -90,9 +90,9 @@ class CorrelatedJitter(Effect):
 @dataclass(frozen=True)
 class TargetGeometry(Effect):
     """
-    Marks of the target that lie off their even places: pulse k by `pulse_angles`[k mod n] rad.
+    Marks of the target that are not evenly spaced: pulse k is late by `pulse_angles[k mod n]` rad.
 
-    With as many angles as pulses per revolution they belong to the target's marks.
+    With one angle for each pulse of a revolution, an angle belongs to a mark of the target.
     """
 
     pulse_angles: tuple[float, ...]
@@ -104,7 +104,7 @@ class TargetGeometry(Effect):
                                  'least one finite angle in rad')
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
-        """Return how much later each mark passes than if it were in its place."""
+        """Return how much later each mark passes than an evenly spaced one."""
         marks = np.array(self.pulse_angles)[index % len(self.pulse_angles)] / (2.0 * np.pi)
         nominal = index / setting.pulses_per_revolution
         return setting.motion.time_at(nominal + marks) - times
@@ -112,7 +112,7 @@ class TargetGeometry(Effect):
 
 @dataclass(frozen=True)
 class ClockSkew(Effect):
-    """The keyphasor's clock runs fast by `skew`: time t of the vibration is t (1 + skew) on it."""
+    """The clock of the keyphasor runs fast by `skew`: it shows t (1 + skew) at time t."""
 
     skew: float
 
@@ -130,8 +130,8 @@ class KeyphasorQuantisation(Effect):
     """
     The keyphasor is sampled: pulse times are rounded up to a clock of `clock_rate` Hz.
 
-    `period_std` (s) is the standard deviation of the trigger period that a slow fluctuation of the
-    speed adds, so that the pulses wander over the clock's grid.
+    `period_std` (s) is the standard deviation of the trigger period by a slow speed fluctuation,
+    which spreads the pulses evenly between the ticks of the clock.
     """
 
     clock_rate: float
@@ -164,11 +164,11 @@ class MissingPulses(Effect):
         require_number('missing_pulses.probability', self.probability, minimum=0, below=1)
 
     def kept(self, setting: Setting, index: IndexArray) -> NDArray[np.bool_]:
-        """Return which pulses are seen."""
+        """Return which pulses are measured."""
         draws = _per_pulse(RandomStream(setting.seed, 'missing_pulses').uniform, index)
         return draws >= self.probability
 
 
 def _per_pulse(draw: Callable[[int, int], FloatArray], index: IndexArray) -> FloatArray:
-    """Return the item of a stream for every one of some consecutive pulses."""
+    """Return one item of a stream for each of consecutive pulses."""
     return draw(int(index[0]), int(index[-1]) + 1)[0] if index.size else np.empty(0)

@@ -1,4 +1,4 @@
-"""Random numbers that depend on where they are read, never on how a run is cut into blocks."""
+"""Random numbers that depend on their index only, not on the blocks in which they are read."""
 
 from dataclasses import dataclass
 import zlib
@@ -10,22 +10,22 @@ from scipy.signal import lfilter
 FloatArray = NDArray[np.float64]
 
 CHUNK = 1024
-_FORGOTTEN = 1e-17  # correlation that no longer shows in a float64
+_NEGLIGIBLE = 1e-17  # correlation below the resolution of a float64
 
 
 @dataclass(frozen=True)
 class RandomStream:
     """
-    An endless table of random numbers: item `k` of a row is the same for every way of reading it.
+    An endless table of random numbers: item `k` of a row does not depend on how it is read.
 
     Parameters
     ----------
     seed
-        Of the whole simulation.
+        Seed of the whole simulation.
     name
-        Of this stream; streams of different names are independent.
+        Name of this stream; streams of different names are independent.
     rows
-        Independent rows that are read together.
+        Number of independent rows.
 
     """
 
@@ -43,13 +43,13 @@ class RandomStream:
 
     def autoregressive(self, start: int, stop: int, *, correlation: float) -> FloatArray:
         """
-        Return standard normal items whose neighbours are correlated, lag k by `correlation`^k.
+        Return standard normal items whose neighbours are correlated, lag k by `correlation^k`.
 
-        Every chunk filters white noise from so far back that what lies before is forgotten.
+        Each chunk filters white noise that begins so early that still earlier noise has no effect.
         """
-        if abs(correlation) < _FORGOTTEN:
+        if abs(correlation) < _NEGLIGIBLE:
             return self.normal(start, stop)
-        memory = int(np.ceil(np.log(_FORGOTTEN) / np.log(abs(correlation))))
+        memory = int(np.ceil(np.log(_NEGLIGIBLE) / np.log(abs(correlation))))
         gain = np.sqrt(1.0 - correlation**2)
         pieces = [
             lfilter([gain], [1.0, -correlation],

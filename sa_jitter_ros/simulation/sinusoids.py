@@ -44,7 +44,7 @@ class SinusoidSum:
         return float(np.abs(self.amplitudes).sum())
 
 
-NOTHING = SinusoidSum(np.empty(0), np.empty(0), np.empty(0))
+ZERO = SinusoidSum(np.empty(0), np.empty(0), np.empty(0))
 
 
 def band_limited(*, std: float, band: tuple[float, float], seed: int, name: str) -> SinusoidSum:

@@ -1,14 +1,47 @@
-"""Effects on the vibration: how the shafts turn, how it reaches the sensor and is sampled."""
+"""Effects on the vibration: motion of the shafts, path to the sensor, sampling."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 import math
 
 import numpy as np
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import Effect, require_number, Setting, Signal, slow_process
-from sa_jitter_ros.simulation.interpolators import GRID_OFFSET, INTERPOLATORS
 from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum
+from scipy.interpolate import CubicSpline
+
+GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # of rates; irrational: fractions spread evenly
+_SPLINE_MARGIN = 32  # an end acts on the spline by 0.268^32 there: below rounding
+
+Interpolator = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def linear(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate `channel` x `sample` linearly; mean gain sinc^2(f/fs)."""
+    at = np.floor(positions).astype(np.int64)
+    fraction = positions - at
+    return (1.0 - fraction) * samples[:, at] + fraction * samples[:, at + 1]
+
+
+def cubic(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate by cubic convolution with a = -1/2 (Keys 1981)."""
+    at = np.floor(positions).astype(np.int64)
+    s = positions - at
+    weights = (((2.0 - s) * s - 1.0) * s / 2.0, (3.0 * s - 5.0) * s * s / 2.0 + 1.0,
+               ((4.0 - 3.0 * s) * s + 1.0) * s / 2.0, (s - 1.0) * s * s / 2.0)
+    return np.asarray(sum(weight * samples[:, at + shift]
+                          for weight, shift in zip(weights, (-1, 0, 1, 2))))
+
+
+def spline(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate by the cubic spline; mean gain 3 sinc^4(f/fs) / (2 + cos(2 pi f/fs))."""
+    return np.asarray(CubicSpline(np.arange(samples.shape[1]), samples, axis=1)(positions))
+
+
+# Name of the averager's method: function, and number of samples that it needs on either side.
+INTERPOLATORS: Mapping[str, tuple[Interpolator, int]] = {
+    'linear': (linear, 1), 'cubic': (cubic, 2), 'spline': (spline, _SPLINE_MARGIN)}
 
 
 @dataclass(frozen=True)
@@ -16,8 +49,8 @@ class SpeedFluctuation(Effect):
     """
     Random acceleration of `acceleration_std` rad/s^2 of the tach shaft.
 
-    It varies slowly enough (below a fifth of the trigger rate) to be nearly constant within a
-    trigger cycle.
+    Its frequencies lie below a fifth of the trigger rate: it is nearly constant within a trigger
+    cycle.
     """
 
     acceleration_std: float
@@ -37,9 +70,9 @@ class SpeedFluctuation(Effect):
 @dataclass(frozen=True)
 class PhaseWander(Effect):
     """
-    Slow random angle of `std` rad between a shaft and its vibration, of each shaft its own.
+    Slow random angle of `std` rad between a shaft and its vibration, independent for each shaft.
 
-    It has frequencies up to `bandwidth` times the trigger rate.
+    Its frequencies reach up to `bandwidth` times the trigger rate.
     """
 
     std: float
@@ -58,7 +91,7 @@ class PhaseWander(Effect):
 
 @dataclass(frozen=True)
 class AmplitudeModulation(Effect):
-    """A slow random gain of mean 1 and standard deviation `std` on each shaft's vibration."""
+    """Slow random gain on the vibration of each shaft, of mean 1 and standard deviation `std`."""
 
     std: float
 
@@ -76,7 +109,7 @@ class InterpolationLoss(Effect):
     """
     The vibration was sampled on another grid of nearly the same rate and interpolated by `method`.
 
-    The place between two samples of the other grid wanders evenly through all fractions.
+    Positions between two samples of the other grid run evenly through all fractions.
     """
 
     method: str
@@ -116,7 +149,7 @@ class AdditiveNoise(Effect):
 
 @dataclass(frozen=True)
 class InterferingTone(Effect):
-    """A tone of `frequency` Hz and `amplitude` on every channel that no shaft makes."""
+    """Tone of `frequency` Hz and `amplitude` on every channel, not locked to any shaft."""
 
     frequency: float
     amplitude: float

@@ -1,0 +1,35 @@
+"""What the pages of measured numbers share: tables, and sections that are written by a command."""
+
+from collections.abc import Iterable, Mapping, Sequence
+import re
+
+import numpy as np
+
+MEMORY = ('MB half way', 'at the end', 'trend between in MB an hour')
+LONG = 240.0  # s that a node must have lived for a trend
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table."""
+    lines = [header, ['---'] * len(header), *rows]
+    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+
+
+def fill(page: str, contents: Mapping[str, str]) -> str:
+    """Return the page with what is between the markers of each section replaced."""
+    for name, content in contents.items():
+        pattern = re.compile(f'(<!-- {name} -->\n).*?(<!-- end -->)', re.DOTALL)
+        if len(pattern.findall(page)) != 1:
+            raise ValueError(f'the page has no section <!-- {name} --> ... <!-- end -->: add it')
+        page = pattern.sub(lambda match, text=content: f'{match[1]}{text}\n{match[2]}', page)
+    return page
+
+
+def growth(rss: Sequence[Sequence[float]]) -> tuple[str, str, str]:
+    """Return memory (MB) half way and at the end, and the trend between (MB an hour)."""
+    times, values = np.array(rss).T
+    later = times >= times.mean()
+    trend = '-'
+    if np.ptp(times) >= LONG:
+        trend = f'{3600.0 * np.polyfit(times[later], values[later], 1)[0]:+.1f}'
+    return f'{values[later][0]:.1f}', f'{values[-1]:.1f}', trend

@@ -1,0 +1,258 @@
+"""
+The library's synchronous average of arrays: at once (`average`) or block by block (`Averager`).
+
+Both stand on the stream that the node `synchronous_averager` uses and take its parameters under
+the same names, with the same defaults but three: `trigger_cycles` None averages all cycles,
+`keyphasor_rate` None is the sampling rate of the vibration, and nothing is dropped because it
+waits too long (`buffer_seconds`).
+"""
+
+from collections.abc import Sequence
+import math
+from typing import Literal
+import warnings
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.parameters import KeyphasorParameters
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
+from sa_jitter_ros.pulses.validation import MissingPulses
+from sa_jitter_ros.samples import SampleBlock
+
+FloatArray = NDArray[np.float64]
+Averaging = Literal['block', 'sliding', 'exponential']
+AngleLawName = Literal['linear', 'quadratic', 'spline']
+Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
+
+_PIECE = 1 << 18  # samples of a channel that are handed on at once, so that memory stays small
+_ALL_CYCLES = 1 << 60  # more trigger cycles than a stream has
+_SHAFT = 'shaft'
+
+
+class Averager:
+    """
+    Synchronous averages of one shaft from vibration and pulses that come block by block.
+
+    `sample_rate` (Hz) and `start_time` (s) of the first sample put the vibration on the clock of
+    the pulses; `ratio` is the speed of the shaft over that of the tach shaft, `trigger_cycles` N_t
+    (None: all of an unbroken run, returned where it ends), `orders` are multiples of the shaft
+    (None: 1, 2, 3). The other keywords are the parameters of the node `synchronous_averager`.
+
+    The averages depend on the data alone: not on where it was cut, nor on whether pulses come
+    before or after their samples. An average holds consecutive trigger cycles only. NaN and
+    infinite samples are a gap; double pulses are dropped, cycles with early, late or missing
+    pulses discarded. `messages` says in words what was discarded, `counts` counts it. Samples and
+    pulses wait for each other up to `buffer_seconds`: give a limit where one of the two may stay
+    away. Raises `ParameterError` for parameters that cannot be used.
+
+    A shaft at 25 Hz whose 8th order has an amplitude of 2 m/s^2, in blocks of a second:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> averager = sa.Averager(5000.0, trigger_cycles=20, orders=[8.0])
+    >>> for start in 0.0, 1.0:
+    ...     time = start + np.arange(5000) / 5000.0
+    ...     pulses = start + 0.02 + np.arange(25) / 25.0
+    ...     for average in averager.update(2.0 * np.cos(2.0 * np.pi * 200.0 * time), pulses):
+    ...         print(average.sequence, round(average.start_time, 2), average.trigger_cycles,
+    ...               abs(average.amplitudes).round(3))
+    0 0.02 20 [[2.]]
+    1 0.82 20 [[2.]]
+    >>> averager.flush(), averager.counts['trigger_cycles']
+    ((), 49)
+    """
+
+    def __init__(
+        self, sample_rate: float, *, start_time: float = 0.0, ratio: float = 1.0,
+        pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
+        trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
+        correct_jitter: bool = False, keyphasor_rate: float | None = None,
+        averaging: Averaging = 'block', angle_law: AngleLawName = 'linear',
+        interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
+        missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
+        interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
+        time_tolerance: float = 0.01, buffer_seconds: float = math.inf,
+    ) -> None:
+        if not (np.isfinite(sample_rate) and sample_rate > 0.0):
+            raise ParameterError(f'sample_rate is {sample_rate} Hz: give a positive rate')
+        if not np.isfinite(start_time):
+            raise ParameterError(f'start_time is {start_time} s: give the time of the first '
+                                 'sample on the clock of the pulses')
+        if not buffer_seconds > 0.0:
+            raise ParameterError(f'buffer_seconds is {buffer_seconds} s: give a positive time')
+        if trigger_cycles is None and averaging != 'block':
+            raise ParameterError(f'averaging is {averaging!r} without trigger_cycles: say how '
+                                 'many trigger cycles the window holds')
+        keyphasor = KeyphasorParameters(
+            pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
+            missing_teeth=missing_teeth, missing_pulses=missing_pulses,
+            maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
+            minimum_interval=minimum_interval, time_tolerance=time_tolerance)
+        settings = keyphasor.average(
+            ratio=ratio, orders=orders, averaging=averaging, angle_law=angle_law,
+            trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
+            samples_per_revolution=samples_per_revolution, interpolation=interpolation,
+            correct_jitter=correct_jitter, keyphasor_rate=keyphasor_rate or 0.0)
+        self._stream = StreamingAverager(
+            {_SHAFT: settings}, validator=keyphasor.validator(),
+            timeline=VibrationTimeline(
+                time_tolerance=time_tolerance, buffer_seconds=buffer_seconds),
+            keep_unfinished=trigger_cycles is None)
+        self._rate, self._start_time = sample_rate, start_time
+        self._index = 0
+        self._channels: int | None = None
+        self._ended = False
+        self.messages: list[str] = []
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """
+        Return what was used and what was not, by the keys of the node's diagnostics.
+
+        `trigger_cycles` were averaged; `pulses_missing_broken`, `pulses_doubles`, ... say what
+        became of the pulses (`sa_jitter_ros.pulses.validation.PulseCounts`).
+        """
+        stream = self._stream
+        return {
+            'trigger_cycles': stream.counts.cycles, **stream.totals,
+            'samples_non_finite': stream.timeline.counts.non_finite,
+            **{f'pulses_{name}': count for name, count in vars(stream.pulse_counts).items()}}
+
+    def update(self, vibration: ArrayLike | None = None, pulse_times: ArrayLike | None = None,
+               ) -> tuple[Average, ...]:
+        """
+        Take the next samples and pulses, either or both, and return the averages that are due.
+
+        `vibration` (channel, sample), or (sample,) for one channel, follows on the samples before;
+        `pulse_times` (pulse,) in s, in order of arrival. Raises `SignalError` for arrays that are
+        not real numbers, of another shape or of another number of channels than before; they are
+        not taken.
+        """
+        if self._ended:
+            raise SignalError('the stream ended with flush: make another Averager')
+        samples = None if vibration is None else self._checked(vibration)
+        found = []
+        if pulse_times is not None:
+            found += self._stream.add_pulses(np.atleast_1d(np.asarray(pulse_times)))
+        if samples is not None and samples.size:
+            self._channels = len(samples)
+            for first in range(0, samples.shape[1], _PIECE):
+                piece = samples[:, first:first + _PIECE].astype(np.float64)
+                found += self._stream.add_samples(SampleBlock(
+                    piece, self._start_time + self._index / self._rate, self._rate, self._index))
+                self._index += piece.shape[1]
+        return self._taken(found)
+
+    def flush(self) -> tuple[Average, ...]:
+        """Return the averages that are due because the stream ends here."""
+        self._ended = True
+        return self._taken(self._stream.finish())
+
+    def _checked(self, vibration: ArrayLike) -> NDArray[np.generic]:
+        samples = np.asarray(vibration)
+        if samples.ndim == 1:
+            samples = samples[None]
+        if samples.ndim != 2 or samples.dtype.kind not in 'fiu':
+            raise SignalError(f'vibration has type {samples.dtype} and shape {samples.shape}: '
+                              'give real numbers, (channel, sample) or (sample,)')
+        if self._channels not in (None, len(samples)) and samples.size:
+            raise SignalError(f'vibration has {len(samples)} channels and had {self._channels} '
+                              'before: give (channel, sample) with the same channels')
+        return samples
+
+    def _taken(self, found: list[tuple[str, Average]]) -> tuple[Average, ...]:
+        self.messages += self._stream.take_messages()
+        return tuple(average for _, average in found)
+
+
+def average(
+    vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike, *, start_time: float = 0.0,
+    ratio: float = 1.0, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
+    trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
+    correct_jitter: bool = False, keyphasor_rate: float | None = None,
+    averaging: Averaging = 'block', angle_law: AngleLawName = 'linear',
+    interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
+    missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
+    interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
+    time_tolerance: float = 0.01,
+) -> tuple[Average, ...]:
+    """
+    Return the synchronous averages of a recording of vibration (channel, sample) or (sample,).
+
+    `pulse_times` (pulse,) in s are on the clock on which the first sample is at `start_time`. The
+    keywords are those of `Averager`: without `trigger_cycles` all cycles make one average, or one
+    for every unbroken run of them. What is discarded is said in a `DataWarning`. Raises
+    `ParameterError` for parameters and `SignalError` for arrays that cannot be used, also where
+    they hold fewer trigger cycles than an average needs.
+
+    A gear mesh of 19 teeth on a shaft at 16.6 Hz whose keyphasor is sampled at 1 kHz. The average
+    shows less than the true amplitude of 2 m/s^2; the vibration tells by how much every pulse is
+    wrong, and without these errors the amplitude is there again:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> time = np.arange(60_000) / 20e3
+    >>> angle = 16.6 * time  # revolutions
+    >>> rng = np.random.default_rng(1)
+    >>> vibration = 2.0 * np.cos(2.0 * np.pi * 19.0 * angle) + rng.normal(0.0, 0.3, time.size)
+    >>> pulses = np.ceil(np.arange(48) / 16.6 * 1e3) / 1e3
+    >>> result, = sa.average(vibration, 20e3, pulses, orders=[19.0], correct_jitter=True,
+    ...                      keyphasor_rate=1e3)
+    >>> abs(result.amplitudes).round(2), abs(result.correction.amplitudes).round(2)
+    (array([[1.8]]), array([[2.]]))
+    >>> result.trigger_cycles, round(result.trigger_speed, 2), result.waveform.shape
+    (47, 16.6, (1, 1296))
+    >>> bool(np.ptp(result.correction.pulse_errors) < 1.05 / 1e3)  # a period of the clock
+    True
+    """
+    averager = Averager(
+        sample_rate, start_time=start_time, ratio=ratio,
+        pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
+        trigger_cycles=trigger_cycles, orders=orders, correct_jitter=correct_jitter,
+        keyphasor_rate=keyphasor_rate, averaging=averaging, angle_law=angle_law,
+        interpolation=interpolation, samples_per_revolution=samples_per_revolution,
+        missing_teeth=missing_teeth, missing_pulses=missing_pulses,
+        maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
+        minimum_interval=minimum_interval, time_tolerance=time_tolerance)
+    samples, pulses = np.asarray(vibration), np.asarray(pulse_times)
+    if samples.ndim == 2 and samples.shape[0] > samples.shape[1] > 0:
+        raise SignalError(f'vibration has {samples.shape[0]} channels of {samples.shape[1]} '
+                          'samples: give (channel, sample), transpose it')
+    found = averager.update(samples, pulses) + averager.flush()
+    discarded = _discarded(averager)
+    if not found:
+        counts, end = averager.counts, start_time + samples.shape[-1] / sample_rate
+        wanted = '' if trigger_cycles is None else f' of the {trigger_cycles} of an average'
+        raise SignalError(
+            f'{pulses.size} pulses and vibration from {start_time:g} s to {end:g} s make '
+            f'{counts["trigger_cycles"]} whole trigger cycles{wanted}: '
+            + (f'{discarded}' if discarded else 'lower trigger_cycles, or give more pulses'))
+    if discarded:
+        warnings.warn(discarded, DataWarning, stacklevel=2)
+    return found
+
+
+_CAUSES = {
+    'samples_non_finite': 'samples that are NaN or infinite',
+    'pulses_non_finite': 'pulse times that are NaN or infinite',
+    'pulses_doubles': 'double pulses', 'pulses_early': 'early pulses',
+    'pulses_late': 'late pulses', 'pulses_missing_broken': 'missing pulses',
+    'pulses_missing_bridged': 'missing pulses that were put in evenly',
+    'pulses_out_of_order': 'pulses out of order', 'pulses_restarts': 'times that run back',
+    'pulses_unlocked': 'pulses without a steady interval',
+    'pulses_relearnt': 'changes of the pulse interval within a pulse or two'}
+
+
+def _discarded(averager: Averager) -> str:
+    """Say what an averager could not use and why, '' if it used everything."""
+    counts = averager.counts
+    causes = [f'{counts[key]} {text}' for key, text in _CAUSES.items() if counts[key]]
+    if not (causes or averager.messages or counts['cycles_dropped']):
+        return ''
+    return '; '.join([
+        f'{counts["cycles_dropped"]} trigger cycles were discarded and '
+        f'{counts["trigger_cycles"]} averaged', *causes, *averager.messages[:3],
+        *(['...'] if len(averager.messages) > 3 else [])])

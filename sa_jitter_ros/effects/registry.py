@@ -1,0 +1,56 @@
+"""
+The list of effects, and effects made from names and values.
+
+To add an effect, write its module, import its class here and give it a place in `EFFECTS`:
+library, predictor, simulator, loop and report find it.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from sa_jitter_ros.effects.additive_noise import AdditiveNoise
+from sa_jitter_ros.effects.amplitude_modulation import AmplitudeModulation
+from sa_jitter_ros.effects.clock_skew import ClockSkew
+from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
+from sa_jitter_ros.effects.effect import Effect, parameter_ranges
+from sa_jitter_ros.effects.excess_jitter import ExcessJitter
+from sa_jitter_ros.effects.interfering_tone import InterferingTone
+from sa_jitter_ros.effects.interpolation_loss import InterpolationLoss
+from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
+from sa_jitter_ros.effects.missing_pulses import MissingPulses
+from sa_jitter_ros.effects.phase_wander import PhaseWander
+from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
+from sa_jitter_ros.effects.target_geometry import TargetGeometry
+from sa_jitter_ros.errors import ParameterError
+
+EFFECTS: Mapping[str, type[Effect]] = {kind.name: kind for kind in (
+    ExcessJitter, KeyphasorQuantisation, CorrelatedJitter, TargetGeometry, SpeedFluctuation,
+    ClockSkew, PhaseWander, MissingPulses, InterpolationLoss, AdditiveNoise, AmplitudeModulation,
+    InterferingTone)}
+
+
+def make_effect(name: str, **parameters: Any) -> Effect:
+    """Return the effect `name`; raise ParameterError for an unknown name, parameter or value."""
+    if name not in EFFECTS:
+        raise ParameterError(f'no effect {name!r}: there are {", ".join(EFFECTS)}')
+    known = parameter_ranges(EFFECTS[name])
+    for key in parameters:
+        if key not in known:
+            raise ParameterError(f'effect {name} has no {key!r}: it has {", ".join(known)}')
+    return EFFECTS[name](**{key: tuple(value) if isinstance(value, list) else value
+                            for key, value in parameters.items()})
+
+
+def enabled_effects(values: Mapping[str, Any]) -> tuple[Effect, ...]:
+    """
+    Return the effects that parameters named `effects.<name>.<parameter>` switch on.
+
+    Other parameters in `values` are ignored; a parameter that is not in `values` has its default.
+    """
+    found = []
+    for name, kind in EFFECTS.items():
+        if values.get(f'effects.{name}.enabled', False):
+            given = {key: values[f'effects.{name}.{key}'] for key in parameter_ranges(kind)
+                     if f'effects.{name}.{key}' in values}
+            found.append(make_effect(name, **given))
+    return tuple(found)

@@ -1,0 +1,140 @@
+"""Trigger cycles of a recording for the averager, and the pulse errors that they tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.averaging.average import Average, AverageSettings
+from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
+from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
+from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw
+from sa_jitter_ros.pulses.resampling import margin
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Errors of this many declared standard deviations are tried again as if more had been declared: an
+# effect may be larger than the declared jitter, and orders may have slipped a cycle.
+_SUSPICIOUS, _WIDER = 1.3, 4.0
+_WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
+_LEAST = 1e-9
+_WHOLE = 1e-9
+_MARGIN = 40  # samples beside a cycle: more than interpolation reads, and corrected pulses move
+_LINEAR = angle_law('linear')
+_COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
+#: Of a fitted ripple, in parts of that of noise of unit power over a cycle.
+RIPPLE_VARIANCE = float(np.mean(1.0 / (1.0 / 30.0 - (1.0 + _COSINE) / (24.0 * (2.0 + _COSINE)))))
+
+
+@dataclass(frozen=True)
+class CycleReader:
+    """Reads trigger cycles of a recording, `samples` (sample, channel) from `start_time` on."""
+
+    samples: FloatArray
+    start_time: float
+    rate: float
+    method: str
+
+    def inside(self, times: FloatArray) -> bool:
+        """Tell whether cycles between these pulses can be read."""
+        reach = margin(self.method) + 1
+        position = (times[[0, -1]] - self.start_time) * self.rate
+        return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
+
+    def cycles(self, pulses: FloatArray, *, law: AngleLaw = _LINEAR,
+               ripple: FloatArray | None = None) -> list[CycleSamples]:
+        """
+        Return the trigger cycles between pulses.
+
+        `pulses` are those of the cycles and all that the `law` reads beside them; `ripple` is that
+        of the speed in each cycle (s).
+        """
+        position = (pulses - self.start_time) * self.rate
+        found = []
+        for k, first in enumerate(range(law.before, len(pulses) - 1 - law.after)):
+            low = max(int(position[first]) - _MARGIN, 0)
+            part = self.samples[low:int(position[first + 1]) + _MARGIN + 2]
+            found.append(CycleSamples(
+                part, self.start_time, self.rate, pulses, first, lead=low / self.rate,
+                ripple=0.0 if ripple is None else float(ripple[k])))
+        return found
+
+    def grid(self, cycles: Sequence[CycleSamples], points: int, law: AngleLaw = _LINEAR
+             ) -> FloatArray:
+        """Return the samples (cycle, point, channel) of cycles at even steps of angle."""
+        u = np.arange(points) / points
+        return np.stack([cycle.at(law, u, method=self.method) for cycle in cycles])
+
+    def average(self, cycles: Sequence[CycleSamples], model: DeclaredModel, orders: FloatArray,
+                law: AngleLaw = _LINEAR) -> Average:
+        """Return the synchronous average of cycles, begun at angle 0."""
+        shaft = ShaftAverager(AverageSettings(
+            cycle_length=model.cycle_length, trigger_cycles=len(cycles),
+            orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
+            revolutions_per_trigger=model.trigger_revolutions))
+        averages = [shaft.update(cycle) for cycle in cycles]
+        assert averages[-1] is not None
+        return averages[-1]
+
+
+def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...],
+            *, with_ripple: bool, also: ArrayLike = ()) -> PulseErrorRecovery:
+    """
+    Recover pulse errors from the channels `rows`, of the declared size or larger.
+
+    Of declared and integer orders, and those in `also`.
+    """
+    periods = np.diff(pulses)
+    points = grid_points(float(periods.max()), reader.rate)
+    grid = reader.grid(reader.cycles(pulses), points)[:, :, list(rows)]
+    declared = max(float(np.sqrt(model.distribution.variance)), _LEAST)
+
+    def attempt(expected: float) -> PulseErrorRecovery:
+        return recover_pulse_errors(
+            grid, periods=periods, cycle_length=model.cycle_length,
+            also=(*model.orders, *np.ravel(also)),
+            declared_standard_deviation=expected * declared, with_ripple=with_ripple)
+
+    found = attempt(1.0)
+    if found.accepted and found.errors.std() < _SUSPICIOUS * declared:
+        return found
+    wider = attempt(_WIDER)
+    if not found.accepted:
+        return wider if _stands_out(wider) else found
+    if wider.accepted and _strength(wider) > _strength(found):
+        return wider
+    return found
+
+
+def _stands_out(recovery: PulseErrorRecovery) -> bool:
+    """Tell whether the errors themselves, not only those expected, exceed their standard error."""
+    power = float(np.mean(recovery.standard_errors**2))
+    return recovery.accepted and power < _WORTHWHILE**2 * (float(recovery.errors.var()) - power)
+
+
+def _strength(recovery: PulseErrorRecovery) -> float:
+    """Return how much power of how high an order the recovered errors bring back."""
+    return float(np.sum((recovery.orders * np.abs(recovery.amplitudes)) ** 2))
+
+
+def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
+    """
+    Return the standard error of the ripple (s) that the noise of the recovered orders leaves.
+
+    Ripples and pulse errors are fitted jointly, of all cycles: at the frequency w (per cycle)
+    u (1 - u) keeps 1/30 - (1 + cos w) / (24 (2 + cos w)) in mean square beyond what straight
+    lines between the pulses follow.
+    """
+    with np.errstate(divide='ignore', invalid='ignore'):
+        signal = (2.0 * np.pi * recovery.orders * np.abs(recovery.amplitudes)) ** 2
+        information = np.nansum(2.0 * signal / recovery.noise**2) / RIPPLE_VARIANCE
+    cycles = 1.0 / np.sqrt(information) if information > 0.0 else float('inf')
+    return float(cycles / model.fundamental_frequency)
+
+
+def kept_apart(ratio: float, orders: FloatArray) -> bool:
+    """Tell whether all orders are lines of a trigger cycle of `ratio` fundamental cycles."""
+    return bool(np.all(np.abs(ratio * orders - np.rint(ratio * orders)) < _WHOLE))

@@ -1,0 +1,132 @@
+"""
+Dependence: how the residual moves with order, speed, frequency and number of averaged cycles.
+
+A prediction that is right on the average may be wrong in how it goes with these: another effect
+has then been fitted to the size of the true one. All is of held-out acquisitions.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects import Effect
+from sa_jitter_ros.effects.effect import mean_period
+from sa_jitter_ros.effects.evidence import Finding, SAME_SPEED
+from sa_jitter_ros.inference.residual import ACCURACY
+from sa_jitter_ros.inference.scoring import Bench, Comparison
+from scipy import stats
+
+Array = NDArray[Any]
+
+#: A change of the residual with a smaller p value is no chance; there are up to four.
+CERTAIN = 1e-3
+_NEARLY_ALL = 0.8
+_FREEDOM = 3
+# What predictions of the same lines at the same speed may be wrong by against each other.
+_ALIKE = 1e-3
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """
+    How much the residual of the attenuation changes `on` something from its `low` to `high` end.
+
+    `change` in parts of an amplitude with its `standard_error`, which holds what the parameters of
+    effects are uncertain by, and the chance `p_value` of as much.
+    """
+
+    on: str
+    unit: str
+    low: float
+    high: float
+    change: float
+    standard_error: float
+    p_value: float
+
+    def __str__(self) -> str:
+        """Return how much changes with what."""
+        name = self.on.replace('_', ' ')
+        unit = f' {self.unit}' if self.unit else ''
+        return (f'what is left changes by {self.change:+.4f} from {name} {self.low:.4g} to '
+                f'{self.high:.4g}{unit} (p = {self.p_value:.2g})')
+
+
+def moving(found: Sequence[Dependence]) -> Dependence | None:
+    """Return the clearest change that is no chance, None where there is none."""
+    certain = [item for item in found if item.p_value < CERTAIN]
+    return min(certain, key=lambda item: item.p_value) if certain else None
+
+
+def still_moving(before: Sequence[Dependence], after: Sequence[Dependence]) -> Dependence | None:
+    """Return the clearest change that an effect leaves nearly all of, None where there is none."""
+    old = {item.on: abs(item.change) for item in before}
+    return moving([item for item in after if abs(item.change) > _NEARLY_ALL * old[item.on]])
+
+
+def dependences(bench: Bench, effects: Sequence[Effect], findings: Sequence[Finding]
+                ) -> tuple[Dependence, ...]:
+    """Return on what the residual with `effects` may depend: all that differs in the data."""
+    whole = bench.compare(effects, findings)
+    weights = 1.0 / (np.mean(whole.scale**2, axis=0) + ACCURACY**2)
+    orders = bench.observation.orders[bench.lines.order]
+    items = [bench.observation.acquisitions[a] for a in bench.held_out]
+    speeds = bench.observation.model.cycle_length / np.array([
+        mean_period(item.times, item.missing) for item in items])
+    found = []
+    if np.ptp(orders) > 0.0:
+        found.append(_over_lines(whole, weights, orders))
+    if len(items) > 1 + _FREEDOM and np.std(speeds) > SAME_SPEED * np.mean(speeds):
+        found += [_over_acquisitions(on, whole, weights, shape, speeds) for on, shape in (
+            ('speed', np.ones(orders.size)), ('frequency', orders))]
+    if bench.fewer is not None:
+        counts = np.array([item.observation.model.trigger_cycles for item in (bench.fewer, bench)])
+        found.append(_over_cycles(whole, bench.fewer.compare(effects, findings), weights, counts))
+    return tuple(found)
+
+
+def _over_lines(whole: Comparison, weights: Array, orders: Array) -> Dependence:
+    """Return the slope over orders, from line to line."""
+    away = orders - np.average(orders, weights=weights)
+    across = weights * away / np.sum(weights * away**2) * np.ptp(orders)
+    return _judged('order', '', orders, whole, across, np.ones(len(whole.scale)))
+
+
+def _over_acquisitions(on: str, whole: Comparison, weights: Array, shape: Array, speeds: Array
+                       ) -> Dependence:
+    """Return the slope over speeds; `shape` (line,) is how much of it each line has."""
+    across = weights * shape / np.sum(weights * shape**2) * shape.max()
+    away = speeds - speeds.mean()
+    return _judged(on, 'Hz', speeds * shape.max(), whole, across,
+                   away / np.mean(away**2) * np.ptp(speeds))
+
+
+def _over_cycles(whole: Comparison, fewer: Comparison, weights: Array, counts: Array
+                 ) -> Dependence:
+    """Return the change from averages of few cycles to those of all."""
+    def less(one: Array, other: Array) -> Array:
+        return np.asarray(one - other.reshape(len(one), -1, one.shape[1]).mean(axis=1))
+
+    both = Comparison(less(whole.difference, fewer.difference), whole.scale, tuple(
+        less(one, other) for one, other in zip(whole.moved, fewer.moved)))
+    return _judged('trigger_cycles', '', counts, both, weights / weights.sum(),
+                   np.ones(len(whole.scale)), accuracy=_ALIKE)
+
+
+def _judged(on: str, unit: str, values: Array, comparison: Comparison, across: Array,
+            along: Array, *, accuracy: float = ACCURACY) -> Dependence:
+    """Judge a sum over lines, weighted by `across`, and its mean over acquisitions by `along`."""
+    each = comparison.difference @ across
+    count = len(each)
+    change = float(np.mean(along * each))
+    away = each - each.mean()
+    away = away - np.mean(along * away) / np.mean(along**2) * along
+    freedom = count - 1 - bool(np.ptp(along))
+    spread = np.sqrt(np.sum((along * away) ** 2) / max(freedom, 1) / count)
+    moved = [np.mean(along * (item @ across)) for item in comparison.moved]
+    error = float(np.sqrt(spread**2 + np.sum(np.square(moved))))
+    total = np.hypot(error, accuracy)
+    chance = 2.0 * stats.t.sf(abs(change) / total, freedom) if freedom >= _FREEDOM else 1.0
+    return Dependence(on, unit, float(values.min()), float(values.max()), change, error,
+                      float(chance))

@@ -1,0 +1,269 @@
+"""Gathering: the evidence that effects look at, from the acquisitions that a fit may use."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.noise import radial_noise
+from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
+from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
+from sa_jitter_ros.effects.lattice import (
+    Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.inference.beat import find_beat
+from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
+from sa_jitter_ros.inference.tone import find_tone
+from sa_jitter_ros.prediction.with_effects import known_errors
+from sa_jitter_ros.recordings.recording import Recording
+from scipy import stats
+
+Array = NDArray[Any]
+
+_STRONG, _COHERENT = 0.2, 0.9
+_PRECISE = 0.25
+_CERTAIN = 1e-4
+_GROUPS = 3
+# A clock this much faster than the declared one is no cause of anything.
+_FINE = 50.0
+
+
+def choose_lines(observation: Observation) -> Lines:
+    """
+    Return the lines worth comparing.
+
+    They have at least 20 % of their order's strongest channel and a coherence from cycle to cycle
+    of 0.9 times that of the best line, which noise and modulation lower too. Raises SignalError
+    where there is none.
+    """
+    orders = observation.orders.size
+    cycles = _cycles(observation)
+    level = np.abs(observation.stacked('corrected')[..., :orders]).mean(axis=0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
+            np.abs(cycles) ** 2, axis=(0, 1))
+    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (
+        coherence > CHANCE / cycles.shape[1])
+    if good.any():
+        good &= coherence >= _COHERENT * coherence[good].max()
+    channel, order = np.nonzero(good)
+    if channel.size == 0:
+        raise SignalError(
+            f'no declared order ({", ".join(f"{g:g}" for g in observation.orders)}) is coherent '
+            'from cycle to cycle on any channel: declare orders that the vibration holds')
+    return Lines(channel, order)
+
+
+def channel_groups(observation: Observation) -> Array:
+    """
+    Return groups of channels (channel,), each of which can be predicted by the others.
+
+    The channels that tell most of the pulse errors are dealt out to the groups one by one.
+    """
+    corrected = np.abs(observation.stacked('corrected'))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        told = np.nanmean(observation.sources * corrected / observation.stacked('noise'), axis=0)
+    information = np.nansum(told**2, axis=1)
+    rank = np.argsort(np.argsort(-information))
+    return np.asarray(rank % min(_GROUPS, rank.size))
+
+
+def gather_pulses(recording: Recording, observation: Observation, group: Array
+                  ) -> tuple[Clock, Sequence[Sequence[Pulses]]]:
+    """
+    Return the clock and what is known of the pulses.
+
+    On a grid, the errors are those of the smoothest motion that it allows; where other channels
+    recover the motion better than a quarter of a tick, those of that motion. Pulses that the angle
+    law reads beside those of an acquisition are there, too.
+    """
+    model, pulses = observation.model, observation.pulses
+    found = find_clock(pulses.times)
+    clock = found.rate
+    usable = 0.0 < clock < _FINE * model.keyphasor_rate
+    smooth = smooth_on_grid(pulses.times, clock) if usable else None
+    again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
+    if usable and group.max() > 0:
+        again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
+                 for i in range(int(group.max()) + 1)]
+    again = [None if motion is None or smooth is None else _unskewed(observation, motion, smooth)
+             for motion in again]
+    spread = [motion for motion in again if motion is not None]
+    error_std = [0.0 if motion is None else _uncertainty(observation, motion, spread)
+                 for motion in again]
+    missed = (0.0, 0.0) if smooth is None else _missed(observation, smooth, clock)
+    known = []
+    for a, item in enumerate(observation.acquisitions):
+        start = item.first - model.weights.before
+        read = slice(start, item.first + item.times.size + model.weights.after)
+        own = slice(model.weights.before, model.weights.before + item.times.size)
+        grid = None if smooth is None else smooth[read]
+        first = int(pulses.number[start])
+        rows = []
+        for motion, uncertain in zip(again, error_std):
+            errors, std, unknown = grid, 0.0, missed
+            precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
+            if grid is not None and motion is not None and precise and np.all(
+                    np.isfinite(motion[a])):
+                errors, std, unknown = grid.copy(), uncertain, (0.0, 0.0)
+                errors[own] = on_grid(motion[a], clock)
+            rows.append(Pulses(pulses.times[read], first, errors,
+                               pulses.missing[read.start:read.stop - 1], std, *unknown))
+        known.append(rows)
+    return (found if usable else Clock(0.0, 0.0)), known
+
+
+def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
+           pulses: Sequence[Sequence[Pulses]], clock: Clock, effects: Sequence[Effect],
+           scatter: LineEvidence) -> Evidence:
+    """Return the evidence of the `chosen` acquisitions, less what `effects` explain."""
+    model = observation.model
+    picked = [observation.acquisitions[a] for a in chosen]
+    usable = [a for a, item in zip(chosen, picked) if np.all(np.isfinite(item.errors))]
+    if len(usable) < 2:
+        raise SignalError('the pulse errors cannot be recovered from the vibration: '
+                          f'{picked[0].reason}; give reference_pulse_times or stronger orders')
+    errors, own = [], []
+    for a in usable:
+        item, read = observation.acquisitions[a], pulses[a][0]
+        if len(read.times) > item.times.size:
+            read = read.without(model.weights.before, model.weights.after)
+        own.append(read)
+        known = known_errors(model, effects, read)
+        left = item.errors if known is None else item.errors - _without_gaps(
+            known, item.missing, item.times)
+        errors.append(left - left.mean())
+    items = [observation.acquisitions[a] for a in usable]
+    standard_errors = np.array([item.standard_errors for item in items])
+    if observation.against_reference:
+        standard_errors = np.zeros_like(standard_errors)
+    ripple = np.array([item.ripple for item in items])
+    resolved = [item.ripple_standard_error**2 for item in items
+                if np.isfinite(item.ripple_standard_error)]
+    return Evidence(
+        model=model, pulses=tuple(own), errors=np.array(errors),
+        standard_errors=standard_errors, ripple=ripple,
+        ripple_standard_error=float(np.sqrt(np.mean(resolved))) if resolved else float('nan'),
+        against_reference=observation.against_reference,
+        record_times=observation.pulses.times, record_missing=observation.pulses.missing,
+        clock=clock, explained=tuple(effects),
+        lines=replace(scatter, radial=scatter.radial[list(usable)],
+                      noise_density=scatter.noise_density[list(usable)]))
+
+
+def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
+    """Return how the amplitudes of the lines scatter, of all acquisitions."""
+    model = observation.model
+    cycles = lines.of(_cycles(observation))
+    shortest = cycles.shape[1]
+    mean = cycles.mean(axis=1, keepdims=True)
+    level = np.abs(mean).mean(axis=(0, 1))
+    along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
+    noises = np.array([radial_noise(row) for row in cycles])
+    noise = np.sqrt(np.mean(noises**2, axis=0))
+    floor = lines.of(observation.stacked('noise_floor'))
+    density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
+    evidence = LineEvidence(
+        order=observation.orders[lines.order], channel=lines.channel, level=level,
+        noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
+    # What changes from acquisition to acquisition is the machine's own.
+    steady = along - along.mean(axis=1, keepdims=True)
+    beat = find_beat(steady.reshape(-1, along.shape[2]), evidence.order
+                     * model.fundamental_frequency / observation.sample_rate)
+    evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
+                       beat_gain=beat.gain)
+    times, angle = _middles(observation, shortest)
+    return replace(evidence, tone=find_tone(cycles[:len(times)], times, angle, evidence.order))
+
+
+def _cycles(observation: Observation) -> Array:
+    """Return corrected amplitudes (acquisition, cycle, channel, order) of cycles that all have."""
+    shortest = min(len(item.cycles) for item in observation.acquisitions)
+    return np.array([item.cycles[:shortest, :, :observation.orders.size]
+                     for item in observation.acquisitions])
+
+
+def _middles(observation: Observation, cycles: int) -> tuple[Array, Array]:
+    """
+    Return time (s) and fundamental cycles (acquisition, cycle) of the middles of the cycles.
+
+    Of several recordings, whose times do not go together, those of the first.
+    """
+    times, places = [], []
+    number = observation.pulses.number
+    for i, item in enumerate(observation.acquisitions):
+        if i and item.first <= observation.acquisitions[i - 1].first:
+            break
+        errors = np.where(np.isfinite(item.errors), item.errors, 0.0)
+        true = item.bridged - np.interp(np.arange(item.bridged.size), item.number, errors)
+        times.append(0.5 * (true[:-1] + true[1:])[:cycles])
+        places.append(number[item.first] + 0.5 + np.arange(cycles))
+    return np.array(times), np.array(places) * observation.model.cycle_length
+
+
+def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:
+    """
+    Return how uncertain recovered errors (acquisition, pulse) are, in s.
+
+    Against a better keyphasor, what they differ from it by, its own errors included. Else the
+    delete-a-group jackknife: recoveries that leave out one group of channels each share the rest.
+    """
+    if observation.against_reference:
+        apart = motion - observation.stacked('errors')
+        variance = np.var(apart, axis=1, ddof=1)
+    else:
+        variance = (len(others) - 1) * np.var(others, axis=0, ddof=min(1, len(others) - 1))
+    variance = variance[np.isfinite(variance)]
+    return float(np.sqrt(variance.mean())) if variance.size else 0.0
+
+
+def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[float, float]:
+    """
+    Return what the smoothest motion on a grid misses: size in s and correlation of neighbours.
+
+    It is 0 where more than the ticks errs.
+    """
+    usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
+    if not usable:
+        return 0.0, 0.0
+    errors = np.array([item.errors for item in usable])
+    error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
+        [item.standard_errors**2 for item in usable])))
+    if not ticks_leave_room(errors, np.array(error), clock):
+        return 0.0, 0.0
+    missed = errors - _of_acquisitions(smooth, usable)
+    missed -= missed.mean(axis=1, keepdims=True)
+    variance = float(np.mean(missed.var(axis=1, ddof=1))) - error**2
+    if variance <= 0.0:
+        return 0.0, 0.0
+    together = float(np.mean(missed[:, 1:] * missed[:, :-1])) / variance
+    return float(np.sqrt(variance)), float(np.clip(together, 0.0, 0.95))
+
+
+def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
+    """Return (acquisition, pulse) of values of all pulses of a record."""
+    return np.array([values[item.first:item.first + item.times.size] for item in items])
+
+
+def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
+    """Return recovered errors (acquisition, pulse) less a slope over time that no grid makes."""
+    items = observation.acquisitions
+    grid = _of_acquisitions(smooth, items)
+    times = np.array([item.times - item.times.mean() for item in items])
+    left = motion - grid
+    slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(
+        times**2, axis=1)
+    slopes = slopes[np.isfinite(slopes)]
+    if slopes.size < 4 or stats.ttest_1samp(slopes, 0.0).pvalue > _CERTAIN:
+        return motion
+    return np.asarray(motion - float(np.median(slopes)) * times)
+
+
+def _without_gaps(known: Array, missing: Array, times: Array) -> Array:
+    """Return known errors less those of missing pulses, which the recovery repairs itself."""
+    if not missing.any():
+        return known
+    period = mean_period(times, missing)
+    return np.asarray(known - period * np.concatenate(([0.0], np.cumsum(missing))))

@@ -1,0 +1,324 @@
+"""
+Observation: what each acquisition of a recording shows of the attenuation of its lines.
+
+An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses
+by the declared angle law; its corrected ones from the better keyphasor, by the same law, where
+there is one, else from pulses whose errors were recovered from the vibration. The attenuation is
+raw over corrected amplitude: what noise, modulation and interpolation do to both cancels in it.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.cycle import grid_points
+from sa_jitter_ros.averaging.noise import noise_floor, without_leakage
+from sa_jitter_ros.effects.effect import mean_period
+from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
+from sa_jitter_ros.inference.cycle_reader import CycleReader, recover, ripple_error
+from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
+from sa_jitter_ros.inference.undeclared_orders import undeclared_orders
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw
+from sa_jitter_ros.recordings.recording import Recording
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+Progress = Callable[[float], None]
+
+MOST_SAMPLES = 200_000_000
+#: Lines are coherent from cycle to cycle by more than this many times the coherence of noise.
+CHANCE = 4
+_OTHER_MACHINE = 5.0
+# Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
+_TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
+_FULL_BAND = 0.45  # of the sample rate
+# A ripple of this many times its noise in power is taken out of the corrected average.
+_RIPPLE = 3.0
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """
+    One acquisition: N_t consecutive trigger cycles from trigger pulse `first` of the record on.
+
+    `times` (N_t + 1,) and `errors`, `standard_errors` (s) of its measured pulses, errors measured
+    minus true with mean 0 (NaN where nothing was recovered). `missing` (N_t,) pulses lack in each
+    cycle; `bridged` are the times with those put in. `raw` and `corrected` (channel, order)
+    are complex peak amplitudes; `cycles` (cycle, channel, order) the corrected ones of each cycle
+    at hand; `noise` (channel, order) the standard deviation of an amplitude along its radius,
+    `noise_floor` what of it the spectrum around the order makes.
+    `ripple` (cycle,) is the factor of u (1 - u) in the error inside a cycle (s).
+    """
+
+    first: int
+    times: FloatArray
+    missing: NDArray[np.int64]
+    bridged: FloatArray
+    errors: FloatArray
+    standard_errors: FloatArray
+    raw_cycles: ComplexArray
+    cycles: ComplexArray
+    noise: FloatArray
+    noise_floor: FloatArray
+    ripple: FloatArray
+    ripple_standard_error: float
+    recovered: bool
+    reason: str
+
+    @property
+    def number(self) -> NDArray[np.int64]:
+        """Return where its measured pulses are among the bridged ones."""
+        return numbered(self.missing)
+
+    @cached_property
+    def raw(self) -> ComplexArray:
+        """Return the raw complex peak amplitudes (channel, order)."""
+        return np.asarray(self.raw_cycles.mean(axis=0))
+
+    @cached_property
+    def corrected(self) -> ComplexArray:
+        """Return the corrected complex peak amplitudes (channel, order)."""
+        return np.asarray(self.cycles.mean(axis=0))
+
+    @property
+    def attenuation(self) -> FloatArray:
+        """Return raw over corrected amplitude (channel, order)."""
+        with np.errstate(divide='ignore', invalid='ignore'):
+            return np.asarray(np.abs(self.raw) / np.abs(self.corrected))
+
+    @property
+    def attenuation_standard_error(self) -> FloatArray:
+        """Return its standard error; the noise of both amplitudes is correlated by it."""
+        with np.errstate(divide='ignore', invalid='ignore'):
+            share = np.sqrt(np.clip(1.0 - self.attenuation**2, 0.0, 1.0))
+            return np.asarray(self.noise / np.abs(self.corrected) * share)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """
+    All acquisitions of one recording; `orders` as declared, `sources` those that may leak in.
+
+    The amplitudes of an acquisition are those of `sources`, of which the first `len(orders)` are
+    the declared orders. The trigger_speed of `model` is the measured mean, which fits and
+    predictions share; `declared_speed` (Hz) is what was declared.
+    """
+
+    model: DeclaredModel
+    acquisitions: tuple[Acquisition, ...]
+    orders: FloatArray
+    sources: FloatArray
+    channel_names: tuple[str, ...]
+    pulses: RecordPulses
+    sample_rate: float
+    against_reference: bool
+    declared_speed: float
+    name: str = ''
+
+    def stacked(self, field: str) -> NDArray[Any]:
+        """Return one field of all acquisitions as an array."""
+        return np.array([getattr(item, field) for item in self.acquisitions])
+
+
+def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 'band_limited',
+            sources: Sequence[float] = (), progress: Progress | None = None) -> Observation:
+    """
+    Observe a recording's acquisitions.
+
+    `sources` are the declared orders and after them others that may leak; without it they are
+    looked for. A better keyphasor is left aside where the vibration itself moves against it, or
+    inside its cycles, so much that its own average loses amplitude.
+    Raises RecordingError where there is no whole acquisition or the better keyphasor is a worse
+    one, ModelError where the declared model does not fit the recording, SignalError where nothing
+    is there to compare with.
+    """
+    if recording.samples * recording.channels > MOST_SAMPLES:
+        raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
+                             f'most {MOST_SAMPLES} values fit; cut the recording')
+    if model.trigger_cycles <= CHANCE:
+        raise ModelError(f'trigger_cycles is {model.trigger_cycles}: whether a line is coherent '
+                         f'from cycle to cycle takes at least {CHANCE + 1}; raise trigger_cycles')
+    if model.sample_rate and abs(recording.sample_rate / model.sample_rate - 1.0) > 1e-3:
+        raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
+                         f'has {recording.sample_rate:g} Hz')
+    once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each leaks into others only
+    pulses, declared_speed = record_pulses(recording, model), model.trigger_speed
+    speed = model.trigger_revolutions / mean_period(pulses.times, pulses.missing)
+    model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
+    samples = np.ascontiguousarray(recording.read().T)
+    if not np.all(np.isfinite(samples)):
+        raise RecordingError('vibration holds NaN or infinity: cut the recording at its gaps')
+    samples -= samples.mean(axis=0)
+    reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
+    starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
+    if not starts:
+        raise RecordingError(
+            f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
+            'trigger cycles inside the vibration: lower trigger_cycles or record longer'
+            + ''.join(f' ({remark})' for remark in pulses.remarks))
+    rows = tuple(range(samples.shape[1]))
+    orders = np.array(sources if len(sources) else [
+        *once, *undeclared_orders(reader, pulses, model, starts, rows)])
+    if pulses.reference is not None and not _reference_serves(
+            reader, pulses, model, starts, np.array(once), rows):
+        pulses = replace(pulses, reference=None)
+    found = []
+    for count, first in enumerate(starts):
+        found.append(_acquire(reader, pulses, model, first, orders, rows))
+        if progress is not None:
+            progress((count + 1) / len(starts))
+    if pulses.reference is None:
+        reason = found[0].reason
+        found = [item for item in found if item.recovered]
+        if not found:
+            raise SignalError('the pulse errors cannot be recovered from the vibration: '
+                              f'{reason}; give reference_pulse_times or orders above the noise')
+    return Observation(
+        model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
+        recording.sample_rate, pulses.reference is not None, declared_speed,
+        recording.description)
+
+
+def together(observations: Sequence[Observation]) -> Observation:
+    """
+    Return the acquisitions of several recordings of one machine as one observation.
+
+    Raises ModelError for recordings of different machines: other channels, rate or amplitudes.
+    """
+    first = observations[0]
+    level = np.abs(first.stacked('corrected')).mean(axis=0)
+    for other in observations[1:]:
+        same = (other.sample_rate == first.sample_rate
+                and other.against_reference == first.against_reference
+                and len(other.channel_names) == len(first.channel_names))
+        if not same:
+            raise ModelError(f'recordings {first.name!r} and {other.name!r} differ in sample '
+                             'rate, channels or reference keyphasor: run the loop on each alone')
+        ratio = np.abs(other.stacked('corrected')).mean(axis=0) / level
+        strong = level > 0.2 * level.max()
+        if not np.all((ratio[strong] > 1.0 / _OTHER_MACHINE) & (ratio[strong] < _OTHER_MACHINE)):
+            raise ModelError(f'recordings {first.name!r} and {other.name!r} have amplitudes that '
+                             f'differ more than {_OTHER_MACHINE:g}-fold: these are different '
+                             'machines or loads; run the loop on each by itself')
+    pulses = RecordPulses(
+        **{name: np.concatenate([getattr(item.pulses, name) for item in observations])
+           for name in ('times', 'missing', 'starts_run', 'doubtful', 'bridged')},
+        remarks=tuple(f'{item.name or "a recording"}: {remark}' for item in observations
+                      for remark in item.pulses.remarks))
+    if len(observations) == 1:
+        return first
+    speed = np.average([item.model.trigger_speed for item in observations],
+                       weights=[len(item.acquisitions) for item in observations])
+    return replace(first, model=replace(first.model, trigger_speed=float(speed)), pulses=pulses,
+                   acquisitions=tuple(acquisition for item in observations
+                                      for acquisition in item.acquisitions))
+
+
+def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]
+                    ) -> FloatArray:
+    """Return pulse errors (acquisition, N_t + 1) that only some channels tell, NaN where none."""
+    samples = np.ascontiguousarray(recording.read().T)
+    reader = CycleReader(samples - samples.mean(axis=0), recording.start_time,
+                         recording.sample_rate, 'band_limited')
+    rows = tuple(channels)
+    errors = []
+    for item in observation.acquisitions:
+        recovery = recover(reader, item.bridged, observation.model, rows, with_ripple=False,
+                           also=observation.sources)
+        errors.append(recovery.errors[item.number] if recovery.accepted
+                      else np.full(item.times.size, np.nan))
+    return np.array(errors)
+
+
+def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
+    """Return the first pulse of every acquisition whose vibration and pulses can be believed."""
+    times, number = pulses.times, pulses.number
+    found, first = [], law.before
+    while first + cycles + law.after < times.size:
+        part = slice(first, first + cycles + 1)
+        read = slice(first - law.before, first + cycles + 1 + law.after)
+        whole = (reader.inside(times[part]) and not pulses.doubtful[read].any()
+                 and not pulses.starts_run[read.start + 1:read.stop].any())
+        if whole and pulses.reference is not None:
+            better = pulses.reference[number[read.start]:number[read.stop - 1] + 1]
+            whole = bool(np.all(np.isfinite(better))) and reader.inside(
+                pulses.reference[[number[part.start], number[part.stop - 1]]])
+        if whole:
+            found.append(first)
+            first += cycles
+        else:
+            first += 1
+    return found
+
+
+def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel,
+                      starts: Sequence[int], orders: FloatArray, rows: tuple[int, ...]) -> bool:
+    """Tell, by a few acquisitions, whether the better keyphasor keeps the amplitudes."""
+    bare = replace(pulses, reference=None)
+    kept, gained = [], []
+    for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
+        item = _acquire(reader, pulses, model, first, orders, rows)
+        other = _acquire(reader, bare, model, first, orders, rows)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            best = other if other.recovered else item
+            clear = best.noise < _CLEAR * np.abs(best.corrected)
+            gained.append(np.where(clear, item.attenuation, np.nan))
+            if other.recovered:
+                kept.append(np.where(clear, np.abs(item.corrected) / np.abs(other.corrected),
+                                     np.nan))
+    gain = np.median(gained, axis=0)
+    if np.any(gain > 1.0 + _LOSS):
+        raise RecordingError(
+            f'reference_pulse_times keep less amplitude than pulse_times (raw over reference '
+            f'amplitude {np.nanmax(gain):.3f}): the reference keyphasor is the worse one; give '
+            'the better one or none')
+    return not kept or not bool(np.any(np.median(kept, axis=0) < 1.0 - _LOSS))
+
+
+def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, first: int,
+             sources: FloatArray, rows: tuple[int, ...]) -> Acquisition:
+    count = model.trigger_cycles
+    times = pulses.times[first:first + count + 1]
+    missing = pulses.missing[first:first + count]
+    here = slice(pulses.number[first], pulses.number[first + count] + 1)
+    fixed, keep = pulses.bridged[here], numbered(missing)
+    recovery = recover(reader, fixed, model, rows, with_ripple=True, also=sources)
+    with_ripple = recovery.accepted and not missing.any()
+    if not recovery.accepted:
+        recovery = recover(reader, fixed, model, rows, with_ripple=False, also=sources)
+    errors = np.full(times.size, np.nan)
+    standard_errors, ripple = errors.copy(), np.full(count, np.nan)
+    bend_error = float('nan')
+    better: FloatArray = fixed
+    if recovery.accepted:
+        errors, standard_errors = recovery.errors[keep], recovery.standard_errors[keep]
+        if with_ripple:
+            ripple, bend_error = recovery.ripple, ripple_error(recovery, model)
+        better = fixed - recovery.errors
+    law = angle_law(model.angle_law)
+    near = slice(first - law.before, first + count + 1 + law.after)
+    clean_law = angle_law('linear')  # whose error in a cycle the recovery knows
+    if pulses.reference is not None:
+        clean_law = law
+        better = pulses.reference[here.start - law.before:here.stop + law.after]
+        errors = times - pulses.reference[here][keep]
+    errors = errors - errors.mean()
+    clear = with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2
+    bend = ripple if pulses.reference is None and clear else None
+    raw = reader.average(reader.cycles(pulses.times[near], law=law), model, sources, law)
+    cycles = reader.cycles(better, law=clean_law, ripple=bend)
+    corrected = reader.average(cycles, model, sources, clean_law)
+    clean = without_leakage(
+        corrected.cycle_amplitudes, tuple(sources.tolist()), model.cycle_length,
+        model.cycle_length * np.arange(len(cycles)))
+    points = grid_points(float(np.diff(fixed).max()), reader.rate)
+    floor = noise_floor(reader.grid(cycles, points, clean_law), model.cycle_length,
+                        sources[:len(model.orders)],
+                        _FULL_BAND * reader.rate / model.fundamental_frequency)
+    return Acquisition(
+        first, times, missing, fixed, errors, standard_errors, raw.cycle_amplitudes, clean,
+        corrected.noise, floor, ripple, bend_error, recovery.accepted, recovery.reason)

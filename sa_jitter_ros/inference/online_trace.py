@@ -1,0 +1,177 @@
+"""
+The trace on line: which effect makes the residual of averages that came over topics.
+
+Averages carry one amplitude per order and channel, not those of single trigger cycles, and pulse
+errors without a ripple between them. Effects that only those show cannot be told here; the loop
+off line can tell them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.evidence import LineEvidence
+from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
+from sa_jitter_ros.errors import ModelError, SignalError
+from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
+from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.inference.scoring import Bench
+from sa_jitter_ros.inference.trace import require_acquisitions, Trace, trace_bench
+from sa_jitter_ros.prediction.moments import noise_line_variance
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+
+Array = NDArray[Any]
+
+# A clock this much faster than the declared one is no cause of anything.
+_FINE = 50.0
+# Correlation with the errors of a grid, and their span in ticks, by which a grid makes the errors.
+_FOLLOWS, _ONE_TICK = 0.5, 1.1
+_DECIDER = 'close_loop on a recording, which sees inside the trigger cycles,'
+_REASON = 'the topics do not carry {}: run close_loop on a recording'
+UNTOLD = {
+    'speed_fluctuation': _REASON.format('the angle error inside the trigger cycles'),
+    'interpolation_loss': _REASON.format('the samples'),
+    'additive_noise': _REASON.format('the amplitudes of single trigger cycles'),
+    'amplitude_modulation': _REASON.format('the amplitudes of single trigger cycles'),
+    'interfering_tone': _REASON.format('the amplitudes of single trigger cycles')}
+
+
+@dataclass(frozen=True)
+class MeasuredNoise(Effect):
+    """The noise that the averages themselves report, `variance` (order,) of a peak amplitude."""
+
+    name: ClassVar[str] = 'measured_noise'
+    summary: ClassVar[str] = 'noise that the averages report'
+    scatters: ClassVar[bool] = True
+    variance: tuple[float, ...]
+
+    def line_variance(self, model: DeclaredModel) -> Array:
+        """Return the variance of each order."""
+        return np.array(self.variance)
+
+
+def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
+                   declared: Sequence[Effect] = (),
+                   progress: Callable[[str], None] | None = None) -> Trace:
+    """
+    Trace the residual of averages, those of the longest stretch without a gap.
+
+    Raises ModelError for fewer than 4 of them and SignalError where nothing can be compared.
+    """
+    stretch = _longest_stretch(averages)
+    observation = _observation(stretch, model)
+    require_acquisitions(observation)
+    lines = Lines(*np.nonzero(
+        good_lines(stretch, places(observation.orders, stretch[0].orders))))
+    count = len(stretch)
+    fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
+    clock, pulses = _pulses(observation)
+    level = lines.of(np.abs(observation.stacked('corrected'))[list(fit)].mean(axis=0))
+    found = trace_bench(Bench(
+        observation, lines, level, pulses, clock, np.ones(len(stretch[0].raw), int),
+        _scatter(observation, lines, level), fit, held_out,
+        (*declared, _measured_noise(observation, lines)), UNTOLD), progress=progress)
+    return replace(found, declared=tuple(declared), findings=tuple(
+        replace(item, rivals=(*item.rivals, 'speed_fluctuation'), decider=_DECIDER)
+        if item.name == 'phase_wander' else item for item in found.findings))
+
+
+def _longest_stretch(averages: Sequence[ReceivedAverage]) -> Sequence[ReceivedAverage]:
+    """Return the longest run of averages with pulse errors, each beginning where one ended."""
+    best: list[ReceivedAverage] = []
+    run: list[ReceivedAverage] = []
+    for item in averages:
+        if item.pulses is None:
+            run = []
+            continue
+        if run and abs(item.start_time - run[-1].end_time) > 1e-6:
+            run = []
+        run.append(item)
+        best = list(run) if len(run) > len(best) else best
+    if not best:
+        raise SignalError('no pulse errors came with the averages: set correct_jitter: true of '
+                          'the averager')
+    return best
+
+
+def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> Observation:
+    """Return the averages as the observation of a record that begins with their first pulse."""
+    measured = averages[0].orders
+    kept = [int(np.argmin(np.abs(measured - order))) for order in dict.fromkeys(model.orders)
+            if np.isclose(measured, order, rtol=1e-6).any()]
+    if not kept:
+        raise ModelError(f'averages have the orders {named(measured)}, none of which is declared')
+    count = averages[0].trigger_cycles
+    found, times = [], []
+    for number, item in enumerate(averages):
+        assert item.pulses is not None
+        when, errors, error = item.pulses.T
+        times.append(when if number == 0 else when[1:])
+        found.append(Acquisition(
+            first=number * count, times=when, missing=np.zeros(count, np.int64),
+            bridged=when, errors=errors - errors.mean(), standard_errors=error,
+            raw_cycles=item.raw[None][:, :, kept], cycles=item.corrected[None][:, :, kept],
+            noise=item.noise[:, kept], noise_floor=item.noise[:, kept],
+            ripple=np.full(count, np.nan), ripple_standard_error=math.inf, recovered=True,
+            reason=''))
+    speed = float(np.mean([item.trigger_speed for item in averages]))
+    orders = measured[kept]
+    record = np.concatenate(times)
+    return Observation(
+        replace(model, trigger_speed=speed, orders=tuple(orders.tolist())), tuple(found), orders,
+        orders, tuple(f'channel {k}' for k in range(len(averages[0].raw))),
+        RecordPulses.unbroken(record), model.sample_rate, False,
+        model.trigger_speed)
+
+
+def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
+    """
+    Return the clock of the pulse times and the pulses.
+
+    For each acquisition, what convicts the clock comes first: errors of the smoothest motion that
+    its grid allows. What predicts comes second: the recovered errors, where they follow the first
+    and do not span more than a tick, so that the grid is what makes them.
+    """
+    times = observation.pulses.times
+    items = observation.acquisitions
+    clock = find_clock(times)
+    if not 0.0 < clock.rate < _FINE * observation.model.keyphasor_rate:
+        return Clock(0.0, 0.0), [
+            2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
+    smooth = smooth_on_grid(times, clock.rate)
+    grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
+    seen = np.asarray(observation.stacked('errors'))
+    follow = np.corrcoef((grid - grid.mean(axis=1, keepdims=True)).ravel(), seen.ravel())[0, 1]
+    span = float(np.median(np.ptp(seen, axis=1))) * clock.rate
+    better = seen if follow > _FOLLOWS and span < _ONE_TICK else grid
+    return clock, [
+        [Pulses(item.times, item.first, errors, item.missing) for errors in pair]
+        for item, pair in zip(items, zip(grid, better))]
+
+
+def _measured_noise(observation: Observation, lines: Lines) -> MeasuredNoise:
+    """Return the noise of each order beyond the declared one, the mean over its channels."""
+    model = observation.model
+    power = 2.0 * np.mean(np.asarray(observation.stacked('noise')) ** 2, axis=0)
+    known = (noise_line_variance(model.noise_std, model.sample_rate, model.duration)
+             if model.noise_std else 0.0)
+    count = np.bincount(lines.order, minlength=observation.orders.size)
+    total = np.bincount(lines.order, lines.of(power), observation.orders.size)
+    return MeasuredNoise(tuple(
+        np.maximum(total / np.maximum(count, 1) - known, 0.0).tolist()))
+
+
+def _scatter(observation: Observation, lines: Lines, level: Array) -> LineEvidence:
+    """Return how the amplitudes of whole averages scatter."""
+    amplitude = lines.of(np.abs(observation.stacked('corrected')))
+    noise = np.sqrt(np.mean(lines.of(np.asarray(observation.stacked('noise'))) ** 2, axis=0))
+    return LineEvidence(
+        order=observation.orders[lines.order], channel=lines.channel, level=level,
+        noise_density=np.full(amplitude.shape, np.nan), radial=(amplitude / level - 1.0)[:, None],
+        radial_noise=noise / level)

@@ -1,0 +1,216 @@
+"""The trigger pulses of a whole recording, numbered over gaps, and those of a better keyphasor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
+from sa_jitter_ros.recordings.recording import Recording
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_SPEED_TOLERANCE = 0.1
+_MOST_SPURIOUS = 0.05
+# Marks of a target that nobody has declared may stand out of place by an eighth of an interval.
+_TOLERANCE = 0.3
+_FEWEST = 3
+_SAME_RATIO = 1e-5  # six digits, as people write them
+_SAME_RATE = 0.01
+# Pulses by which two keyphasors are aligned, and the share of the pulses that both must have.
+_ALIGNED, _COVERED = 15, 0.5
+_AS_MANY = 0.6  # of the pulses: a reference with fewer has one pulse a trigger cycle
+_LONGEST_GAP = 1_000_000  # pulses
+
+
+@dataclass(frozen=True)
+class RecordPulses:
+    """
+    Trigger pulses of a recording.
+
+    `times` (n,) in s are those that were measured; `missing` (n - 1,) is how many trigger pulses
+    lack in each interval. `starts_run` (n,): the number of trigger cycles since the pulse before
+    is not certain. `doubtful` (n,): a double pulse was dropped beside it, and it may be the double
+    itself. `bridged` and `reference` (m,), m = n + the missing ones, are the times with short gaps
+    filled and those of a better keyphasor, NaN where there is none; `reference` is None without
+    one. `remarks` say what was done to the pulses.
+    """
+
+    times: FloatArray
+    missing: IntArray
+    starts_run: BoolArray
+    doubtful: BoolArray
+    bridged: FloatArray
+    reference: FloatArray | None = None
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def unbroken(cls, times: FloatArray) -> 'RecordPulses':
+        """Return consecutive trigger pulses, all of which can be believed."""
+        none = np.zeros(times.size, np.bool_)
+        return cls(times, np.zeros(max(times.size - 1, 0), np.int64), none, none, times)
+
+    @property
+    def number(self) -> IntArray:
+        """Return how many trigger cycles each pulse (n,) is after the first one."""
+        return numbered(self.missing)
+
+
+def numbered(missing: IntArray) -> IntArray:
+    """Return the numbers (n,) of pulses of which `missing` (n - 1,) lack between them."""
+    return np.asarray(np.concatenate(([0], np.cumsum(1 + missing))), np.int64)
+
+
+def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
+    """
+    Return the trigger pulses of a recording, as the pulse validation of the averager accepts them.
+
+    Raises ModelError where the recording contradicts the declared model and RecordingError where
+    it has no usable pulses.
+    """
+    if abs(recording.ratio / model.ratio - 1.0) > _SAME_RATIO and recording.ratio != 1.0:
+        raise ModelError(f'ratio is declared as {model.ratio:.9g} but the recording says '
+                         f'{recording.ratio:.9g}: declare the ratio of this machine')
+    if recording.pulses_per_revolution not in (1, model.pulses_per_revolution):
+        raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
+                         f'the recording says {recording.pulses_per_revolution}')
+    step = model.pulses_per_trigger or model.pulses_per_revolution
+    measured = keyphasor_pulses(recording)
+    if measured.size < _FEWEST:
+        raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
+                             'look at the tach, its level may never cross the threshold')
+    pulses, counts = _validated(measured)
+    spurious = counts.doubles + counts.early
+    if spurious > _MOST_SPURIOUS * measured.size:
+        raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
+                             f'{_MOST_SPURIOUS:.0%}: give the trigger more hysteresis')
+    found = pulses.every(step)
+    if found.times.size < _FEWEST or not np.any(found.missing == 0):
+        raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
+                             f'pulses: the loop needs {_FEWEST} in a row; record longer')
+    speed = model.trigger_revolutions / float(np.median(np.diff(found.times)[found.missing == 0]))
+    if abs(speed / model.trigger_speed - 1.0) > _SPEED_TOLERANCE:
+        raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
+                         f'shaft turns at {speed:.4g} Hz: declare the speed and '
+                         'pulses_per_revolution of this recording')
+    reference = None
+    if recording.reference_pulse_times is not None:
+        better, _ = _validated(recording.reference_pulse_times)
+        as_many = better.times.size >= _AS_MANY * pulses.times.size
+        reference = _matched(found, better.every(1), step if as_many else 1)
+    remarks = [*_remarks(counts, measured.size), *_tach_rate_remark(recording, model)]
+    return RecordPulses(found.times, found.missing, found.starts_run, found.doubtful,
+                        found.bridged, reference, tuple(remarks))
+
+
+def keyphasor_pulses(recording: Recording) -> FloatArray:
+    """Return the pulses of the tested keyphasor: those of the file, else of its waveform."""
+    if recording.pulse_times is not None:
+        return recording.pulse_times
+    if recording.tach is None or recording.tach_rate is None:
+        if recording.reference_pulse_times is not None:
+            return recording.reference_pulse_times
+        raise RecordingError('no pulse_times and no tach: the loop needs a keyphasor')
+    detector = KeyphasorDetector(interpolate=False)
+    found, index = [], 0
+    for block in recording.tach_blocks():
+        found.append(detector.update(
+            block[0], recording.start_time + index / recording.tach_rate, recording.tach_rate))
+        index += block.shape[1]
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True)
+class _Accepted:
+    """Accepted pulses (k,), missing ones that were put in included, numbered over all gaps."""
+
+    times: FloatArray
+    number: IntArray
+    measured: BoolArray
+    starts_run: BoolArray
+    doubtful: BoolArray
+
+    def every(self, step: int) -> RecordPulses:
+        """Return the pulses whose number is a multiple of `step`."""
+        chosen = self.number % step == 0
+        there = np.flatnonzero(chosen & self.measured)
+        number = self.number // step
+        bridged = np.full(int(number[-1]) + 1 if there.size else 0, np.nan)
+        bridged[number[chosen]] = self.times[chosen]
+        run = np.cumsum(self.starts_run)[there]
+        first, last = (int(number[there[k]]) if there.size else 0 for k in (0, -1))
+        return RecordPulses(
+            self.times[there], np.asarray(np.diff(number[there]) - 1, np.int64),
+            np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1])
+
+
+def _validated(times: FloatArray) -> tuple[_Accepted, PulseCounts]:
+    """Return the accepted pulses, and what became of all."""
+    # Every pulse is a trigger here: trigger cycles are counted over what breaks a run.
+    validator = PulseValidator(missing_pulses='bridge', interval_tolerance=_TOLERANCE)
+    found = validator.update(times)
+    number = found.count.copy()
+    for begin in np.flatnonzero(np.diff(number) <= 0) + 1:  # after a gap of unknown length
+        usual = float(np.median(np.diff(found.times[max(begin - _ALIGNED, 0):begin])))
+        gap = float(found.times[begin] - found.times[begin - 1])
+        number[begin:] += number[begin - 1] + int(np.clip(round(gap / usual), 1, _LONGEST_GAP)
+                                                  ) - number[begin]
+    # The double, or the pulse before it, is the true one; one of the last two before a break may
+    # be what broke the run.
+    doubtful = found.doubtful | np.append((found.doubtful | found.starts_run)[1:], False)
+    doubtful[:-2] |= found.starts_run[2:]
+    return (_Accepted(found.times, number, found.measured, found.starts_run, doubtful),
+            validator.finish())
+
+
+def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArray:
+    """Return the time of every trigger pulse (m,) on the better keyphasor, NaN where none is."""
+    some = pulses.times[:_ALIGNED]
+    nearest = np.argmin(np.abs(better.times[:, None] - some), axis=0)
+    shift = int(np.median(better.number[nearest] - step * pulses.number[:some.size]))
+    wanted = shift + step * np.arange(pulses.bridged.size)
+    known = better.bridged.copy()
+    known[better.number[better.doubtful]] = np.nan
+    inside = (wanted >= 0) & (wanted < known.size)
+    matched = np.full(wanted.size, np.nan)
+    matched[inside] = known[wanted[inside]]
+    share = float(np.mean(np.isfinite(matched[pulses.number])))
+    if share < _COVERED:
+        raise RecordingError(f'reference_pulse_times cover {share:.0%} of the pulses: give the '
+                             'same stretch of time')
+    return matched
+
+
+def _remarks(counts: PulseCounts, total: int) -> Sequence[str]:
+    """Say what the validation dropped, put in or could not use."""
+    found = []
+    spurious = counts.doubles + counts.early
+    if spurious:
+        found.append(f'{spurious} of {total} pulses are spurious ({counts.doubles} double, '
+                     f'{counts.early} early): they were dropped, and no acquisition holds a '
+                     'trigger cycle beside them')
+    if counts.missing_bridged:
+        found.append(f'{counts.missing_bridged} pulses are missing beside the {total} that were '
+                     'measured')
+    if counts.late:
+        found.append(f'{counts.late} of {total} pulses come late, after a gap that is no whole '
+                     'number of intervals or longer than three missing pulses: no acquisition '
+                     'holds such a gap')
+    if counts.unlocked:
+        found.append(f'{counts.unlocked} of {total} pulses came while no steady interval was '
+                     'known: they were dropped')
+    return found
+
+
+def _tach_rate_remark(recording: Recording, model: DeclaredModel) -> Sequence[str]:
+    """Say that the recording's tach was sampled at another rate than the declared one."""
+    rate = recording.tach_rate
+    if not rate or abs(model.keyphasor_rate / rate - 1.0) <= _SAME_RATE:
+        return []
+    return [f'keyphasor_rate is declared as {model.keyphasor_rate:.6g} Hz but the '
+            f"recording's tach was sampled at {rate:.6g} Hz: declare {rate:.6g}"]

@@ -1,0 +1,160 @@
+"""
+Scoring: how well the declared model and some effects predict the held-out acquisitions.
+
+The scale holds what the machine's own amplitudes scatter by (unsteadiness), beside what noise,
+jitter and effects predict.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects import Effect
+from sa_jitter_ros.effects.effect import Pulses
+from sa_jitter_ros.effects.evidence import Evidence, Finding, LineEvidence
+from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
+from sa_jitter_ros.inference.gathering import gather
+from sa_jitter_ros.inference.observation import Observation
+from sa_jitter_ros.inference.residual import Residual, residual, Sensitivity
+
+Array = NDArray[Any]
+
+#: Scatter from average to average that is the machine's own, in parts of an amplitude: what steady
+#: machines were measured to have that no effect describes (docs/measured_cases.md).
+STEADY = 0.02
+_CHANCE = 3.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """
+    Residual of the attenuation and its `scale`, (acquisition, line).
+
+    `moved` is what one standard error of each fitted parameter changes in the prediction.
+    """
+
+    difference: Array
+    scale: Array
+    moved: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Bench:
+    """
+    Everything that scoring needs; `untold` says of effects why these data cannot tell them.
+
+    `fewer` is the same averaged over fewer cycles, where the acquisitions hold enough of them.
+    """
+
+    observation: Observation
+    lines: Lines
+    level: Array
+    pulses: Sequence[Sequence[Pulses]]
+    clock: Clock
+    group: Array
+    scatter: LineEvidence
+    fit: tuple[int, ...]
+    held_out: tuple[int, ...]
+    declared: tuple[Effect, ...]
+    untold: Mapping[str, str] = field(default_factory=dict)
+    memory: Memory = field(default_factory=dict, repr=False)
+    fewer: 'Bench | None' = None
+
+    def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
+        """Return the evidence of some acquisitions, less what effects explain."""
+        return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
+                      [*self.declared, *effects], self.scatter)
+
+    def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
+               unsteadiness: float = 0.0) -> Expectation:
+        """Predict some acquisitions."""
+        return expect(self.observation, self.lines, self.level, [*self.declared, *effects],
+                      self.pulses, self.group, chosen, unsteadiness=unsteadiness,
+                      memory=self.memory)
+
+    def observed(self, chosen: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Return attenuation, its variance and amplitude over level (acquisition, line)."""
+        items = [self.observation.acquisitions[a] for a in chosen]
+        orders = self.observation.orders.size
+
+        def of(name: str) -> Array:
+            return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
+
+        kept = self.scatter.beat_gain  # raw and corrected amplitude have both lost the rest
+        return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
+                kept * np.abs(of('raw')) / self.level)
+
+    def unsteadiness(self, effects: Sequence[Effect]) -> float:
+        """
+        Return what the corrected amplitudes scatter by beyond what noise and effects predict.
+
+        It is the root mean square over acquisitions and lines, in parts of the level: 0 where it
+        may be chance, and of no line more than a steady machine has.
+        """
+        orders = self.observation.orders.size
+        amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
+        power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
+        model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
+        scattering = [effect for effect in (*self.declared, *effects) if effect.scatters]
+        known = expect(replace(self.observation, model=model), self.lines, self.level, scattering,
+                       self.pulses, self.group, [0]).amplitude_variance[0]
+        chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
+        if np.mean(power / known) < 1.0 + chance:
+            return 0.0
+        return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
+
+    def compare(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Comparison:
+        """Return the residual of the attenuation of the held-out acquisitions, one by one."""
+        attenuation, variance, _ = self.observed(self.held_out)
+        expected = self.expect(effects, self.held_out)
+        return Comparison(
+            attenuation - expected.attenuation, np.sqrt(expected.attenuation_variance + variance),
+            tuple(self.expect(others, self.held_out).attenuation - expected.attenuation
+                  for others in _moved(effects, findings)))
+
+    def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
+              unsteadiness: float) -> Residual:
+        """Return the residual of the held-out acquisitions."""
+        attenuation, variance, amplitude = self.observed(self.held_out)
+        expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
+        probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
+        moved = []
+        for others in _moved(effects, findings):
+            other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
+            moved.append(Sensitivity(
+                (other.attenuation - expected.attenuation).mean(axis=0),
+                float(np.mean((other.attenuation_variance - expected.attenuation_variance)
+                              / (expected.attenuation_variance + variance))),
+                float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
+        return residual(
+            attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
+            expected.amplitude, expected.amplitude_variance, probability, sensitivities=moved)
+
+
+def _moved(effects: Sequence[Effect], findings: Sequence[Finding]) -> Iterator[list[Effect]]:
+    """Yield the effects with each of their numbers one standard error larger."""
+    for i, finding in enumerate(findings):
+        for shifted in _shifted(finding):
+            yield [*effects[:i], shifted, *effects[i + 1:]]
+
+
+def _shifted(finding: Finding) -> list[Effect]:
+    """Return the effect with each of its numbers one standard error larger."""
+    found: list[Effect] = []
+    if finding.effect is None or finding.effect.scatters:
+        return found
+    for name, error in finding.standard_errors.items():
+        value = finding.effect.values[name]
+        if isinstance(value, str):
+            continue
+        for step in np.diag(np.where(np.isfinite(error), error, 0.0).reshape(-1)):
+            shifted = tuple((np.ravel(value) + step).tolist())
+            try:
+                found.append(replace(  # type: ignore[type-var]
+                    finding.effect, **{name: shifted if np.ndim(value) else shifted[0]}))
+            except ValueError:
+                continue
+    return found

@@ -1,0 +1,198 @@
+"""
+The loop as one function: recordings of a machine and its declared model in, a report out.
+
+It observes every acquisition, compares the observed attenuation with the predicted one and, where
+a significant residual remains, names the effect that the declared model lacks.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+import math
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+import warnings
+
+from sa_jitter_ros.declaration import Declaration, read_declaration
+from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.inference.observation import Observation, observe
+from sa_jitter_ros.inference.trace import Trace, trace
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.report.report import report, summary
+
+Source = str | os.PathLike[str] | Recording
+Declared = str | os.PathLike[str] | Declaration | DeclaredModel | Mapping[str, Any]
+
+_VERDICTS = ('none', 'traced', 'unexplained')
+_SHAFT = 'shaft'  # name of the only one
+_SAME_RATIO = 1e-5  # six digits, as people write them
+
+
+@dataclass(frozen=True)
+class Loop:
+    """
+    What `close_loop` found; as text, a summary.
+
+    `traces` holds the arrays behind the report, by the name of the shaft.
+    """
+
+    traces: Mapping[str, Trace]
+    recordings: tuple[str, ...]
+
+    @cached_property
+    def shafts(self) -> Mapping[str, Mapping[str, Any]]:
+        """Return the report of each shaft by its name; an undefined number is None."""
+        return {shaft: report(trace, recordings=self.recordings)
+                for shaft, trace in self.traces.items()}
+
+    @property
+    def report(self) -> Mapping[str, Any]:
+        """
+        Return the content of `report.json`.
+
+        With one shaft it is the report of that shaft; with several it holds their common `verdict`
+        and the `shafts`, a report for each.
+        """
+        if len(self.shafts) == 1:
+            return next(iter(self.shafts.values()))
+        return {'verdict': self.verdict, 'shafts': self.shafts}
+
+    @property
+    def verdict(self) -> str:
+        """Return `none`, `traced` or `unexplained`; of several shafts, the one that is last."""
+        return max((trace.verdict for trace in self.traces.values()), key=_VERDICTS.index)
+
+    def __str__(self) -> str:
+        """Return the reports in a few lines."""
+        if len(self.shafts) == 1:
+            return summary(self.report)
+        return '\n'.join(f'shaft {shaft}\n{summary(content)}'
+                         for shaft, content in self.shafts.items())
+
+    def write(self, folder: str | os.PathLike[str]) -> None:
+        """
+        Write `report.json`, `report.html` and the figures as PNG: all of them or none.
+
+        With several shafts these files are in a folder for each, named after the shaft; the
+        `report.json` and `report.html` beside these folders are those of all shafts. Loads
+        matplotlib. Raises OSError where the folder cannot be written.
+        """
+        from sa_jitter_ros.report.html_report import files_of_all, report_files
+
+        files = {shaft: report_files(trace, self.shafts[shaft])
+                 for shaft, trace in self.traces.items()}
+        write_files(folder, next(iter(files.values())) if len(files) == 1
+                    else files_of_all(self.report, files))
+
+
+def write_files(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> None:
+    """Write files, by their path in the folder: they are complete before one gets its name."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix='.close_loop.') as temporary:
+        for name, content in files.items():
+            for place in (Path(temporary, name), Path(folder, name)):
+                place.parent.mkdir(exist_ok=True)
+            Path(temporary, name).write_bytes(content)
+        for name in files:
+            os.replace(Path(temporary, name), Path(folder, name))
+
+
+def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
+               names: Sequence[str] = (), progress: Callable[[str], None] | None = None) -> Loop:
+    """
+    Find what the declared jitter model lacks in recordings of one machine.
+
+    `recordings` is one path or `Recording`, or several. `declared` is the path of a ROS parameter
+    file of `jitter_predictor`, a `DeclaredModel`, or a mapping of the keywords of `predict`, with
+    `effects` as a mapping of names to parameters; a parameter file may declare several `shafts`,
+    which are judged one by one. A `sample_rate` that it does not give is that of
+    the first recording. The report calls the recordings by their `names`: without these, by path
+    or description. `progress` is called with one line of text for every step.
+
+    Raises RecordingError, ModelError or SignalError where the recordings cannot be read, do not
+    fit the declared model, or hold no order above the noise.
+
+    >>> from sa_jitter_ros.recordings.recording import ArraySource, Recording
+    >>> from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+    >>> rate, speed = 5000.0, 25.0  # Hz
+    >>> machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6)), rate, speed=((0.0, speed),),
+    ...                   effects=(DeclaredJitter('normal', 8e-5), AdditiveNoise(0.02)), seed=3)
+    >>> recording = Recording(ArraySource(machine.vibration(0, 36_000)), rate,
+    ...                       pulse_times=machine.pulses(0.0, 7.2).times)
+    >>> found = close_loop(recording, {
+    ...     'keyphasor_rate': 20e3, 'trigger_speed': speed, 'trigger_cycles': 20,
+    ...     'orders': [8, 16, 24], 'noise_std': 0.02})
+    >>> found.verdict, [effect['name'] for effect in found.report['missing_effects']]
+    ('traced', ['excess_jitter'])
+    """
+    say = progress or (lambda text: None)
+    if isinstance(recordings, (str, os.PathLike, Recording)):
+        recordings = [recordings]
+    if not recordings:
+        raise ModelError('no recording: give at least one')
+    names = tuple(names) or tuple(_name(*item) for item in enumerate(recordings, 1))
+    opened = [item if isinstance(item, Recording) else read(item)
+              for item in recordings]
+    declaration = _declaration(declared, opened[0].sample_rate)
+    models = declaration.models
+    if len(models) > 1:
+        opened = [_for_several(item, models) for item in opened]
+    traces = {}
+    for shaft, model in models.items():
+        if len(models) > 1:
+            say(f'shaft {shaft}')
+        observations: list[Observation] = []
+        for name, recording in zip(names, opened):
+            say(f'observing {name}')
+            observations.append(observe(
+                recording, model,
+                sources=observations[0].sources.tolist() if observations else ()))
+            say(f'{len(observations[-1].acquisitions)} acquisitions of {model.trigger_cycles} '
+                'trigger cycles')
+        traces[shaft] = trace(observations, opened, declared=declaration.effects,
+                              progress=progress)
+    return Loop(traces, names)
+
+
+def _for_several(recording: Recording, models: Mapping[str, DeclaredModel]) -> Recording:
+    """Return a recording whose ratio, which is that of one shaft, binds none of several."""
+    ratios = [model.ratio for model in models.values()]
+    if recording.ratio != 1.0 and not any(
+            math.isclose(recording.ratio, ratio, rel_tol=_SAME_RATIO) for ratio in ratios):
+        raise ModelError(f'the recording has the ratio {recording.ratio:.9g}, which none of the '
+                         f'shafts {", ".join(models)} has: declare the ratios of this machine')
+    return replace(recording, ratio=1.0)
+
+
+def _name(number: int, source: Source) -> str:
+    """Return what a report calls a recording: its path or description, else its number."""
+    if isinstance(source, Recording):
+        return source.description or f'recording {number}'
+    return os.fspath(source)
+
+
+def _declaration(declared: Declared, sample_rate: float) -> Declaration:
+    """Return model and effects, whichever way they were declared; raises SaJitterError."""
+    if isinstance(declared, Declaration):
+        return declared
+    if isinstance(declared, DeclaredModel):
+        return Declaration({_SHAFT: declared}, ())
+    if not isinstance(declared, Mapping):
+        found = read_declaration(Path(declared), sample_rate=sample_rate)
+        for name in found.unknown:
+            warnings.warn(f'{os.fspath(declared)}: {name} is not a parameter of jitter_predictor '
+                          'and is ignored', stacklevel=3)
+        return found
+    known = {item.name for item in fields(DeclaredModel)}
+    for name in declared.keys() - known - {'effects'}:
+        raise ModelError(f'{name} is not a keyword of a declared model: give some of '
+                         f'{", ".join(sorted(known))}, effects')
+    values = {'sample_rate': sample_rate,
+              **{name: value for name, value in declared.items() if value is not None}}
+    effects = values.pop('effects', {})
+    return Declaration({_SHAFT: DeclaredModel(**values)}, tuple(
+        make_effect(name, **parameters) for name, parameters in effects.items()))

@@ -1,0 +1,193 @@
+"""
+Pytest fixtures for tests of nodes: a graph in one process, and the environment of several.
+
+Name this module in the `conftest.py` at the top of your tests:
+
+    pytest_plugins = ['sa_jitter_ros.nodes.testing']
+
+A test then asks for `ros_graph`, adds nodes to it, captures topics, publishes, and serves the
+callbacks until something has happened:
+
+    def test_listener(ros_graph):
+        ros_graph.add(SynchronousAverager, {'trigger_cycles': 10, 'shaft.orders': [1.0]})
+        amplitudes = ros_graph.capture('shaft/order_amplitude', Float64MultiArray)
+        ros_graph.publish('vibration', encode_samples(block))
+        ros_graph.settle()
+        assert len(amplitudes) == 2
+
+The import switches discovery off, so that no test meets another ROS graph, and the checks of
+message fields on. Both must be set before a message package is imported: name the module in
+`conftest.py`, not in a test. For the same reason rclpy is imported where it is used.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+import fcntl
+import os
+from pathlib import Path
+import random
+import socket
+import tempfile
+import time
+from typing import Any, TextIO
+
+import pytest
+
+os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF', ROS_PYTHON_CHECK_FIELDS='1')
+for _name in ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
+    os.environ.pop(_name, None)
+
+_DEPTH = 5000  # messages of a captured topic that may wait: none is lost in a test
+_AHEAD = 50  # messages that `publish` sends before it serves callbacks: fewer than an input queues
+_IDLE_ROUNDS = 40  # without a new message, each of one callback at most, before all is settled
+_DOMAINS = range(1, 101)  # of ROS: on every system their ports are below those given to clients
+
+
+class Graph:
+    """
+    Nodes, publishers and captured topics in one context and one single-threaded executor.
+
+    `context` is that of the nodes, `node` the one that publishes and captures.
+    """
+
+    def __init__(self) -> None:
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+        self.context = Context()
+        self.context.init(args=[])
+        self.node = Node('test', context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self._publishers: dict[str, Any] = {}
+        self._captured: list[list[Any]] = []
+        self._listeners = Counter[str]()  # by resolved topic, as the others
+        self._handled = Counter[str]()
+        self._expected = Counter[str]()  # of what this graph publishes
+
+    def add(self, node_class: Callable[..., Any], parameters: Mapping[str, Any] | None = None,
+            **node_kwargs: Any) -> Any:
+        """Construct a node in this graph with parameters by name; return it."""
+        from rclpy.parameter import Parameter
+        if parameters:
+            node_kwargs['parameter_overrides'] = [
+                *node_kwargs.get('parameter_overrides', ()),
+                *(Parameter(name, value=value) for name, value in parameters.items())]
+        node = node_class(context=self.context, **node_kwargs)
+        for subscription in node.subscriptions:
+            self._listeners[subscription.topic_name] += 1
+            subscription.callback = self._counting(subscription)
+        self._executor.add_node(node)
+        return node
+
+    def _counting(self, subscription: Any) -> Callable[[Any], None]:
+        callback, topic = subscription.callback, subscription.topic_name
+
+        def counted(message: Any) -> None:
+            self._handled[topic] += 1
+            callback(message)
+        return counted
+
+    def capture(self, topic: str, kind: type, *, qos: Any = None, latched: bool = False
+                ) -> list[Any]:
+        """Return the list to which each message of a topic will be added, from now on."""
+        from rclpy.qos import DurabilityPolicy, QoSProfile
+        if qos is None:
+            qos = QoSProfile(depth=_DEPTH)
+            if latched:
+                qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+        messages: list[Any] = []
+        self._captured.append(messages)
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def publisher(self, topic: str, kind: type, *, qos: Any = None) -> Any:
+        """Return the publisher of a topic, made at the first call; default QoS: of an input."""
+        from sa_jitter_ros.nodes.base import INPUT_QOS
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(kind, topic, qos or INPUT_QOS)
+        return self._publishers[topic]
+
+    def publish(self, topic: str, *messages: Any) -> None:
+        """
+        Publish messages, once a node of this graph or another subscribes.
+
+        Many messages never overflow a queue: callbacks are served in between.
+        """
+        for message in messages:
+            publisher = self.publisher(topic, type(message))
+            assert self.spin(publisher.get_subscription_count), f'nobody subscribes to {topic}'
+            publisher.publish(message)
+            self._expected[publisher.topic_name] += self._listeners[publisher.topic_name]
+            if (self._expected - self._handled).total() > _AHEAD:
+                assert self.spin(self._all_handled)
+
+    def spin(self, until: Callable[[], object], timeout: float = 60.0) -> bool:
+        """
+        Serve callbacks until `until()` is true; return whether it was before `timeout` seconds.
+
+        The timeout ends a test that would hang. Leave it generous: a test must not depend on how
+        fast the machine is.
+        """
+        deadline = time.monotonic() + timeout
+        while not until():
+            if time.monotonic() > deadline:
+                return False
+            self._executor.spin_once(timeout_sec=0.02)
+        return True
+
+    def settle(self) -> None:
+        """Serve callbacks until all that was published, and all results of it, have arrived."""
+        assert self.spin(self._all_handled)
+        idle, before = 0, self._arrived()
+        while idle < _IDLE_ROUNDS:
+            self._executor.spin_once(timeout_sec=0.001)
+            idle, before = (idle + 1 if before == self._arrived() else 0), self._arrived()
+
+    def _all_handled(self) -> bool:
+        return self._handled >= self._expected
+
+    def _arrived(self) -> tuple[int, ...]:
+        return self._handled.total(), *map(len, self._captured)
+
+    def shutdown(self) -> None:
+        """Destroy the nodes and the context."""
+        nodes = self._executor.get_nodes()
+        self._executor.shutdown()
+        for node in nodes:
+            node.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def ros_graph() -> Iterator[Graph]:
+    """Yield a ROS graph for this test only, without nodes; skip the test where there is no ROS."""
+    pytest.importorskip('rclpy')
+    graph = Graph()
+    yield graph
+    graph.shutdown()
+
+
+@pytest.fixture
+def process_environment() -> Iterator[dict[str, str]]:
+    """Yield the environment of processes that meet each other, and nobody else, over DDS."""
+    domain, lock = _reserve_domain()
+    with lock:
+        yield {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
+               'ROS_DOMAIN_ID': str(domain)}
+
+
+def _reserve_domain() -> tuple[int, TextIO]:
+    """Return a ROS domain that nobody on this host uses, and the file that reserves it if open."""
+    for domain in random.sample(_DOMAINS, len(_DOMAINS)):
+        with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            lock = Path(tempfile.gettempdir(), f'sa_jitter_ros_domain_{domain}').open('w')
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                probe.bind(('', 7410 + 250 * domain))  # of its first participant
+            except OSError:
+                lock.close()
+                continue
+            return domain, lock
+    raise RuntimeError('all ROS domains from 1 to 100 are in use on this host')

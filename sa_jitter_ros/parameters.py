@@ -1,0 +1,112 @@
+"""
+Parameters: name, default, meaning, unit and range of each, the same for nodes, files and library.
+
+A `Parameter` says what it takes and converts what it is given; `nodes/parameters.py` declares it
+to ROS.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+from numbers import Integral, Real
+import re
+from typing import Any
+
+from sa_jitter_ros.errors import ParameterError
+
+_LARGEST = 1e15  # size of a float: squares and products stay finite
+_WORDS = {float: ('a number', 'numbers'), int: ('a whole number', 'whole numbers'),
+          str: ('a text', 'texts'), bool: ('true or false', 'true or false')}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """
+    Description of one parameter.
+
+    The default's type is the parameter's type; `[0.0]`-like defaults make lists, and `element`
+    gives the type of a list whose default is empty. `minimum` and `maximum` bound a number or
+    every element of a list, `above` is an open lower bound, `choices` are the values a text may
+    take. A `read_only` parameter of a node is fixed at its start.
+    """
+
+    name: str
+    default: Any
+    description: str
+    unit: str = ''
+    minimum: float | None = None
+    maximum: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+    element: type = float
+
+    @property
+    def is_list(self) -> bool:
+        """Whether the value is a list."""
+        return isinstance(self.default, list)
+
+    @property
+    def kind(self) -> type:
+        """Type of the value, or of a list's elements."""
+        if self.is_list:
+            return type(self.default[0]) if self.default else self.element
+        return type(self.default)
+
+    def convert(self, value: Any) -> Any:
+        """Return the value as this parameter's type; raise ParameterError where it has none."""
+        if self.is_list:
+            if isinstance(value, (str, bytes)) or not hasattr(value, '__len__'):
+                raise ParameterError(f'{self.name} is {value!r}: give a list of '
+                                     f'{_WORDS[self.kind][1]}')
+            return [self._convert_one(item, f'{self.name}[{i}]') for i, item in enumerate(value)]
+        return self._convert_one(value, self.name)
+
+    def _convert_one(self, given: Any, name: str) -> Any:
+        kind, value = self.kind, given
+        if kind is float and _is_a(Real, value):
+            value = math.inf if abs(value) > _LARGEST else float(value)
+        elif kind is int and _is_a(Integral, value):
+            value = int(value)
+        elif kind is str and _is_a(Integral, value):
+            value = str(value)  # `-p tach_channel:=2` means the name 2
+        if type(value) is not kind:
+            raise ParameterError(f'{name} is {value!r}: give {_WORDS[kind][0]}')
+        if kind in (int, float):
+            self._check_range(value, given, name)
+        elif self.choices and value not in self.choices:
+            raise ParameterError(f'{name} is {value!r}: give one of '
+                                 f'{", ".join(self.choices)}')
+        return value
+
+    def _check_range(self, value: Any, given: Any, name: str) -> None:
+        limit = ''
+        if isinstance(value, float) and not math.isfinite(value):
+            limit = f'a finite number, at most {_LARGEST:g} in size'
+        elif self.above is not None and not value > self.above:
+            limit = f'more than {self.above}'
+        elif self.minimum is not None and value < self.minimum:
+            limit = f'at least {self.minimum}'
+        elif self.maximum is not None and value > self.maximum:
+            limit = f'at most {self.maximum}'
+        if limit:
+            unit = f' {self.unit}' if self.unit else ''
+            raise ParameterError(f'{name} is {given}{unit}: give {limit}')
+
+
+def _is_a(kind: Any, value: Any) -> bool:
+    """Return whether a value is a number of a kind; true and false are none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
+#: Beyond this range one shaft hardly turns while the other is averaged.
+RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest over that of the tach shaft',
+                  minimum=1e-3, maximum=1e3)
+
+
+def require_shaft_names(parameter: str, names: Sequence[str]) -> None:
+    """Raise ParameterError unless there are names, different ones that topics can have."""
+    wrong = [name for name in names if not re.fullmatch('[a-z][a-z0-9_]*', name)]
+    if wrong or not names or len(set(names)) < len(names):
+        raise ParameterError(f'{parameter} is {", ".join(map(repr, names))}: give different names '
+                             'of small letters, digits and underscores')

@@ -1,0 +1,180 @@
+"""Third cumulants of the average: what its normal law lacks at order 1/sqrt(N_t)."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise, permutations
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.prediction.angle_error import (
+    AngleErrorProcess,
+    IndependentPulseJitter,
+    joint_characteristic,
+    unit_nodes,
+)
+from sa_jitter_ros.prediction.distributions import Empirical
+from sa_jitter_ros.prediction.moments import (
+    correlation_length,
+    cycle_moments,
+    CycleMoments,
+    require_cycles,
+    require_orders,
+)
+
+Array = NDArray[Any]
+
+_REACH = 3  # correlation in cycles up to which triple moments are integrated
+_NODES = 6  # on each of three axes; 1e-8 of the largest cumulant while g D stays below 1
+# Of tables, whose values do not smear what wide errors do, and their spreads in cycles.
+_TABLE_NODES, _SPREADS = (_NODES, 12, 24), (0.4, 0.75)
+_CLEAR = 8.0  # variance of a cycle over its squared mean
+_MOST_BLOCKS = 64
+_PAIR_NODES = 32
+
+
+def third_cumulants(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments, *, nodes: int = _NODES,
+) -> tuple[Array, Array]:
+    """
+    Return the joint cumulants k(X, X, X) and k(X, X, conj X) of the average, shape (orders,) each.
+
+    `cycles` are the `cycle_moments` of the same processes.
+    """
+    g = require_orders(orders)
+    require_cycles(trigger_cycles)
+    u, w = unit_nodes(nodes)
+    length = correlation_length(processes)
+    axes = (u[:, None, None], u[:, None], u)
+    box = g[:, None, None, None]
+    m = cycles.mean
+    plain = np.zeros(g.size, complex)
+    mixed = np.zeros(g.size, complex)
+
+    def pair(i: int, j: int) -> Array:
+        return (cycles.pseudo_variance[abs(i - j)] if abs(i - j) <= length else 0.0) + m**2
+
+    def pair_conj(i: int, j: int) -> Array:
+        if abs(i - j) > length:
+            return np.abs(m) ** 2
+        moment: Array = cycles.variance[abs(i - j)] + np.abs(m) ** 2
+        return moment if j >= i else np.conj(moment)
+
+    for p in range(length + 1):
+        for q in range(length + 1):
+            triple = (0, p, p + q)
+            places = (trigger_cycles - p - q) / trigger_cycles**3
+            if places <= 0.0:
+                continue
+            arrangements = set(permutations(triple))
+            raw = joint_characteristic(processes, [box] * 3, axes, triple) @ w @ w @ w
+            lower = pair(0, p) + pair(0, p + q) + pair(p, p + q)
+            plain += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
+            for (a, b, c), count in Counter(
+                    (*sorted(order[:2]), order[2]) for order in arrangements).items():
+                raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c))
+                lower = m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b)
+                mixed += places * count * (
+                    raw @ w @ w @ w - lower + 2.0 * m * np.abs(m) ** 2)
+    return plain, mixed
+
+
+def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Array, Array]:
+    """
+    Return k(X, X, X) and k(X, X, conj X) as the pair moments of the cycles alone suggest.
+
+    A triple moment is taken for the product of its three pair moments over its three means: exact
+    for phasors of a Gaussian phase, and cheap where the memory is long. Long averages are summed
+    in blocks. 0 where the scatter of a cycle buries its mean and leaves nothing to expand about.
+    """
+    require_cycles(trigger_cycles)
+    size = np.abs(cycles.mean)
+    clear = np.real(cycles.variance[0]) < _CLEAR * size**2
+    m = np.where(clear, cycles.mean, 1.0)
+    block = math.ceil(trigger_cycles / _MOST_BLOCKS)
+    count = round(trigger_cycles / block)
+    steps = np.arange(1 - block, block)
+    lags = block * np.arange(count)[:, None] + steps
+    weight = (block - np.abs(steps)) / block**2 * (np.abs(lags) < len(cycles.variance))
+    first, last = 1 - len(cycles.variance), len(cycles.variance) - 1
+    by_lag = np.zeros((count, last - first + 1))  # weights of the lags that are remembered
+    row, column = np.nonzero(weight)
+    by_lag[row, lags[row, column] - first] = weight[row, column]
+    known = np.arange(first, last + 1)
+    p = (by_lag @ cycles.pseudo_variance[np.abs(known)]).T / m[:, None] ** 2
+    both = cycles.variance[np.abs(known)]
+    j = (by_lag @ np.where(known[:, None] < 0, both.conj(), both)).T / size[:, None] ** 2
+    distance = np.subtract.outer(np.arange(count), np.arange(count))
+    p, j = p[:, np.abs(distance)], j[:, np.abs(distance)]
+    j = np.where(distance > 0, j.conj(), j)
+    p_row, j_row, j_column = p.sum(axis=2), j.sum(axis=2), j.sum(axis=1)
+    plain = 3.0 * np.sum(p_row**2, axis=1) + np.sum(p * (p @ p), axis=(1, 2))
+    mixed = (2.0 * np.sum(p_row * j_row, axis=1) + np.sum(j_column**2, axis=1)
+             + np.sum(p * (j @ j.transpose(0, 2, 1)), axis=(1, 2)))
+    factor = np.where(clear, m, 0.0) / count**3
+    return plain * factor * m**2, mixed * factor * size**2
+
+
+def average_cumulants(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments,
+) -> tuple[Array, Array]:
+    """
+    Return k(X, X, X) and k(X, X, conj X): integrated where the memory is short, else superposed.
+
+    Normal gains have no third cumulants; what their superposition makes of them is taken out. With
+    both kinds of processes the superposition is corrected by its error for the short ones.
+    Independent jitter seen through a law that reads many pulses counts as seen through its `near`
+    law, which moves the distribution function of |X| by less than 0.02.
+    """
+    near = [_near(process) for process in processes]
+    if all(one is other and one.correlation_length <= _REACH
+           for one, other in zip(near, processes)):
+        return _integrated(orders, processes, trigger_cycles, cycles)
+    gains = [process for process in processes if hasattr(process, 'draw_gain')]
+    spurious = (0.0, 0.0)
+    if gains:
+        own = superposed_cumulants(cycle_moments(orders, gains, nodes=_PAIR_NODES), trigger_cycles)
+        spurious = own[0] * cycles.mean**3, own[1] * cycles.mean * np.abs(cycles.mean) ** 2
+    short = [process for process in near if process.correlation_length <= _REACH]
+    if not short:
+        every = superposed_cumulants(cycles, trigger_cycles)
+        return every[0] - spurious[0], every[1] - spurious[1]
+    alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
+    plain, mixed = _integrated(orders, short, trigger_cycles, alone)
+    gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
+    if len(short) == len(near):
+        return plain * gain**3, mixed * gain * np.abs(gain) ** 2
+    every = superposed_cumulants(cycles, trigger_cycles)
+    close = superposed_cumulants(alone, trigger_cycles)
+    return (every[0] - spurious[0] + (plain - close[0]) * gain**3,
+            every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
+
+
+def _integrated(
+    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
+    cycles: CycleMoments,
+) -> tuple[Array, Array]:
+    """Return `third_cumulants` with as many nodes as the spread of a table asks for."""
+    g = np.asarray(orders, float)
+    tables = [process for process in processes if isinstance(process, IndependentPulseJitter)
+              and isinstance(process.distribution, Empirical)]
+    spread = g * math.sqrt(sum(item.frequency**2 * item.distribution.variance for item in tables))
+    found = np.zeros((2, g.size), complex)
+    for (low, high), nodes in zip(pairwise((-1.0, *_SPREADS, np.inf)), _TABLE_NODES):
+        some = (spread > low) & (spread <= high)
+        if some.any():
+            part = CycleMoments(cycles.mean[some], cycles.variance[:, some],
+                                cycles.pseudo_variance[:, some])
+            found[:, some] = third_cumulants(g[some], processes, trigger_cycles, part, nodes=nodes)
+    return found[0], found[1]
+
+
+def _near(process: AngleErrorProcess) -> AngleErrorProcess:
+    """Return independent jitter seen through the `near` law, any other process as it is."""
+    if isinstance(process, IndependentPulseJitter) and process.weights.near is not None:
+        return replace(process, weights=process.weights.near)
+    return process

@@ -1,0 +1,179 @@
+"""
+The law of the amplitude for averages of a few cycles, where no limit theorem holds: by sampling.
+
+The draws are the same for every order and every call (fixed seed), so a prediction is a function
+of its model. The mean square is not sampled: it is exact.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, unit_nodes
+from sa_jitter_ros.prediction.moments import AverageMoments
+from sa_jitter_ros.pulses.angle_law import LINEAR, PulseWeights
+
+Array = NDArray[Any]
+#: ``known(count)``: pulse errors (count, pulse) in fundamental cycles of as many averages.
+KnownErrors = Callable[[int], Array]
+
+_SEED = 20190215
+_BUDGET = 3_000_000  # phasors in one law
+_FEWEST, _MOST = 4096, 65536
+_COARSEST = 512  # fewest draws of long averages
+LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
+_MOST_POINTS = 1000  # of a process drawn at once
+_LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
+
+
+@dataclass(frozen=True)
+class SampledLaw:
+    """The law of |X| by sorted draws of shape (orders, n) and an exact mean square."""
+
+    draws: Array = field(repr=False)
+    mean_square: Array
+
+    @property
+    def variance(self) -> Array:
+        """Return Var|X| of the draws."""
+        return np.asarray(np.var(self.draws, axis=1, dtype=float))
+
+    @property
+    def mean(self) -> Array:
+        """Return E|X|, so that mean^2 + variance = E|X|^2."""
+        return np.asarray(np.sqrt(np.maximum(self.mean_square - self.variance, 0.0)))
+
+    def cdf(self, amplitude: ArrayLike) -> Array:
+        """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
+        y = np.atleast_2d(np.asarray(amplitude, float))
+        y = np.broadcast_to(y, (self.draws.shape[0], y.shape[-1]))
+        counts = [np.searchsorted(row, at, side='right') for row, at in zip(self.draws, y)]
+        return np.where(np.isnan(y), np.nan, np.array(counts) / self.draws.shape[1])
+
+    def ppf(self, probability: ArrayLike) -> Array:
+        """
+        Return quantiles of |X|, shape (orders, k) for k probabilities in (0, 1).
+
+        Raises ParameterError for a probability outside (0, 1).
+        """
+        p = require_probabilities(probability)
+        position = p * (self.draws.shape[1] - 1)
+        index = np.minimum(position.astype(int), self.draws.shape[1] - 2)
+        part = position - index
+        return np.asarray((1.0 - part) * self.draws[:, index] + part * self.draws[:, index + 1])
+
+
+def can_be_sampled(
+    processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int,
+) -> bool:
+    """Tell whether averages of all processes can be drawn, and in about a second."""
+    pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
+    points = trigger_cycles * (1 if pulsed else _LINEAR_RULE[0].size)
+    drawn = _MOST_POINTS if any(hasattr(item, 'draw_angle') or hasattr(item, 'draw_gain')
+                                for item in processes) else math.inf
+    return points <= min(drawn, LONGEST) and points * orders <= MOST_PHASORS and all(
+        any(hasattr(process, f'draw_{what}') for what in ('pulses', 'angle', 'gain'))
+        for process in processes)
+
+
+def sampled_law(
+    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, moments: AverageMoments, *,
+    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
+    known: KnownErrors | None = None,
+) -> SampledLaw:
+    """
+    Return the law of the average of `trigger_cycles` cycles; parameters as of `drawn_averages`.
+
+    `moments` are the exact ones with gain and noise.
+    """
+    draws = drawn_averages(orders, processes, trigger_cycles, gain=gain,
+                           line_variance=line_variance, weights=weights, known=known)
+    return SampledLaw(np.sort(np.abs(draws), axis=1), moments.mean_square)
+
+
+def drawn_averages(
+    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
+    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
+    known: KnownErrors | None = None,
+) -> Array:
+    """
+    Return complex averages (order, draw) of `trigger_cycles` cycles, single precision.
+
+    `processes` `can_be_sampled`; `line_variance` is E|n|^2 of the noise; `weights` are those of
+    the angle law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come
+    on top of the random ones, of all N_t - 1 + weights.pulses pulses or of the average's
+    own N_t + 1.
+    """
+    g = np.asarray(orders, float)
+    pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
+    inside = [process for process in processes if process not in pulsed]
+    bare = weights is LINEAR and not inside
+    u, w = _LINEAR_RULE if weights is LINEAR else _BENT_RULE
+    w = w.astype(np.float32)
+    phasors = g.size * (trigger_cycles + 3) * (1 if bare else u.size)
+    count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
+    most = min(MOST_PHASORS, LONGEST * g.size)
+    count = max(_COARSEST, min(count, _COARSEST * most // phasors))
+    rng = np.random.default_rng(_SEED)
+    shape = (trigger_cycles + weights.pulses - 1, count)
+    errors: Array = np.zeros(shape)
+    for process in pulsed:
+        errors = errors + process.draw_pulses(rng, shape)
+    noise = rng.normal(0.0, np.sqrt(0.5), (2, count)).astype(np.float32)
+    if known is not None:
+        errors = errors + weights.padded(known(count), trigger_cycles).T
+    extra = [process.draw_angle(rng, trigger_cycles, u, count) for process in inside
+             if hasattr(process, 'draw_angle')]
+    gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
+             if hasattr(process, 'draw_gain')]
+    angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
+                            + sum(extra))).astype(np.float32) if not bare else errors
+    swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
+    factors = np.broadcast_to(np.asarray(gain), g.shape)
+    scales = np.broadcast_to(np.sqrt(np.asarray(line_variance, float)), g.shape)
+    noise = noise[0] + 1j * noise[1]
+    draws = np.empty((g.size, count), np.complex64)
+    for row, order, factor, scale in zip(draws, g, factors, scales):
+        if bare:
+            real, imag = cycle_amplitudes((order * errors).astype(np.float32))
+        else:
+            turned = np.float32(order) * angle
+            real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
+        row[:] = factor * (real.mean(axis=0) + 1j * imag.mean(axis=0)) + scale * noise
+    return draws
+
+
+def moments_of(draws: Array) -> AverageMoments:
+    """Return the moments of complex draws (order, draw)."""
+    mean = draws.mean(axis=1, dtype=complex)
+    off = draws - mean[:, None]
+    return AverageMoments(mean, np.mean(np.abs(off) ** 2, axis=1), np.mean(off**2, axis=1))
+
+
+def cycle_amplitudes(errors: Array) -> tuple[Array, Array]:
+    """
+    Return real and imaginary part of int_0^1 exp(j 2 pi e_k(u)) du, cycles on axis 0, linear law.
+
+    `errors` are pulse errors in cycles of the order, pulses on axis 0; the precision is theirs.
+    """
+    middle = np.pi * (errors[1:] + errors[:-1])
+    half = np.pi * np.diff(errors, axis=0)
+    half[half == 0.0] = np.finfo(half.dtype).tiny
+    gain = np.sin(half) / half
+    return gain * np.cos(middle), gain * np.sin(middle)
+
+
+def require_probabilities(probability: ArrayLike) -> Array:
+    """Return probabilities of shape (k,); raise ParameterError for one outside (0, 1)."""
+    try:
+        p = np.atleast_1d(np.asarray(probability, float))
+    except (TypeError, ValueError) as error:
+        raise ParameterError(
+            f'probabilities {probability!r} must be numbers between 0 and 1') from error
+    if not np.all((p > 0.0) & (p < 1.0)):
+        raise ParameterError(f'probabilities {p} must lie between 0 and 1, both excluded')
+    return p

@@ -1,0 +1,343 @@
+"""
+From the sampled waveform of a keyphasor to the times of its pulses.
+
+A Schmitt trigger decides that there is a pulse; the threshold crossing in front of that decision
+says when. With interpolation the crossing lies between two samples; without, it is the first
+sample past the threshold, which is the sampled keyphasor of Camerini et al. 2019 (Fig. 2).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+import warnings
+
+import numpy as np
+import numpy.typing as npt
+from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
+from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
+from sa_jitter_ros.samples import SampleBlock
+
+__all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_pulses']
+
+FloatArray = npt.NDArray[np.float64]
+Polarity = Literal['positive', 'negative']
+Edge = Literal['rising', 'falling', 'centre']
+_NONE: FloatArray = np.empty(0)
+# Parts of the known level difference. While the middle of the levels strays by less, the threshold
+# stays as it is: every change of it would shift the pulses against each other.
+_DEAD_BAND = 0.1
+# Less than this is the noise of a stopped machine, once two windows have agreed on the levels.
+_STOPPED = 0.1
+
+
+@dataclass(frozen=True)
+class KeyphasorState:
+    """
+    What a detector has learnt and counted so far; levels in the waveform's unit, NaN if unknown.
+
+    `waiting` are samples in which pulses will be looked for when there are levels; `too_close`
+    counts pulses dropped for `minimum_interval`, `gaps` breaks of the sample times and
+    `windows_without_levels` learning windows in which the waveform had no two levels.
+    """
+
+    low: float
+    high: float
+    threshold: float
+    samples: int
+    waiting: int
+    pulses: int
+    too_close: int
+    gaps: int
+    windows_without_levels: int
+
+
+class KeyphasorDetector:
+    """
+    Find the pulses of one keyphasor in a stream of blocks of samples, whatever their sizes.
+
+    The state levels are learnt from the first `learning_time` seconds in which there are two, and
+    followed window by window; samples wait until then, so that no pulse is lost. A `threshold`
+    together with `hysteresis` 0 needs no learning.
+
+    :param threshold: in the waveform's unit; None for half way between the state levels.
+    :param hysteresis: width of the band around the threshold, in parts of the levels' difference.
+    :param polarity: 'negative' where the pulse goes down. It decides what is the rising edge.
+    :param edge: the pulse's 'rising' (first) edge, its 'falling' edge or the 'centre' of the two.
+    :param interpolate: False gives the time of the first sample past the threshold.
+    :param minimum_interval: pulses that follow sooner (s) are dropped and counted.
+    :param learning_time: seconds, two revolutions or more.
+    :param minimum_difference: state levels closer than this (waveform's unit) are noise.
+    :raises ParameterError: an option is out of range.
+    """
+
+    def __init__(
+        self, *, threshold: float | None = None, hysteresis: float = 0.1,
+        polarity: Polarity = 'positive',
+        edge: Edge = 'rising', interpolate: bool = True,
+        minimum_interval: float = 0.0, learning_time: float = 0.5, minimum_difference: float = 0.0,
+    ) -> None:
+        if threshold is not None and not np.isfinite(threshold):
+            raise ParameterError(f'threshold {threshold} is not finite: give a level, or None')
+        if not 0.0 <= hysteresis < 1.0:
+            raise ParameterError(f'hysteresis {hysteresis} is outside 0 <= hysteresis < 1: '
+                                 'give a fraction of the difference of the state levels')
+        if polarity not in ('positive', 'negative'):
+            raise ParameterError(f"polarity '{polarity}': use 'positive' or 'negative'")
+        if edge not in ('rising', 'falling', 'centre'):
+            raise ParameterError(f"edge '{edge}': use 'rising', 'falling' or 'centre'")
+        if not 0.0 < learning_time < np.inf:
+            raise ParameterError(f'learning_time {learning_time} s must be finite and above 0')
+        for name, value in (('minimum_interval', minimum_interval),
+                            ('minimum_difference', minimum_difference)):
+            if not 0.0 <= value < np.inf:
+                raise ParameterError(f'{name} {value} must be finite and not negative')
+        self._sign = 1.0 if polarity == 'positive' else -1.0
+        self._fixed_threshold = None if threshold is None else self._sign * threshold
+        self._hysteresis = hysteresis
+        self._edge = edge
+        self._interpolate = interpolate
+        self._minimum_interval = minimum_interval
+        self._learning_time = learning_time
+        self._minimum_difference = minimum_difference
+        self._learns = threshold is None or hysteresis > 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the levels, the waiting samples, the time and the counts."""
+        self._rate = 0.0
+        self._origin = np.nan
+        self._index = 0
+        self._window: list[tuple[float, int, FloatArray]] = []
+        self._levels: StateLevels | None = None
+        self._confirmed = False
+        self._trigger = SchmittTrigger(interpolate=self._interpolate)
+        self._trigger_origin = np.nan
+        self._leading: float | None = None
+        self._last_pulse = -np.inf
+        self._samples = self._pulses = self._too_close = self._gaps = self._levelless = 0
+
+    @property
+    def state(self) -> KeyphasorState:
+        """Return what has been learnt and counted."""
+        levels = self._levels or StateLevels(np.nan, np.nan, significant=False)
+        low, high = sorted((self._sign * levels.low, self._sign * levels.high))
+        waiting = 0 if self._levels else sum(part.size for *_, part in self._window)
+        return KeyphasorState(
+            low=low, high=high, threshold=self._sign * self._threshold(levels),
+            samples=self._samples, waiting=waiting, pulses=self._pulses,
+            too_close=self._too_close,
+            gaps=self._gaps, windows_without_levels=self._levelless)
+
+    def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:
+        """
+        Take the next samples (n,), the first at `start_time` (s), and return new pulse times (s).
+
+        A `start_time` more than half a sample away from where the last block ended is a gap: no
+        pulse is read across it. A block refused by an error leaves a gap and changes nothing else.
+
+        :raises SignalError: wrong shape, not finite, or another sample rate than before.
+        """
+        block = self._checked(samples, start_time, sample_rate)
+        self._rate = sample_rate
+        if not abs(start_time - (self._origin + self._index / sample_rate)) <= 0.5 / sample_rate:
+            self._gaps += bool(np.isfinite(self._origin))
+            self._origin, self._index = start_time, 0
+        self._samples += block.size
+        found = []
+        window = max(round(self._learning_time * sample_rate), 8) if self._learns else block.size
+        while block.size:
+            piece, block = np.split(block, [window - sum(part.size for *_, part in self._window)])
+            found.append(self._take((self._origin, self._index, piece)))
+            self._index += piece.size
+            if sum(part.size for *_, part in self._window) == window:
+                found.append(self._learn())
+        return np.concatenate(found) if found else _NONE
+
+    def flush(self) -> FloatArray:
+        """Return the pulse times (s) in samples that wait for levels, at a recording's end."""
+        return self._learn() if self._levels is None and self._window else _NONE
+
+    def _checked(
+        self, samples: npt.ArrayLike, start_time: float, sample_rate: float,
+    ) -> FloatArray:
+        given = np.asarray(samples)
+        if given.ndim != 1:
+            raise SignalError(f'the keyphasor waveform has shape {given.shape}: give one channel')
+        if given.dtype.kind not in 'fiub':
+            raise SignalError(f'the keyphasor waveform has type {given.dtype}: give real numbers')
+        if not (np.isfinite(sample_rate) and sample_rate > 0.0):
+            raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
+        if self._rate and sample_rate != self._rate:
+            raise SignalError(f'sample rate {sample_rate} Hz differs from {self._rate} Hz before: '
+                              'reset the detector to begin a new stream')
+        if not np.isfinite(start_time):
+            raise SignalError(f'start time {start_time} s of a block is not finite')
+        block = self._sign * given.astype(np.float64)
+        if not np.all(np.isfinite(block)):
+            bad = int(np.argmin(np.isfinite(block)))
+            raise SignalError(f'sample {bad} of the block is {given[bad]}: only finite '
+                              'samples can be used; leave the block out, which is a gap')
+        return block
+
+    def _take(self, piece: tuple[float, int, FloatArray]) -> FloatArray:
+        """Remember a piece for learning and look for pulses in it if the levels are known."""
+        if self._learns:
+            self._window.append(piece)
+        return self._detect(piece) if self._levels or not self._learns else _NONE
+
+    def _learn(self) -> FloatArray:
+        """Learn from a full window; return the pulses in it if they had to wait for that."""
+        window = np.concatenate([part for *_, part in self._window])
+        levels, known = state_levels(window), self._levels
+        useful = levels.significant and levels.difference > self._minimum_difference
+        if known and levels.difference < _STOPPED * known.difference and self._confirmed:
+            useful = False
+        if not useful:
+            self._levelless += 1
+            self._window = [] if known else _last(self._window, window.size // 2)
+            return _NONE
+        waiting, self._window = self._window, []
+        self._confirmed = known is not None and levels.difference >= _STOPPED * known.difference
+        if known and _same(levels, known):
+            return _NONE
+        self._levels = levels
+        return _NONE if known else np.concatenate([self._detect(piece) for piece in waiting])
+
+    def _threshold(self, levels: StateLevels) -> float:
+        return levels.middle if self._fixed_threshold is None else self._fixed_threshold
+
+    def _detect(self, piece: tuple[float, int, FloatArray]) -> FloatArray:
+        """Return the times of the pulses that end their detection in `piece`."""
+        origin, index, samples = piece
+        if origin != self._trigger_origin:
+            self._trigger = SchmittTrigger(interpolate=self._interpolate)
+            self._trigger_origin, self._leading, self._last_pulse = origin, None, -np.inf
+        levels = self._levels or StateLevels(0.0, 0.0, significant=False)
+        crossings, rising = self._trigger.update(
+            samples, index, self._threshold(levels), 0.5 * self._hysteresis * levels.difference)
+        if self._edge == 'centre':
+            crossings = self._centres(crossings, rising)
+        else:
+            crossings = crossings[rising == (self._edge == 'rising')]
+        pulses = self._apart(origin + crossings / self._rate)
+        self._pulses += pulses.size
+        return pulses
+
+    def _centres(self, crossings: FloatArray, rising: npt.NDArray[np.bool_]) -> FloatArray:
+        """Return the middles of rising crossings and the falling ones that follow them."""
+        leading, trailing = crossings[rising], crossings[~rising]
+        if self._leading is not None:
+            leading = np.concatenate(([self._leading], leading))
+        elif trailing.size and not rising[0]:
+            trailing = trailing[1:]
+        self._leading = float(leading[-1]) if leading.size > trailing.size else None
+        return np.asarray(0.5 * (leading[:trailing.size] + trailing))
+
+    def _apart(self, times: FloatArray) -> FloatArray:
+        """Drop the pulses that follow the last kept one within `minimum_interval`."""
+        keep = np.diff(times, prepend=self._last_pulse) >= self._minimum_interval
+        if not keep.all():
+            last = self._last_pulse
+            for i, time in enumerate(times):
+                keep[i] = time - last >= self._minimum_interval
+                last = time if keep[i] else last
+            self._too_close += int(np.count_nonzero(~keep))
+            times = times[keep]
+        if times.size:
+            self._last_pulse = float(times[-1])
+        return times
+
+
+def _same(levels: StateLevels, known: StateLevels) -> bool:
+    """Whether newly measured levels are so near the known ones that those may stay."""
+    return (abs(levels.middle - known.middle) <= _DEAD_BAND * known.difference
+            and 0.5 <= levels.difference / known.difference <= 2.0)
+
+
+def _last(
+    pieces: list[tuple[float, int, FloatArray]], count: int,
+) -> list[tuple[float, int, FloatArray]]:
+    """Return the last `count` samples of the pieces."""
+    kept: list[tuple[float, int, FloatArray]] = []
+    for origin, index, samples in reversed(pieces):
+        if count > 0:
+            skip = max(samples.size - count, 0)
+            kept.append((origin, index + skip, samples[skip:]))
+            count -= samples.size
+    return kept[::-1]
+
+
+def detect_pulses(
+    tach: npt.ArrayLike, sample_rate: float, *, start_time: float = 0.0,
+    threshold: float | None = None, hysteresis: float = 0.1,
+    polarity: Polarity = 'positive', edge: Edge = 'rising', interpolate: bool = True,
+    minimum_interval: float = 0.0, learning_time: float = 0.5, minimum_difference: float = 0.0,
+) -> FloatArray:
+    """
+    Return the pulse times (pulse,) in s of the sampled waveform (sample,) of a keyphasor.
+
+    The first sample is at `start_time`, `sample_rate` in Hz; the other keywords are those of
+    `KeyphasorDetector`. No pulse is found across samples that are NaN or infinite. A `DataWarning`
+    says why there are no pulses, where there are none. Raises `ParameterError` for options and
+    `SignalError` for an array or a rate that cannot be used.
+
+    One pulse a revolution of a shaft at 25 Hz. `interpolate=False` gives the times at which a
+    keyphasor that is sampled at 2 kHz sees them:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> time = np.arange(2000) / 2e3
+    >>> tach = 5.0 / (1.0 + np.exp(-80.0 * (np.cos(2.0 * np.pi * 25.0 * time) - 0.95)))
+    >>> pulses = sa.detect_pulses(tach, 2e3)
+    >>> pulses.size, float(np.diff(pulses).mean().round(6))
+    (25, 0.04)
+    >>> float((sa.detect_pulses(tach, 2e3, interpolate=False) - pulses).max()) < 1.0 / 2e3
+    True
+    """
+    detector = KeyphasorDetector(
+        threshold=threshold, hysteresis=hysteresis, polarity=polarity, edge=edge,
+        interpolate=interpolate, minimum_interval=minimum_interval, learning_time=learning_time,
+        minimum_difference=minimum_difference)
+    samples = np.asarray(tach)
+    if samples.ndim != 1 or samples.dtype.kind not in 'fiub':
+        detector.update(samples, start_time, sample_rate)  # raises what is wrong with it
+    block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
+    found = [detector.update(part.samples[0], part.start_time, sample_rate)
+             for part in block.finite_parts()]
+    pulses = np.concatenate([*found, detector.flush()])
+    if not pulses.size:
+        state = detector.state
+        why = (f'its levels are {state.low:g} and {state.high:g}, the threshold '
+               f'{state.threshold:g}' if np.isfinite(state.low) else
+               f'no two levels stand out in {samples.size} samples: is the shaft turning?')
+        warnings.warn(f'the keyphasor waveform has no pulses: {why}', DataWarning, stacklevel=2)
+    return pulses
+
+
+def counter_pulses(
+    counts: npt.ArrayLike, *, start_time: float = 0.0, sample_rate: float,
+) -> FloatArray:
+    """
+    Return the pulse times (s) of a sampled pulse counter (n,): each step up by 1 is a pulse.
+
+    A pulse has the time of the first sample that counts it; several in one sample are spread
+    evenly over the time since the sample before.
+
+    :raises SignalError: not one channel of integers, or the counter runs backwards.
+    """
+    values = np.asarray(counts)
+    if values.ndim != 1 or values.dtype.kind not in 'iu':
+        raise SignalError(f'a counter has type {values.dtype} and shape {values.shape}: '
+                          'give integers of one channel')
+    if not (np.isfinite(sample_rate) and sample_rate > 0.0):
+        raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
+    values = values.astype(np.int64)
+    steps = np.diff(values)
+    if np.any(steps < 0):
+        bad = int(np.argmax(steps < 0)) + 1
+        raise SignalError(f'the counter falls from {values[bad - 1]} to {values[bad]} at sample '
+                          f'{bad}: unwrap it first')
+    total = np.arange(1, int(steps.sum()) + 1)
+    level = values - values[:1]
+    sample = np.searchsorted(level, total)
+    fraction = (level[sample] - total) / steps[sample - 1]
+    return np.asarray(start_time + (sample - fraction) / sample_rate)

@@ -1,0 +1,153 @@
+"""From accepted pulses to trigger pulses: counting teeth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class TriggerPulses:
+    """
+    Trigger pulses (n,), each the end of a valid trigger cycle unless it starts a run.
+
+    `times` in s; `starts_run` where no valid cycle lies between the trigger pulse before and this
+    one; `restarted` where, besides, time ran back. `count` is how many trigger cycles a pulse is
+    after the first one: it runs on over missing pulses, also those that break a run, and begins
+    again at 0 where the number is unknown or not whole. `measured` is False for a missing pulse
+    that was put in between its neighbours, `doubtful` True where a double pulse was dropped in the
+    trigger cycle that ends here: which of the two was the true one may be wrong.
+    """
+
+    times: FloatArray
+    starts_run: BoolArray
+    restarted: BoolArray
+    count: IntArray
+    measured: BoolArray
+    doubtful: BoolArray
+
+    @classmethod
+    def joined(cls, parts: 'list[TriggerPulses]') -> 'TriggerPulses':
+        """Return the pulses of all parts, in their order."""
+        if len(parts) == 1:
+            return parts[0]
+        if not parts:
+            none = np.empty(0, np.bool_)
+            return cls(np.empty(0), none, none, np.empty(0, np.int64), none, none)
+        return cls(*(np.concatenate([getattr(part, name) for part in parts])
+                     for name in cls.__dataclass_fields__))
+
+
+class TriggerCounter:
+    """
+    Count the teeth of runs of pulses and give the time of every `teeth_per_trigger`-th.
+
+    A run begins at tooth 0. Its first trigger pulse is given together with the second, which makes
+    it the start of a whole trigger cycle; runs without one leave no trace but a discarded cycle.
+    """
+
+    def __init__(self, *, teeth: int, teeth_per_trigger: int) -> None:
+        self._teeth, self._per_trigger = teeth, teeth_per_trigger
+        self._times: list[float] = []  # of the last pulse and those since the last count
+        self._steps: list[int] = []
+        self._doubles: list[int] = []  # in `_times`, the pulses that a double followed
+        self._target = 0  # tooth of the next trigger pulse
+        self._origin = 0  # teeth from the pulse with count 0 to the run's tooth 0
+        self._last: int | None = None  # teeth from the pulse with count 0 to the last run's end
+        self._starting = False
+        self._doubtful = False
+        self._waiting: list[TriggerPulses] = []  # the first trigger pulse of a run
+        self._found: list[TriggerPulses] = []
+        self._restarted = False
+        self.discarded = 0
+
+    @property
+    def running(self) -> bool:
+        """Whether there is a run to which pulses can be added."""
+        return bool(self._times)
+
+    def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
+        """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
+        self.stop()
+        if passed is None or self._last is None:
+            self._origin = -(0 if tooth == 0 else self._teeth)
+        else:
+            self._origin = self._last + passed - tooth
+        self._times, self._steps = [time], [tooth]
+        self._target = 0 if tooth == 0 else self._teeth
+        if (self._origin + self._target) % self._per_trigger:  # trigger pulses on other teeth
+            self._origin = -self._target
+        self._starting = True
+
+    def extend(self, times: list[float], steps: list[int]) -> None:
+        """Add pulses (s) to the run, each `steps` teeth after the one before."""
+        self._times += times
+        self._steps += steps
+
+    def double(self) -> None:
+        """Note that a double of the latest pulse was dropped."""
+        if self.running:
+            self._doubles.append(len(self._times) - 1)
+
+    def stop(self, *, known: bool = True) -> None:
+        """End the run and discard its unfinished trigger cycle; `known` tells its end is valid."""
+        if self.running:
+            self._count()
+            self._last = self._origin + self._steps[0]
+            self.discarded += not self._starting or bool(self._waiting)
+        if not known:
+            self._last = None
+        self._times, self._steps, self._doubles, self._waiting = [], [], [], []
+        self._doubtful = False
+
+    def restart(self) -> None:
+        """Mark the start of the next run as one for which time ran back."""
+        self._restarted = True
+
+    def take(self) -> TriggerPulses:
+        """Return the new trigger pulses."""
+        if self.running:
+            self._count()
+        found, self._found = self._found, []
+        return TriggerPulses.joined(found)
+
+    def _count(self) -> None:
+        teeth = np.cumsum(self._steps)
+        targets = np.arange(self._target, teeth[-1] + 1, self._per_trigger)
+        if targets.size:
+            found = self._trigger_pulses(targets, teeth)
+        else:
+            self._doubtful |= bool(self._doubles)
+        self._doubles = []
+        self._target += targets.size * self._per_trigger
+        self._times, self._steps = self._times[-1:], [int(teeth[-1]) - self._target]
+        self._origin += self._target
+        self._target = 0
+        if not targets.size:
+            return
+        if self._starting:
+            found = TriggerPulses.joined([*self._waiting, found])
+            self._waiting = []
+            if found.times.size < 2:
+                self._waiting = [found]
+                return
+            found.starts_run[0], found.restarted[0] = True, self._restarted
+            self._starting = self._restarted = False
+        self._found.append(found)
+
+    def _trigger_pulses(self, targets: IntArray, teeth: IntArray) -> TriggerPulses:
+        doubtful = np.zeros(targets.size + 1, np.bool_)
+        if self._doubles:
+            doubtful[np.searchsorted(targets, teeth[self._doubles], side='right')] = True
+        doubtful[0] |= self._doubtful
+        self._doubtful = bool(doubtful[-1])
+        starts, restarts = np.zeros((2, targets.size), np.bool_)
+        # Teeth that are missing stand evenly between their neighbours.
+        return TriggerPulses(
+            np.interp(targets, teeth, self._times), starts, restarts,
+            (self._origin + targets) // self._per_trigger,
+            teeth[np.searchsorted(teeth, targets)] == targets, doubtful[:-1])

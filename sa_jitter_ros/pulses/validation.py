@@ -1,0 +1,195 @@
+"""
+Which pulses of a keyphasor can be believed, and which of them begin a trigger cycle.
+
+This layer puts pulses in order of time; `interval_judge` decides by their intervals which are
+valid and `trigger_counter` counts those. A pulse earlier than the last by `time_tolerance` or less
+is out of order and dropped. One that is earlier by more waits. If a later pulse continues the old
+sequence, those that waited (one or two) are out of order; a third in their own order, or one that
+fits them and not the old sequence, makes them a new run. If the last pulse had not been confirmed
+by a regular one, it is that one which is out of order.
+"""
+
+from dataclasses import astuple, dataclass, replace
+from operator import add
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.interval_judge import IntervalJudge
+from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
+from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
+
+__all__ = ['MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
+
+FloatArray = npt.NDArray[np.float64]
+MissingPulses = Literal['break', 'bridge']
+# Pulses looked at together while they are regular, and one by one around those that are not.
+_CHUNK = 1024
+_FEW = 32
+_RESTART = 3
+
+
+@dataclass(frozen=True)
+class PulseCounts:
+    """
+    What became of the pulses so far.
+
+    `accepted` pulses are regular, end a gap or start a run. Missing ones were not there. All
+    others were dropped, but for `late` ones, which start a run; `unlocked` ones came while no
+    steady interval was known. `relearnt` counts changes of speed within an interval or two, and
+    `cycles_discarded` trigger cycles that were begun and lost.
+    """
+
+    accepted: int = 0
+    doubles: int = 0
+    missing_bridged: int = 0
+    missing_broken: int = 0
+    early: int = 0
+    late: int = 0
+    out_of_order: int = 0
+    restarts: int = 0
+    non_finite: int = 0
+    unlocked: int = 0
+    relearnt: int = 0
+    cycles_discarded: int = 0
+
+    def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
+        """Return the counts of both."""
+        return PulseCounts(*map(add, astuple(self), astuple(other)))
+
+
+class PulseValidator:
+    """
+    Validate a stream of pulse times, whatever its blocks, and return its trigger pulses.
+
+    The result is causal: a trigger pulse is returned as soon as it ends a trigger cycle, the first
+    one of a run together with the second. At the start pulses wait for two intervals that agree
+    (a wheel with missing teeth: for a revolution); none is lost by that.
+
+    :param pulses_per_revolution: of the tach shaft; with missing teeth, those counted.
+    :param pulses_per_trigger: pulses in a trigger cycle, None for all of a revolution.
+    :param missing_teeth: teeth that the wheel lacks, in one gap or several.
+    :param missing_pulses: 'bridge' puts missing pulses evenly between their neighbours, 'break'
+        discards the trigger cycle.
+    :param interval_tolerance: of an interval, in parts of the expected one. 0.25 suits most; less
+        finds pulses displaced by less, up to 0.45 follows a cranking engine.
+    :param maximum_missing: more missing pulses than this in a row are a standstill.
+    :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
+    :param time_tolerance: how far (s) time may run back before it is another run.
+    :raises ParameterError: an option is out of range, or cycles do not fit the wheel.
+    """
+
+    def __init__(
+        self, *, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
+        missing_teeth: int = 0, missing_pulses: MissingPulses = 'break',
+        interval_tolerance: float = 0.25, maximum_missing: int = 3,
+        minimum_interval: float = 0.0, time_tolerance: float = 0.01,
+    ) -> None:
+        teeth = pulses_per_revolution
+        per_trigger = teeth if pulses_per_trigger is None else pulses_per_trigger
+        for name, number, least in (
+                ('pulses_per_revolution', teeth, 1), ('pulses_per_trigger', per_trigger, 1),
+                ('missing_teeth', missing_teeth, 0), ('maximum_missing', maximum_missing, 0)):
+            if number != int(number) or number < least:
+                raise ParameterError(f'{name} {number} must be a whole number, {least} or more')
+        if missing_pulses not in ('break', 'bridge'):
+            raise ParameterError(f"missing_pulses '{missing_pulses}': use 'break' or 'bridge'")
+        if not 0.0 < interval_tolerance < 0.5:
+            raise ParameterError(f'interval_tolerance {interval_tolerance} must lie between 0 '
+                                 'and 0.5, where one pulse can be told from none and two')
+        for name, value in (('minimum_interval', minimum_interval),
+                            ('time_tolerance', time_tolerance)):
+            if not 0.0 <= value < np.inf:
+                raise ParameterError(f'{name} {value} s must be finite and not negative')
+        if missing_teeth and teeth % per_trigger and per_trigger % teeth:
+            raise ParameterError(
+                f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
+                'wheel, so that cycles would lose its index: choose a divisor or a multiple')
+        target: Target = EvenTarget(tolerance=interval_tolerance)
+        if missing_teeth:
+            target = ToothedWheel(
+                teeth=teeth, missing=missing_teeth, tolerance=interval_tolerance)
+        self._clock = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
+        self._judge = IntervalJudge(
+            target, self._clock, bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
+            maximum_missing=maximum_missing, minimum_interval=minimum_interval)
+        self.pulses_per_trigger = per_trigger
+        self._time_tolerance = time_tolerance
+        self._held: list[float] = []  # pulses after time ran back
+        self._out_of_order = self._restarts = self._non_finite = 0
+
+    @property
+    def counts(self) -> PulseCounts:
+        """Return what became of the pulses so far."""
+        return PulseCounts(
+            **self._judge.counts, out_of_order=self._out_of_order, restarts=self._restarts,
+            non_finite=self._non_finite, cycles_discarded=self._clock.discarded)
+
+    def finish(self) -> PulseCounts:
+        """Return the counts when no pulse follows: those that still wait are unlocked."""
+        counts = self.counts
+        return replace(
+            counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
+
+    def update(self, times: npt.ArrayLike) -> TriggerPulses:
+        """
+        Take the next pulse times (n,) in s, in order of arrival, and return new trigger pulses.
+
+        Pulses that are not finite are dropped and counted.
+
+        :raises SignalError: not a one-dimensional array of real numbers.
+        """
+        given = np.asarray(times)
+        if given.ndim != 1 or given.dtype.kind not in 'fiu':
+            raise SignalError(f'pulse times have type {given.dtype} and shape {given.shape}: '
+                              'give real numbers, (n,)')
+        pulses = given.astype(np.float64)
+        finite = np.isfinite(pulses)
+        self._non_finite += int(np.count_nonzero(~finite))
+        pulses = pulses[finite]
+        done = 0
+        while done < pulses.size:
+            if self._judge.calm and not self._held:
+                done += self._judge.take_regular(pulses[done:done + _CHUNK])
+            for pulse in pulses[done:done + _FEW].tolist():
+                self._take(pulse)
+                done += 1
+                if self._judge.calm:
+                    break
+        return self._clock.take()
+
+    def _take(self, pulse: float) -> None:
+        judge = self._judge
+        if judge.confirmed < pulse < judge.last - self._time_tolerance:
+            self._out_of_order += judge.drop_unconfirmed()
+        back = pulse < judge.last - self._time_tolerance
+        if back or (self._held and self._continues_held(pulse)):
+            self._hold(pulse)
+            return
+        self._out_of_order += len(self._held)
+        self._held = []
+        if pulse < judge.last:
+            self._out_of_order += 1
+        else:
+            judge.take(pulse)
+
+    def _continues_held(self, pulse: float) -> bool:
+        """Whether a pulse goes with those that wait rather than with the sequence before."""
+        return pulse <= self._judge.last or (
+            not self._judge.fits(pulse - self._judge.last)
+            and self._judge.fits(pulse - self._held[-1]))
+
+    def _hold(self, pulse: float) -> None:
+        """Let a pulse wait after time ran back, or begin a new run with those that do."""
+        if self._held and pulse <= self._held[-1]:
+            self._out_of_order += len(self._held)
+            self._held = []
+        self._held.append(pulse)
+        if len(self._held) == _RESTART or pulse > self._judge.last:
+            self._restarts += 1
+            self._judge.forget()
+            self._clock.restart()
+            held, self._held = self._held, []
+            for each in held:
+                self._judge.take(each)

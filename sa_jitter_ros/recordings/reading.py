@@ -1,0 +1,104 @@
+"""Recordings of every format are opened here, by `read`."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+import os
+from pathlib import Path
+from typing import Any
+
+from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.recordings.bag_format import open_bag
+from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.csv_format import open_csv
+from sa_jitter_ros.recordings.fields import CONVERTED, converted_fields
+from sa_jitter_ros.recordings.mat_format import open_mat
+from sa_jitter_ros.recordings.npz_format import open_npz
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.wav_format import open_wav
+
+SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
+
+
+def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
+         vibration_channels: Sequence[str | int] = (), tach_channel: str | int = '',
+         time_column: str | int = '', **fields: Any) -> Recording:
+    """
+    Open a recording of any format; its samples are read later, in blocks of bounded memory.
+
+    Parameters
+    ----------
+    path
+        `.npz`, `.mat`, `.wav`, `.csv`, `.mcap` or `.db3` file, or a rosbag2 folder.
+    acquisition
+        Which one, of a file that holds several (`Recording.acquisitions`), from 0.
+    keyphasor
+        Which one, of a bag that holds several; '' for the first one.
+    vibration_channels
+        Names, or numbers from 0, of the vibration channels; of a bag also a `/topic`. Empty: all
+        channels but the tach.
+    tach_channel
+        Name or number of the channel that is the sampled keyphasor waveform; of a bag also a
+        `/topic`.
+    time_column
+        Name or number of the column of a `.csv` with the sample times in s; '' for one called
+        `time` or `t`.
+    fields
+        Values that the file lacks, or that replace the file's, by their names in `Recording`:
+        `sample_rate` (Hz), `start_time` (s), `pulse_times` (s), `reference_pulse_times` (s),
+        `tach_rate` (Hz), `pulses_per_revolution`, `pulses_per_trigger`, `ratio`, `orders`,
+        `channel_names`, `units`, `description`. None stands for the file's value. The times that a
+        `.csv` or a bag holds for its samples are not replaced: `sample_rate` must agree with them.
+
+    Raises
+    ------
+    ParameterError
+        If `fields` holds an unknown name.
+    RecordingError
+        If the file is missing, broken, unsafe or lacks what a recording needs, in one line that
+        starts with the path.
+
+    Examples
+    --------
+    >>> import tempfile, numpy as np
+    >>> from sa_jitter_ros.recordings import read
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     np.savez(f'{folder}/rig.npz', vibration=np.zeros((2, 5000)), sample_rate=5000.0,
+    ...              pulse_times=np.arange(0.0, 1.0, 0.04))
+    ...     recording = read(f'{folder}/rig.npz', ratio=2.5, orders=(20, 40))
+    >>> recording.channels, recording.duration, recording.ratio, recording.orders
+    (2, 1.0, 2.5, (20.0, 40.0))
+
+    """
+    unknown = sorted(fields.keys() - CONVERTED.keys())
+    if unknown:
+        raise ParameterError(f'a recording has no field {", ".join(unknown)}: give some of '
+                             f'{", ".join(CONVERTED)}')
+    path = Path(path)
+    if isinstance(vibration_channels, str):
+        vibration_channels = (vibration_channels,)
+    channel_map = ChannelMap(tuple(map(str, vibration_channels)), str(tach_channel),
+                             str(time_column))
+    with recording_errors(path):
+        if not path.exists():
+            raise RecordingError('no such file or folder')
+        suffix = 'bag' if path.is_dir() else path.suffix.lower()
+        if suffix not in ('bag', *SUFFIXES):
+            raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
+                                 f'{", ".join(SUFFIXES)} or a rosbag2 folder')
+        given = converted_fields({key: value for key, value in fields.items()
+                                  if value is not None})
+        if suffix in ('.npz', '.mat'):
+            opened = open_npz if suffix == '.npz' else open_mat
+            recording = channel_map.select(opened(path, acquisition=acquisition, given=given))
+        elif suffix == '.wav':
+            recording = channel_map.select(replace(open_wav(path), **given))
+        else:
+            rate = given.pop('sample_rate', None)
+            recording = replace(
+                open_csv(path, channel_map=channel_map, sample_rate=rate) if suffix == '.csv' else
+                open_bag(path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
+                **given)
+        if not 0 <= acquisition < recording.acquisitions:
+            raise RecordingError(f'acquisition {acquisition}: the file holds '
+                                 f'{recording.acquisitions}, numbered from 0')
+        return replace(recording, description=recording.description or path.name, path=str(path))

@@ -1,0 +1,1 @@
+"""The report of the loop: report.json, report.html and the figures."""

@@ -1,0 +1,274 @@
+"""Figures of the evidence: pulse errors, the trigger cycle, amplitudes; expected and observed."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect
+from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.prediction.with_effects import predict_with
+from sa_jitter_ros.pulses.angle_law import LINEAR
+from sa_jitter_ros.report.expected_errors import cycle_places, lags_of, Version, versions_of, whole
+from sa_jitter_ros.report.plotting import AFTER, BEFORE, legend_below, MEASURED, panels
+
+Array = NDArray[Any]
+
+_MICRO = 1e6
+_MOST_POINTS = 3000
+_STEPS = 16  # places in a trigger cycle
+
+
+def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+    """Draw the pulse errors: time, distribution, autocorrelation, clock, origin, steadiness."""
+    evidence, versions = whole(evidence), versions_of(evidence, effects)
+    figure, axes = panels(8, columns=4)
+    _over_time(axes[0], evidence, versions[-1])
+    _law(axes[1], evidence, versions)
+    _autocorrelation(axes[2], evidence, versions)
+    _return_map(axes[3], evidence)
+    _lattice(axes[4], evidence)
+    _origin(axes[5], evidence)
+    _steadiness(axes[6], evidence, versions)
+    _intervals(axes[7], evidence)
+    return figure
+
+
+def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
+    """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
+    evidence, versions = whole(evidence), versions_of(evidence, effects)
+    figure, axes = panels(3, columns=3)
+    _profile(axes[0], evidence, versions)
+    _dependence_on_cycles(axes[1], evidence, versions)
+    _folded(axes[2], evidence, versions[-1])
+    return figure
+
+
+def amplitudes(evidence: Evidence, channel_names: Sequence[str]) -> Figure:
+    """Draw how the strongest lines vary: over time, with each other, and their spectrum."""
+    lines = evidence.lines
+    figure, axes = panels(3, columns=3)
+    strongest = np.argsort(lines.radial_noise)[:4]
+    names = [f'order {lines.order[k]:g}, {channel_names[lines.channel[k]]}' for k in strongest]
+    moves = lines.radial[..., strongest]
+    cycles = moves.shape[1]
+    for move, name in zip(moves.reshape(-1, len(names)).T, names):
+        axes[0].plot(move, linewidth=0.6, alpha=0.8, label=name)
+    axes[0].set(title='cycle by cycle', xlabel='trigger cycle of the fitted acquisitions',
+                ylabel='amplitude over its level, less 1')
+    legend_below(axes[0])
+    for other in range(1, len(names)):
+        axes[1].plot(_thinned(moves[..., 0]), _thinned(moves[..., other]), '.', markersize=2,
+                     color=f'C{other}', label=names[other])
+    axes[1].set(title='correlation between lines', xlabel=f'less 1: {names[0]}',
+                ylabel='less 1: other lines')
+    if len(names) > 1:
+        legend_below(axes[1])
+    power = np.mean(np.abs(np.fft.rfft(moves, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
+    axes[2].semilogy(np.fft.rfftfreq(cycles)[1:], power, linewidth=0.9)
+    axes[2].set(title='spectrum', xlabel='frequency in cycles per trigger cycle',
+                ylabel='density')
+    return figure
+
+
+# --- panels of pulse errors ----------------------------------------------------------------------
+
+def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
+    """Draw the errors over the length of an acquisition: what they have in common is a trend."""
+    times = evidence.times - evidence.times[:, :1]
+    for row in range(min(len(times), 8)):
+        axes.plot(times[row], _MICRO * evidence.errors[row], color='0.7', linewidth=0.6,
+                  label='single acquisitions' if row == 0 else None)
+    axes.plot(times.mean(axis=0), _MICRO * evidence.errors.mean(axis=0), color=MEASURED,
+              label='mean of all')
+    if version.patterns.any():
+        axes.plot(times[0], _MICRO * version.patterns[0], color=version.colour, linewidth=0.9,
+                  label='known part, first acquisition')
+    axes.set(title='over an acquisition', xlabel='time since its start [s]',
+             ylabel='pulse error [µs]')
+    legend_below(axes)
+
+
+def _law(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+    """Draw the histogram of the errors and the expected distributions."""
+    errors = _MICRO * evidence.errors.ravel()
+    top = max(np.abs(errors).max(), *(_MICRO * np.quantile(np.abs(item.draws), 0.999)
+                                      for item in versions))
+    edges = np.linspace(-top, top, 41).tolist()
+    axes.hist(errors, edges, density=True, color='0.8', label='recovered')
+    for item in versions:
+        axes.hist(_MICRO * item.draws, edges, density=True, histtype='step', color=item.colour,
+                  label=item.label)
+    axes.set(title='distribution', xlabel='pulse error [µs]', ylabel='density [1/µs]')
+    legend_below(axes)
+
+
+def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+    """Draw the autocorrelation of the errors with its standard error."""
+    errors = evidence.errors
+    lags = np.arange(lags_of(evidence))
+    rows = np.array([[np.mean(row[:row.size - k] * row[k:]) for k in lags] for row in errors])
+    scale = rows[:, 0].mean()
+    error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows)) / scale
+    for item in versions:
+        axes.plot(lags, item.autocovariance / item.autocovariance[0], color=item.colour,
+                  marker='_', label=item.label)
+    axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o', markersize=3,
+                  capsize=2, color=MEASURED, label='recovered')
+    axes.set(title='autocorrelation', xlabel='lag [trigger pulses]', ylabel='correlation')
+    legend_below(axes)
+
+
+def _return_map(axes: Axes, evidence: Evidence) -> None:
+    """Draw each error over the one before: a cloud, an ellipse, lines or spots."""
+    errors = _MICRO * evidence.errors
+    axes.plot(_thinned(errors[:, :-1]), _thinned(errors[:, 1:]), '.', color=MEASURED, markersize=2)
+    axes.set(title='from pulse to pulse', xlabel='pulse error [µs]',
+             ylabel='error of the next pulse [µs]')
+
+
+def _lattice(axes: Axes, evidence: Evidence) -> None:
+    """Draw the errors against the ticks of a clock: that of the pulse times, else the declared."""
+    errors = _MICRO * evidence.errors
+    known = [pulses.errors for pulses in evidence.pulses if pulses.errors is not None]
+    if len(known) == len(errors):
+        grid = np.array(known)
+        grid = _MICRO * (grid - grid.mean(axis=1, keepdims=True))
+        axes.plot(_thinned(grid), _thinned(errors), '.', color=MEASURED, markersize=2)
+        axes.plot(*2 * [[grid.min(), grid.max()]], color=AFTER, linewidth=0.9, label='slope 1')
+        axes.set(title=f'clock of the pulse times, {evidence.clock.rate:.6g} Hz',
+                 xlabel='error that its ticks impose [µs]', ylabel='recovered pulse error [µs]')
+        legend_below(axes)
+        return
+    rate = evidence.model.keyphasor_rate
+    ticks = ((evidence.times - evidence.errors) * rate) % 1.0
+    axes.plot(_thinned(ticks), _thinned(errors), '.', color=MEASURED, markersize=2)
+    axes.set(title=f'declared clock, {rate:.6g} Hz', xlabel='pulse time x clock mod 1',
+             ylabel='pulse error [µs]')
+
+
+def _origin(axes: Axes, evidence: Evidence) -> None:
+    """Draw whether the measured pulse times follow the recovered errors."""
+    x = _MICRO * np.diff(evidence.errors, 2, axis=1)
+    y = np.diff(evidence.times, 2, axis=1)
+    half = 0.5 * evidence.period
+    y = _MICRO * ((y + half) % (2.0 * half) - half)
+    axes.plot(_thinned(x), _thinned(y), '.', color=MEASURED, markersize=2)
+    ends = np.array([x.min(), x.max()])
+    axes.plot(ends, ends, color=AFTER, linewidth=0.9, label='error of the tach')
+    axes.plot(ends, 0.0 * ends, color=BEFORE, linewidth=0.9, label='motion of the vibration side')
+    axes.set(title='origin: second differences', xlabel='of the pulse errors [µs]',
+             ylabel='of the pulse times [µs]')
+    legend_below(axes)
+
+
+def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+    """Draw the size of the errors over the record."""
+    size = np.sqrt(np.mean(evidence.errors**2, axis=1))
+    axes.plot(evidence.times.mean(axis=1), _MICRO * size, 'o', markersize=3, color=MEASURED,
+              label='acquisitions')
+    for item in versions:
+        axes.axhline(_MICRO * item.std, color=item.colour, linewidth=0.9, label=item.label)
+    axes.set(title='size over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
+    axes.set_ylim(bottom=0.0)
+    legend_below(axes)
+
+
+def _intervals(axes: Axes, evidence: Evidence) -> None:
+    """Draw how long the pulse intervals are."""
+    intervals = np.diff(evidence.record_times)
+    axes.hist(intervals / np.median(intervals), 60, color='0.6')
+    axes.set_yscale('log')
+    axes.set_ylim(bottom=0.5)
+    axes.set(title='pulse intervals', xlabel='interval over their median', ylabel='number')
+
+
+# --- panels of the trigger cycle -----------------------------------------------------------------
+
+def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+    """Draw the RMS angle error over the trigger cycle: large at its ends or in the middle."""
+    u = cycle_places()
+    for item in versions:
+        axes.plot(u, _MICRO * item.profile, color=item.colour, label=item.label)
+    size = np.sqrt(np.mean(_angle_errors(evidence, u) ** 2, axis=(0, 1)))
+    axes.plot(u, _MICRO * size, color=MEASURED, linewidth=0.0, marker='.', label='recovered')
+    axes.set(title='over the trigger cycle', xlabel='u, position in the trigger cycle',
+             ylabel='RMS angle error [µs]')
+    axes.set_ylim(bottom=0.0)
+    legend_below(axes)
+
+
+def _angle_errors(evidence: Evidence, u: Array) -> Array:
+    """
+    Return the angle error (acquisition, cycle, u) in s: pulse errors and ripple.
+
+    The ripple is that between lines from pulse to pulse, part of which other laws follow.
+    """
+    cycles = evidence.errors.shape[1] - 1
+    late = evidence.times - evidence.times[:, :1] - evidence.period * np.arange(cycles + 1)
+    read = (evidence.model.weights.path(late, u, cycles)
+            - LINEAR.path(late - evidence.errors, u, cycles))
+    ripple = np.where(np.isfinite(evidence.ripple), evidence.ripple, 0.0)[:, :, None]
+    return np.asarray(read + ripple * u * (1.0 - u))
+
+
+def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+    """Draw the attenuation that the pulse errors make in averages of fewer cycles."""
+    model = evidence.model
+    counts = np.unique(np.geomspace(1, model.trigger_cycles, 7).astype(int))
+    path = _angle_errors(evidence, np.arange(_STEPS) / _STEPS + 0.5 / _STEPS)
+    turns = 2j * np.pi * model.fundamental_frequency * path
+    single = np.array([np.abs(np.exp(g * turns).mean()) for g in model.orders])
+    g = model.orders[int(np.argmin(np.abs(single - 0.7)))]
+    gain = np.exp(g * turns).mean(axis=2)
+    means, spreads = [], []
+    for n in counts:
+        whole = gain.shape[1] // n
+        each = np.abs(gain[:, :whole * n].reshape(len(gain), whole, n).mean(axis=2)).mean(axis=1)
+        means.append(each.mean())
+        spreads.append(each.std(ddof=1) / np.sqrt(len(each)))
+    axes.errorbar(counts, means, yerr=spreads, fmt='o', color=MEASURED, markersize=4, capsize=2,
+                  label='of the recovered errors')
+    for item in versions:
+        curve = [predict_with(replace(model, trigger_cycles=int(n), noise_std=0.0, orders=(g,)),
+                              item.effects).mean_attenuation[0] for n in counts]
+        axes.plot(counts, curve, color=item.colour, label=item.label)
+    axes.set_xscale('log')
+    axes.set_xticks(counts, [str(n) for n in counts])
+    axes.set_xticks([], minor=True)
+    axes.set(title=f'order {g:g} over the number of cycles', xlabel='averaged trigger cycles',
+             ylabel='attenuation')
+    legend_below(axes)
+
+
+def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
+    """Draw the mean error over the pulse index, folded by the target or a few pulses."""
+    model = evidence.model
+    step = model.pulses_per_trigger or model.pulses_per_revolution
+    angles = [effect.values['pulse_angles'] for effect in version.effects
+              if effect.name == 'target_geometry']
+    marks = len(angles[0]) if angles else 1
+    period = marks // int(np.gcd(marks, step)) if marks > 1 else 12
+    period = min(period, evidence.errors.shape[1])
+    index = np.array([pulses.index for pulses in evidence.pulses]) % period
+    places = np.unique(index)
+    mean = np.array([evidence.errors[index == k].mean() for k in places])
+    error = np.array([evidence.errors[index == k].std() / np.sqrt((index == k).sum())
+                      for k in places])
+    axes.errorbar(places, _MICRO * mean, yerr=_MICRO * error, fmt='o', color=MEASURED, capsize=2,
+                  markersize=4, label='recovered, mean')
+    if angles:
+        known = np.array([version.patterns[index == k].mean() for k in places])
+        axes.plot(places, _MICRO * known, color=version.colour, marker='_', label=version.label)
+    axes.axhline(0.0, color='0.4', linewidth=0.8)
+    axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse mod {period}',
+             ylabel='pulse error [µs]')
+    legend_below(axes)
+
+
+def _thinned(values: Array) -> Array:
+    flat = values.ravel()
+    return np.asarray(flat[::max(1, flat.size // _MOST_POINTS)])

@@ -1,0 +1,115 @@
+"""What a model expects of the pulse errors that the evidence shows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect
+from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.prediction.angle_error import joint_characteristic
+from sa_jitter_ros.prediction.with_effects import jitter_processes, known_errors
+from sa_jitter_ros.report.plotting import AFTER, BEFORE, with_effects
+from scipy.linalg import toeplitz
+
+Array = NDArray[Any]
+
+_MOST_LAGS = 25
+_SMALL = 1e-5  # s, an error that a small coefficient of the characteristic function is for
+_DRAWS, _SEED = 20_000, 3
+# Effects that recovered errors do not show: gaps are repaired first, samples come as they are.
+_NOT_IN_ERRORS = ('missing_pulses', 'interpolation_loss')
+
+
+@dataclass(frozen=True)
+class Version:
+    """
+    What one model expects of the pulse errors; times in s.
+
+    `effects` are those that pulse errors show; `autocovariance` (lag,) is that of errors of mean 0
+    in each acquisition, `std` their size, `draws` some of them, `profile` (u,) the RMS angle error
+    over the trigger cycle, `patterns` (acquisition, N_t + 1) what is known of each pulse.
+    """
+
+    label: str
+    colour: str
+    effects: tuple[Effect, ...]
+    autocovariance: Array
+    std: float
+    draws: Array
+    profile: Array
+    patterns: Array
+
+
+def versions_of(evidence: Evidence, effects: Sequence[Effect]) -> list[Version]:
+    """Return what declared model and, if there are any, added effects expect."""
+    declared = evidence.explained
+    found = [_version('declared model', BEFORE, evidence, declared)]
+    if effects:
+        label = with_effects([effect.name for effect in effects])
+        found.append(_version(label, AFTER, evidence, (*declared, *effects)))
+    return found
+
+
+def whole(evidence: Evidence) -> Evidence:
+    """Return the evidence with what declared effects know of the errors put back into them."""
+    return replace(evidence, errors=evidence.errors + _patterns(evidence, evidence.explained))
+
+
+def _patterns(evidence: Evidence, effects: Sequence[Effect]) -> Array:
+    """Return what effects know of each pulse error (acquisition, N_t + 1) in s."""
+    patterns = np.zeros(evidence.errors.shape)
+    for row, pulses in zip(patterns, evidence.pulses):
+        known = known_errors(evidence.model, _timing(effects), pulses)
+        if known is not None:
+            row += known - known.mean()
+    return patterns
+
+
+def _timing(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    return tuple(effect for effect in effects
+                 if not effect.scatters and effect.name not in _NOT_IN_ERRORS)
+
+
+def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect, ...]) -> Version:
+    model = evidence.model
+    count = evidence.errors.shape[1]
+    patterns = _patterns(evidence, effects)
+    random = replace(evidence, explained=effects).expected_autocovariance(np.arange(count))
+    noise = _noise(evidence)
+    covariance = toeplitz(random) + noise**2 * np.eye(count)
+    centred = covariance - covariance.mean(axis=0) - covariance.mean(axis=1)[:, None]
+    centred += covariance.mean() + patterns.T @ patterns / len(patterns)
+    total = np.array([np.trace(centred, lag) / (count - lag) for lag in range(lags_of(evidence))])
+    rng = np.random.default_rng(_SEED)
+    replaced = any(effect.replaces_jitter(model) for effect in effects)
+    jitter = np.zeros(_DRAWS) if replaced else model.distribution.draw(rng, _DRAWS)
+    rest = max(random[0] - (0.0 if replaced else model.distribution.variance), 0.0) + noise**2
+    draws = jitter + np.sqrt(rest) * rng.standard_normal(_DRAWS)
+    draws += rng.choice(patterns.ravel(), _DRAWS)
+    u = cycle_places()
+    small = 1e-2 / (max(np.sqrt(random[0]), _SMALL) * model.fundamental_frequency)
+    processes = jitter_processes(model, effects)
+    first = np.abs(joint_characteristic(processes, [small], [u], [0]))
+    variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
+    path = model.weights.path(patterns, u, model.trigger_cycles)
+    profile = np.sqrt(np.maximum(variance, 0.0) + np.mean(path**2, axis=(0, 1)))
+    return Version(label, colour, _timing(effects), total, float(np.sqrt(total[0])), draws,
+                   profile, patterns)
+
+
+def _noise(evidence: Evidence) -> float:
+    """Return the mean standard error of the pulse errors, 0 where it is unknown."""
+    known = evidence.standard_errors[np.isfinite(evidence.standard_errors)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else 0.0
+
+
+def lags_of(evidence: Evidence) -> int:
+    """Return how many lags of the autocovariance are worth showing."""
+    return min(_MOST_LAGS + 1, int(evidence.errors.shape[1]) // 2 + 1)
+
+
+def cycle_places() -> Array:
+    """Return places in a trigger cycle (u,)."""
+    return np.linspace(0.0, 1.0, 41)

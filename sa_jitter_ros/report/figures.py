@@ -1,0 +1,194 @@
+"""The figures of a report: residual over orders, distributions, and what convicted the effect."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+import io
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect
+from sa_jitter_ros.inference.expectation import Expectation
+from sa_jitter_ros.inference.residual import Residual
+from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.prediction.amplitude_law import AmplitudeLaw
+from sa_jitter_ros.report import evidence_figures
+from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
+
+Array = NDArray[Any]
+
+_FEWEST_CYCLES = 3
+_MOST_PANELS = 3
+_POINTS = 200
+_BAND = 1.96
+_SPREAD = 0.6  # of the distance of two orders over which its lines are spread
+
+
+@dataclass(frozen=True)
+class Illustration:
+    """A figure with the stem of its file name, a title and what it shows."""
+
+    name: str
+    title: str
+    caption: str
+    figure: Figure
+
+    def png(self) -> bytes:
+        """Return the figure as PNG."""
+        buffer = io.BytesIO()
+        FigureCanvasAgg(self.figure)
+        self.figure.savefig(buffer, format='png', dpi=110)
+        return buffer.getvalue()
+
+
+def illustrate(trace: Trace) -> tuple[Illustration, ...]:
+    """Draw the figures of a trace; those of the evidence only where there is some."""
+    held_out = f'{len(trace.held_out)} held-out acquisitions'
+    found = [
+        Illustration(
+            'residual', 'Residual over orders',
+            f'Mean attenuation of the {held_out}, observed and predicted, and the difference of '
+            'the two. Every mark is one line: an order on one channel. Bars are one standard '
+            'error; 95 of 100 lines of a right prediction lie in the grey band.',
+            _residual_figure(trace)),
+        Illustration(
+            'distribution', 'Distribution of the amplitudes',
+            f'Distribution function of the amplitudes of the {held_out}, over the level of their '
+            'line, and the predicted one; and of all lines together as the share of '
+            'amplitudes below each predicted probability, which is the diagonal where the '
+            'prediction is right.', _distribution_figure(trace))]
+    if trace.evidence is None or trace.observation.model.trigger_cycles < _FEWEST_CYCLES:
+        return tuple(found)
+    effects = _effects(trace)
+    drawn: Sequence[tuple[str, str, str, Callable[..., Figure]]] = (
+        ('pulse_errors', 'Pulse errors',
+         'Pulse errors (measured minus true time) of the fitted acquisitions, with no effect '
+         'removed, and what the declared model and the report expect.',
+         evidence_figures.pulse_errors),
+        ('trigger_cycle', 'Inside the trigger cycle, and over the number of cycles',
+         'How the angle error is spread over the trigger cycle, how the attenuation changes with '
+         'the number of averaged cycles, and how the pulse errors repeat with the pulse index.',
+         evidence_figures.trigger_cycle),
+        ('amplitudes', 'Amplitudes of the lines',
+         'How the amplitudes vary from cycle to cycle after the pulse errors are removed: '
+         'timing does not cause these variations.',
+         lambda evidence, _: evidence_figures.amplitudes(
+             evidence, trace.observation.channel_names)))
+    for name, title, caption, draw in drawn:
+        found.append(Illustration(name, title, caption, draw(trace.evidence, effects)))
+    return tuple(found)
+
+
+def _effects(trace: Trace) -> tuple[Effect, ...]:
+    return tuple(item.effect for item in trace.findings if item.effect is not None)
+
+
+def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:
+    """Return label, colour, prediction and residual before and, with effects, after."""
+    before = ('declared model', BEFORE, trace.prediction_before, trace.before)
+    if not trace.findings:
+        return [before]
+    label = with_effects([item.name for item in trace.findings])
+    return [before, (label, AFTER, trace.prediction_after, trace.after)]
+
+
+def _positions(trace: Trace) -> tuple[Array, Array]:
+    """Return where each line is drawn, channels spread around their order's place; the orders."""
+    orders, place = np.unique(trace.observation.orders[trace.lines.order], return_inverse=True)
+    channels, shift = np.unique(trace.lines.channel, return_inverse=True)
+    offset = _SPREAD * ((shift + 0.5) / channels.size - 0.5)
+    return place + offset, orders
+
+
+def _residual_figure(trace: Trace) -> Figure:
+    position, orders = _positions(trace)
+    versions = _versions(trace)
+    held_out = list(trace.held_out)
+    figure = Figure(figsize=(10.0, 3.1 * (1 + len(versions))), layout='constrained')
+    axes = figure.subplots(1 + len(versions), 1, sharex=True)
+    observed = trace.attenuation[held_out]
+    axes[0].errorbar(position, observed.mean(axis=0), yerr=observed.std(axis=0), fmt='o',
+                     color=MEASURED, markersize=4, capsize=2,
+                     label='observed: mean, scatter of the acquisitions')
+    for label, colour, expected, _ in versions:
+        axes[0].plot(position, expected.attenuation[held_out].mean(axis=0), '_', color=colour,
+                     markersize=12, markeredgewidth=2, label=f'predicted, {label}')
+    axes[0].set_ylabel('attenuation\n(1: nothing lost)')
+    axes[0].legend(fontsize='small', loc='best')
+    for row, (label, colour, _, left) in zip(axes[1:], versions):
+        half = _BAND * left.standard_error
+        row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
+                width=_SPREAD / np.unique(trace.lines.channel).size)
+        row.errorbar(position, left.mean, yerr=left.standard_error, fmt='o', color=colour,
+                     markersize=4, capsize=2, label=f'{label}: RMS {left.rms:.4f}')
+        row.axhline(0.0, color='0.4', linewidth=0.8)
+        row.use_sticky_edges = False
+        row.margins(y=0.08)
+        row.set_ylabel('observed minus predicted\nattenuation')
+        row.legend(fontsize='small', loc='best')
+    step = max(1, orders.size // 30)
+    axes[-1].set_xticks(np.arange(orders.size)[::step], [f'{g:g}' for g in orders[::step]],
+                        rotation=0 if orders.size <= 20 else 90)
+    axes[-1].set_xlabel('order (channels side by side)')
+    axes[-1].set_xlim(-0.6, orders.size - 0.4)
+    return figure
+
+
+def _distribution_figure(trace: Trace) -> Figure:
+    chosen = _most_telling(trace)
+    held_out = np.array(trace.held_out)
+    figure, axes = panels(len(chosen) + 1, columns=min(len(chosen) + 1, 4))
+    amplitude = trace.amplitude[held_out]
+    for one, line in zip(axes, chosen):
+        order = trace.observation.orders[trace.lines.order[line]]
+        channel = trace.observation.channel_names[trace.lines.channel[line]]
+        _observed_share(one, amplitude[:, line])
+        low, high = amplitude[:, line].min(), amplitude[:, line].max()
+        for label, colour, expected, _ in _versions(trace):
+            mean = expected.amplitude[held_out, line]
+            reach = 3.0 * np.sqrt(expected.amplitude_variance[held_out, line].mean())
+            x = np.linspace(max(0.0, min(low, mean.min() - reach)), max(high, mean.max() + reach),
+                            _POINTS)
+            law = _rows(expected.law, held_out * trace.lines.count + line)
+            one.plot(x, law.cdf(x).mean(axis=0), color=colour, label=label)
+        one.set(title=f'order {order:g}, {channel}', xlabel='amplitude over its mean level',
+                ylabel='share below')
+        one.legend(fontsize='x-small')
+    _probability_panel(trace, axes[-1])
+    return figure
+
+
+def _probability_panel(trace: Trace, axes: Axes) -> None:
+    """Draw the share of all amplitudes below each predicted probability."""
+    for label, colour, expected, left in _versions(trace):
+        probability = expected.law.cdf(trace.amplitude.reshape(-1, 1)).reshape(
+            trace.amplitude.shape)[list(trace.held_out)].ravel()
+        _observed_share(axes, probability, color=colour, label=f'{label}: KS {left.ks:.3f}')
+    axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
+    axes.set(title='all lines', xlabel='predicted probability',
+             ylabel='share below')
+    axes.legend(fontsize='x-small')
+
+
+def _most_telling(trace: Trace) -> list[int]:
+    """Return the line of the largest standardised residual of each of a few orders."""
+    size = np.abs(trace.before.mean) / trace.before.standard_error
+    best = [int(rows[np.argmax(size[rows])]) for order in np.unique(trace.lines.order)
+            for rows in [np.flatnonzero(trace.lines.order == order)]]
+    best = sorted(best, key=lambda line: -size[line])[:_MOST_PANELS]
+    return sorted(best, key=lambda line: int(trace.lines.order[line]))
+
+
+def _rows(law: AmplitudeLaw, index: Array) -> AmplitudeLaw:
+    """Return the law of some entries."""
+    return AmplitudeLaw(*(getattr(law, item.name)[index] for item in fields(law)))
+
+
+def _observed_share(axes: Axes, sample: Array, *, color: str = MEASURED,
+                    label: str = 'observed') -> None:
+    ordered = np.sort(sample)
+    axes.step(ordered, (np.arange(ordered.size) + 0.5) / ordered.size, where='mid', color=color,
+              label=label)

@@ -1,0 +1,219 @@
+"""The report of a trace as files: `report.json`, self-contained `report.html`, PNG figures."""
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+import json
+import re
+from typing import Any
+
+from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.report.figures import illustrate, Illustration
+
+Json = Any
+
+_STYLE = """
+body { font: 15px/1.45 sans-serif; color: #222; max-width: 62rem; margin: 2rem auto;
+       padding: 0 1rem }
+h1 { font-size: 1.5rem }
+h2 { font-size: 1.15rem; margin-top: 2rem }
+.verdict { font-size: 1.1rem; padding: .8rem 1rem; border-left: .4rem solid; background: #f3f3f3 }
+.traced { border-color: #1f77b4 }
+.none { border-color: #2ca02c }
+.unexplained { border-color: #d62728 }
+table { border-collapse: collapse; margin: .5rem 0 }
+th, td { border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; vertical-align: top }
+td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
+figure { margin: 1rem 0 }
+img { max-width: 100% }
+figcaption { color: #555 }
+"""
+_ERRORS = (
+    ('rms', 'RMS of observed minus predicted attenuation'),
+    ('rms_standard_error', 'part of the RMS that is its standard error (in quadrature)'),
+    ('rms_parameter_error', 'part of the standard error that the fitted parameters cause'),
+    ('chi2_per_dof', 'chi2 per degree of freedom of the amplitudes'),
+    ('ks', 'Kolmogorov-Smirnov distance from the predicted distribution'),
+    ('cramer_von_mises', 'Cramer-von Mises statistic'),
+    ('coverage_95', 'share of amplitudes in the 95 % band'),
+    ('p_value', 'p value of the residual'))
+
+
+def report_files(trace: Trace, content: Mapping[str, Json]) -> Mapping[str, bytes]:
+    """Return all files of a report by name; `content` is that of `report.json`."""
+    figures = illustrate(trace)
+    pictures = {f'{item.name}.png': item.png() for item in figures}
+    page = html(content, figures, pictures)
+    return {'report.json': _json(content),
+            'report.html': page.encode(), **pictures}
+
+
+def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, bytes]]
+                 ) -> Mapping[str, bytes]:
+    """
+    Return the files of several shafts by path: those of each in a folder, and an index.
+
+    `content` is that of the common `report.json`; `files` are those of each shaft.
+    """
+    rows = ''.join(
+        f'<tr><td><a href="{escape(shaft)}/report.html">{escape(shaft)}</a></td>'
+        f'<td>{escape(verdict_sentence(item))}</td></tr>\n'
+        for shaft, item in content['shafts'].items())
+    page = _page(content['verdict'], [
+        '<h1>Measured against predicted attenuation</h1>',
+        f'<table>\n<tr><th>shaft</th><th>result</th></tr>\n{rows}</table>'])
+    return {'report.json': _json(content), 'report.html': page.encode(),
+            **{f'{shaft}/{name}': data for shaft, each in files.items()
+               for name, data in each.items()}}
+
+
+def verdict_sentence(content: Mapping[str, Json]) -> str:
+    """Return the verdict of a report in one plain sentence."""
+    before, after = content['error_before'], content['error_after']
+    error = (f'the held-out error goes from {_number(before["rms"])} to {_number(after["rms"])} '
+             f'(RMS of observed minus predicted attenuation), chi2 per degree of freedom from '
+             f'{_number(before["chi2_per_dof"])} to {_number(after["chi2_per_dof"])}')
+    added = ' and '.join(f'{item["name"]} ({_parameters(item)})'
+                         for item in content['missing_effects'])
+    if content['verdict'] == 'none':
+        return (f'The declared model suffices: no significant residual (p = '
+                f'{_number(before["p_value"])}), held-out error {_number(before["rms"])} (RMS of '
+                'observed minus predicted attenuation).')
+    if content['verdict'] == 'traced':
+        return f'The declared model lacks {added}: with it {error}.'
+    left = ', '.join(filter(None, (f'p = {_number(after["p_value"])}', content['remains'])))
+    if added:
+        return (f'The residual is not explained: even with {added} a significant one remains '
+                f'({left}); {error}.')
+    return (f'The residual is significant ({left}, held-out error {_number(after["rms"])}) and '
+            'none of the known effects explains it.')
+
+
+def html(content: Mapping[str, Json], figures: Sequence[Illustration],
+         pictures: Mapping[str, bytes]) -> str:
+    """Return the page; `pictures` are the PNGs of the figures by file name."""
+    verdict = content['verdict']
+    parts = [
+        '<h1>Measured against predicted attenuation</h1>',
+        f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
+        *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
+        *_effects(content['missing_effects']),
+        '<h2>Error of held-out acquisitions</h2>', _error_table(content),
+        '<h2>What the residual changes with</h2>', _dependence_table(content['dependence']),
+        *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
+        '<h2>Candidates</h2>', _candidate_table(content['candidates']),
+        '<h2>Lines</h2>', _line_table(content['lines']),
+        '<h2>Declared model and data</h2>', _declared_table(content)]
+    return _page(verdict, parts)
+
+
+def _json(content: Mapping[str, Json]) -> bytes:
+    return (json.dumps(content, indent=2, allow_nan=False) + '\n').encode()
+
+
+def _page(verdict: str, parts: Sequence[str]) -> str:
+    return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+            f'<title>Report: {escape(verdict)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n'
+            + '\n'.join(parts) + '\n</body>\n</html>\n')
+
+
+def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
+    for number, item in enumerate(effects, 1):
+        yield f'<h2>{number}. Missing effect: {escape(item["name"])}</h2>'
+        yield _table(('parameter', 'value', 'standard error', 'unit'), [
+            (name, _number(value['value']), _number(value['standard_error']), _unit(value))
+            for name, value in item['parameters'].items()])
+        text = f'Evidence: {item["evidence"]}.'
+        if item['indistinguishable_from']:
+            text += (' These data cannot tell it from '
+                     f'{", ".join(item["indistinguishable_from"])}.')
+        yield f'<p>{escape(text)}</p>'
+
+
+def _error_table(content: Mapping[str, Json]) -> str:
+    before, after = content['error_before'], content['error_after']
+    return _table(('', 'before', 'after'), [
+        *((text, _number(before[key]), _number(after[key])) for key, text in _ERRORS),
+        ('unsteadiness: unexplained scatter of the amplitudes, included in the scale',
+         *2 * (_number(content['unsteadiness']),))])
+
+
+def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
+    return _table(
+        ('from its lowest to its highest', 'from', 'to', 'change before', 'p value',
+         'change after', 'p value'),
+        [(item['on'].replace('_', ' '), _number(item['low']),
+          f'{_number(item["high"])} {item["unit"]}'.strip(),
+          *(text for when in ('before', 'after') for text in (
+              f'{_number(item[when]["change"])} ± {_number(item[when]["standard_error"])}',
+              _number(item[when]['p_value'])))) for item in rows])
+
+
+def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
+    return _table(('round', 'effect', 'held-out score', 'p value', 'outcome'), [
+        (item['round'], item['name'], _number(item['held_out_score']), _number(item['p_value']),
+         item['rejected_because'] or 'added') for item in candidates])
+
+
+def _line_table(lines: Sequence[Mapping[str, Json]]) -> str:
+    keys = ('level', 'observed', 'predicted_before', 'predicted_after', 'standard_error')
+    return _table(
+        ('order', 'channel', 'amplitude', 'observed attenuation', 'predicted before',
+         'predicted after', 'standard error'),
+        [(_number(item['order']), item['channel'], *(_number(item[key]) for key in keys))
+         for item in lines])
+
+
+def _declared_table(content: Mapping[str, Json]) -> str:
+    rows = [(key, _number(value)) for key, value in content['declared'].items()]
+    rows += [('measured trigger_speed', _number(content['measured_speed'])),
+             ('recordings', ', '.join(content['recordings'])),
+             ('attenuation measured against', content['against']),
+             ('acquisitions fitted', content['acquisitions']['fit']),
+             ('acquisitions held out', content['acquisitions']['held_out'])]
+    return _table(('quantity', 'value'), rows)
+
+
+def _figure(item: Illustration, picture: bytes) -> str:
+    data = base64.b64encode(picture).decode()
+    return (f'<h2>{escape(item.title)}</h2>\n<figure>'
+            f'<img alt="{escape(item.title)}" src="data:image/png;base64,{data}">'
+            f'<figcaption>{escape(item.caption)}</figcaption></figure>')
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[Json]]) -> str:
+    lines = ['<tr>' + ''.join(f'<th>{escape(cell)}</th>' for cell in head) + '</tr>']
+    lines += ['<tr>' + ''.join(_cell(cell) for cell in row) + '</tr>' for row in rows]
+    return '<table>\n' + '\n'.join(lines) + '\n</table>'
+
+
+def _cell(value: Json) -> str:
+    text = str(value)
+    kind = ' class="number"' if re.fullmatch(r'–|[-\d.e+]+', text) else ''
+    return f'<td{kind}>{escape(text)}</td>'
+
+
+def _parameters(effect: Mapping[str, Json]) -> str:
+    return ', '.join(
+        f'{name} = {_with_error(item["value"], item["standard_error"])} {_unit(item)}'.rstrip()
+        for name, item in effect['parameters'].items())
+
+
+def _with_error(value: Json, error: Json) -> str:
+    if isinstance(value, list):
+        errors = error if isinstance(error, list) else [error] * len(value)
+        return '[' + ', '.join(_with_error(*pair) for pair in zip(value, errors)) + ']'
+    return _number(value) + (f' ± {error:.2g}' if isinstance(error, float) else '')
+
+
+def _unit(parameter: Mapping[str, Json]) -> str:
+    return '' if parameter['unit'] == '1' else str(parameter['unit'])
+
+
+def _number(value: Json) -> str:
+    """Return a value as people read it, a dash for what is undefined."""
+    if value is None:
+        return '–'
+    if isinstance(value, list):
+        return '[' + ', '.join(_number(item) for item in value) + ']'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

@@ -1,0 +1,140 @@
+"""The report of a trace as data: what `report.json` holds, and numpy turned into plain JSON."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+import math
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.effects import parameter_ranges
+from sa_jitter_ros.effects.evidence import Finding
+from sa_jitter_ros.inference.candidates import Candidate
+from sa_jitter_ros.inference.dependence import Dependence, moving
+from sa_jitter_ros.inference.residual import Residual
+from sa_jitter_ros.inference.trace import Trace
+
+Json = Any
+
+
+def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json]:
+    """Return the content of `report.json`; undefined numbers are None."""
+    observation = trace.observation
+    orders = observation.orders
+    lines = [{
+        'channel': observation.channel_names[c], 'order': orders[g], 'level': trace.level[i],
+        'observed': trace.attenuation[list(trace.held_out), i].mean(),
+        'predicted_before': trace.prediction_before.attenuation[list(trace.held_out), i].mean(),
+        'predicted_after': trace.prediction_after.attenuation[list(trace.held_out), i].mean(),
+        'standard_error': trace.after.standard_error[i],
+    } for i, (c, g) in enumerate(zip(trace.lines.channel, trace.lines.order))]
+    content: Mapping[str, Json] = plain({
+        'declared': {**asdict(observation.model), 'trigger_speed': observation.declared_speed,
+                     'effects': {effect.name: effect.values for effect in trace.declared}},
+        'measured_speed': observation.model.trigger_speed,
+        'recordings': list(recordings),
+        'remarks': [*observation.pulses.remarks, *_not_compared(trace)],
+        'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
+        'orders': orders,
+        'against': 'reference keyphasor' if observation.against_reference else 'vibration',
+        'missing_effects': [_effect(finding) for finding in trace.findings],
+        'candidates': [_candidate(item) for item in trace.candidates],
+        'error_before': errors(trace.before),
+        'error_after': errors(trace.after),
+        'dependence': [_dependence(*pair) for pair in zip(
+            trace.dependences_before, trace.dependences_after)],
+        'unsteadiness': trace.unsteadiness,
+        'verdict': trace.verdict,
+        'remains': str(moving(trace.dependences_after) or ''),
+        'lines': lines,
+    })
+    return content
+
+
+def errors(item: Residual) -> Mapping[str, Json]:
+    """Return the summary of a residual."""
+    return {
+        'rms': item.rms, 'chi2_per_dof': item.chi2_per_dof, 'ks': item.ks,
+        'cramer_von_mises': item.cramer_von_mises, 'coverage_95': item.coverage,
+        'mean': item.mean.mean(), 'rms_standard_error': item.rms_standard_error,
+        'rms_parameter_error': item.rms_parameter_error, 'p_value': item.p_value}
+
+
+def summary(content: Mapping[str, Json]) -> str:
+    """Return the report in a few lines of text."""
+    before, after = content['error_before'], content['error_after']
+    text = [f'verdict: {content["verdict"]}', *content['remarks']]
+    for effect in content['missing_effects']:
+        values = ', '.join(f'{name} = {_number(item["value"])} {item["unit"]}'
+                           for name, item in effect['parameters'].items())
+        text.append(f'missing effect: {effect["name"]} ({values})')
+        text.append(f'  {effect["evidence"]}')
+        if effect['indistinguishable_from']:
+            text.append(f'  cannot be told from: {", ".join(effect["indistinguishable_from"])}')
+    text.append(f'held-out error (RMS of observed minus predicted attenuation): '
+                f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
+    text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
+                f'{after["chi2_per_dof"]:.3g} after')
+    if content['remains']:
+        text.append(content['remains'])
+    if content['unsteadiness']:
+        text.append('unexplained scatter of the amplitudes (unsteadiness): '
+                    f'{content["unsteadiness"]:.2%}, included in the scale of chi2 and p')
+    return '\n'.join(text)
+
+
+def plain(value: Any) -> Json:
+    """Return numpy and tuples as JSON has them, with None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
+
+
+def _not_compared(trace: Trace) -> Sequence[str]:
+    """Say which declared orders have no line to compare."""
+    orders = trace.observation.orders
+    return [f'order {orders[g]:g} was declared and is not compared: on no channel is it as '
+            'coherent from cycle to cycle as the other lines'
+            for g in np.setdiff1d(np.arange(orders.size), trace.lines.order)]
+
+
+def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
+    return {'on': before.on, 'unit': before.unit, 'low': before.low, 'high': before.high,
+            **{when: {'change': item.change, 'standard_error': item.standard_error,
+                      'p_value': item.p_value}
+               for when, item in (('before', before), ('after', after))}}
+
+
+def _effect(finding: Finding) -> Mapping[str, Json]:
+    assert finding.effect is not None
+    ranges = parameter_ranges(type(finding.effect))
+    evidence = finding.evidence
+    if finding.rivals:
+        evidence += f'; {finding.decider} would tell it from {", ".join(finding.rivals)}'
+    return {
+        'name': finding.name,
+        'parameters': {name: {'value': value,
+                              'standard_error': finding.standard_errors.get(name),
+                              'unit': ranges[name].unit}
+                       for name, value in finding.effect.values.items()},
+        'evidence': evidence, 'p_value': finding.p_value,
+        'indistinguishable_from': list(finding.rivals)}
+
+
+def _candidate(item: Candidate) -> Mapping[str, Json]:
+    return {'name': item.name, 'round': item.stage, 'held_out_score': item.held_out_score,
+            'p_value': item.finding.p_value, 'rejected_because': item.rejected_because,
+            'added': not item.rejected_because}
+
+
+def _number(value: Json) -> str:
+    if isinstance(value, list):
+        return '[' + ', '.join(_number(item) for item in value) + ']'
+    return f'{value:.4g}' if isinstance(value, float) else str(value)

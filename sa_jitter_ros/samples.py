@@ -1,0 +1,42 @@
+"""Consecutive samples of one source: what recordings, messages and the averager hand on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Return first and end index of each span of `samples` (channel, sample) that is finite."""
+    every = np.isfinite(samples)
+    if every.all():
+        return [(0, samples.shape[1])] if samples.size else []
+    finite = np.concatenate(([False], every.all(axis=0), [False])).astype(np.int8)
+    return [(int(begin), int(end))
+            for begin, end in np.flatnonzero(np.diff(finite)).reshape(-1, 2)]
+
+
+@dataclass(frozen=True)
+class SampleBlock:
+    """
+    Consecutive samples of one source.
+
+    `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz,
+    `index` of the first sample, which counts on from block to block.
+    """
+
+    samples: NDArray[np.float64]
+    start_time: float
+    sample_rate: float
+    index: int
+
+    @property
+    def end_index(self) -> int:
+        """Index of the sample after the last one."""
+        return self.index + int(self.samples.shape[1])
+
+    def finite_parts(self) -> 'tuple[SampleBlock, ...]':
+        """Return the parts without NaN or infinity; between them is a gap of the index."""
+        return tuple(SampleBlock(
+            self.samples[:, begin:end], self.start_time + begin / self.sample_rate,
+            self.sample_rate, self.index + begin) for begin, end in finite_spans(self.samples))

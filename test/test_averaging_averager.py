@@ -1,0 +1,223 @@
+"""The library's average: any cut is the same average, and what is discarded is said."""
+
+from dataclasses import fields
+import inspect
+import warnings
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+
+RATE, SPEED = 2000.0, 25.0
+TIME = np.arange(4000) / RATE
+PULSES = 0.01 + np.arange(49) / SPEED
+NOISE = np.random.default_rng(3).normal(0.0, 0.2, (2, TIME.size))
+WAVE = np.cos(2.0 * np.pi * 5.0 * SPEED * (TIME - PULSES[0]))
+VIBRATION = WAVE * np.array([[1.0], [0.5]]) + NOISE
+
+
+def same(first, second):
+    """Assert that two lists of averages are alike in everything."""
+    assert len(first) == len(second)
+    for one, other in zip(first, second):
+        for item in fields(sa.Average):
+            a, b = getattr(one, item.name), getattr(other, item.name)
+            if item.name == 'correction':
+                assert (a is None) == (b is None)
+                if a is not None:
+                    assert a.pulse_errors == pytest.approx(b.pulse_errors, abs=1e-12)
+            else:
+                assert np.allclose(a, b, rtol=1e-9, atol=1e-12, equal_nan=True), item.name
+
+
+@pytest.mark.parametrize('options', [
+    {}, {'trigger_cycles': 9}, {'trigger_cycles': 9, 'averaging': 'sliding'},
+    {'angle_law': 'spline', 'ratio': 2.4}, {'correct_jitter': True, 'keyphasor_rate': 1e3}],
+    ids=str)
+@settings(max_examples=8, deadline=None)
+@given(data=st.data())
+def test_any_cut_gives_the_average_of_all(options, data):
+    samples, pulses = VIBRATION.copy(), np.delete(PULSES, 30)
+    samples[1, 700] = np.nan
+    with pytest.warns(sa.DataWarning, match='1 samples that are NaN'):
+        whole = sa.average(samples, RATE, pulses, **options)
+    cut = data.draw(st.lists(st.tuples(st.integers(0, TIME.size), st.integers(0, pulses.size)),
+                             max_size=6))
+    rows, columns = (sorted(part) for part in zip(*cut)) if cut else ([], [])
+    averager = sa.Averager(RATE, **options)
+    found = []
+    for one, other in zip(np.split(samples, rows, axis=1), np.split(pulses, columns)):
+        if data.draw(st.booleans()):
+            found += averager.update(pulse_times=other)
+            found += averager.update(one)
+        else:
+            found += averager.update(one, other)
+    same(whole, (*found, *averager.flush()))
+
+
+def test_one_channel_may_be_one_dimensional_and_integer():
+    counts = np.rint(1000.0 * VIBRATION[0]).astype(np.int16)
+    result, = sa.average(counts, RATE, PULSES.tolist(), orders=[5])
+    assert result.amplitudes == pytest.approx(1000.0, rel=0.02)
+    assert result.waveform.shape == (1, result.angle.size)
+
+
+def test_without_trigger_cycles_all_make_one_average():
+    result, = sa.average(VIBRATION, RATE, PULSES)
+    assert result.trigger_cycles == 48
+    assert result.start_time, result.end_time == (PULSES[0], PULSES[-1])
+    assert result.trigger_speed == pytest.approx(SPEED)
+    assert result.orders.tolist() == [1.0, 2.0, 3.0]
+    assert np.diff(result.angle) == pytest.approx(1.0 / result.angle.size)
+    truth = np.cos(2.0 * np.pi * 5.0 * result.angle)
+    assert np.abs(result.waveform[0] - truth).max() < 6.0 * result.standard_error.max()
+
+
+def test_every_unbroken_run_is_an_average_of_its_own():
+    with pytest.warns(sa.DataWarning, match='1 missing pulses'):
+        found = sa.average(VIBRATION, RATE, np.delete(PULSES, 20), orders=[5])
+    assert [item.trigger_cycles for item in found] == [19, 27]
+    assert [item.sequence for item in found] == [0, 1]
+
+
+def test_the_times_are_those_of_the_clock_of_the_pulses():
+    here, = sa.average(VIBRATION, RATE, PULSES, orders=[5])
+    there, = sa.average(VIBRATION, RATE, PULSES + 1000.0, start_time=1000.0, orders=[5])
+    assert there.start_time == pytest.approx(here.start_time + 1000.0)
+    assert there.amplitudes == pytest.approx(here.amplitudes, abs=1e-7)  # the kernel
+
+
+def test_several_pulses_a_revolution_and_a_faster_shaft():
+    pulses = PULSES[0] + np.arange(48 * 3 + 1) / (3.0 * SPEED)
+    result, = sa.average(VIBRATION, RATE, pulses, pulses_per_revolution=3, ratio=2.5, orders=[2])
+    assert result.trigger_cycles == 48
+    assert result.trigger_speed == pytest.approx(SPEED)
+    assert abs(result.amplitudes[:, 0]) == pytest.approx([1.0, 0.5], abs=0.02)
+    third, = sa.average(VIBRATION, RATE, pulses, pulses_per_revolution=3, pulses_per_trigger=1)
+    assert third.trigger_cycles == 144
+    assert third.trigger_speed == pytest.approx(SPEED)
+
+
+def test_nothing_is_said_where_everything_was_used():
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        sa.average(VIBRATION, RATE, PULSES)
+    averager = sa.Averager(RATE)
+    averager.update(VIBRATION, PULSES)
+    averager.flush()
+    assert averager.messages == []
+    assert averager.counts['trigger_cycles'] == averager.counts['pulses_accepted'] - 1 == 48
+    assert averager.counts['cycles_dropped'] == 0
+
+
+@pytest.mark.parametrize(('pulses', 'text'), [
+    (np.sort(np.append(PULSES, PULSES[7] + 0.01)), '1 double pulses'),
+    (np.insert(PULSES, 9, np.nan), '1 pulse times that are NaN'),
+    (PULSES - 0.5, 'no gapless vibration from -0.49'),
+    (PULSES + 0.5, 'from 2.030000 s on: 10 trigger cycles discarded'),
+    (np.append(PULSES, PULSES + 500.0), 'no vibration from')])
+def test_what_is_discarded_is_said(pulses, text):
+    with pytest.warns(sa.DataWarning, match=text):
+        sa.average(VIBRATION, RATE, pulses)
+
+
+def test_samples_that_wait_too_long_are_said_and_counted():
+    averager = sa.Averager(RATE, buffer_seconds=0.5, trigger_cycles=10)
+    for part in np.split(VIBRATION, 4, axis=1):
+        assert averager.update(part) == ()
+    averager.update(pulse_times=PULSES)
+    assert averager.counts['samples_dropped'] >= 3000
+    assert averager.messages
+
+
+@pytest.mark.parametrize(('options', 'text'), [
+    ({'trigger_cycles': 60}, 'make 48 whole trigger cycles of the 60 of an average'),
+    ({'start_time': 50.0}, 'make 0 whole trigger cycles')])
+def test_too_few_cycles_are_an_error_that_says_how_many_there_are(options, text):
+    with pytest.raises(sa.SignalError, match=text):
+        sa.average(VIBRATION, RATE, PULSES, **options)
+
+
+def test_a_stream_may_end_without_an_average():
+    averager = sa.Averager(RATE, trigger_cycles=60)
+    assert averager.update(VIBRATION, PULSES) == averager.flush() == ()
+    with pytest.raises(sa.SignalError, match='make another Averager'):
+        averager.update(VIBRATION)
+
+
+@pytest.mark.parametrize(('options', 'text'), [
+    ({'sample_rate': 0.0}, 'sample_rate is 0.0 Hz'), ({'ratio': 0.0}, 'ratio is 0'),
+    ({'start_time': np.nan}, 'start_time is nan'), ({'trigger_cycles': 0}, 'trigger_cycles is 0'),
+    ({'orders': []}, 'orders are'), ({'orders': [-1.0]}, 'orders are'),
+    ({'averaging': 'sliding'}, 'without trigger_cycles'),
+    ({'averaging': 'mean', 'trigger_cycles': 4}, "averaging is 'mean'"),
+    ({'angle_law': 'cubic'}, "angle_law is 'cubic'"),
+    ({'pulses_per_trigger': 2}, 'pulses_per_trigger is 2 of 1'),
+    ({'interval_tolerance': 0.7}, 'interval_tolerance 0.7'),
+    ({'keyphasor_rate': -1.0}, 'keyphasor_rate is -1')])
+def test_parameters_that_cannot_be_used_are_refused(options, text):
+    with pytest.raises(sa.ParameterError, match=text):
+        sa.average(VIBRATION, **{'sample_rate': RATE, 'pulse_times': PULSES, **options})
+
+
+@pytest.mark.parametrize(('vibration', 'pulses', 'text'), [
+    (VIBRATION.T, PULSES, '4000 channels of 2 samples'),
+    (VIBRATION[None], PULSES, 'shape'), (VIBRATION.astype(complex), PULSES, 'complex'),
+    (['a', 'b'], PULSES, 'real numbers'), (VIBRATION, ['a'], 'real numbers'),
+    (VIBRATION, PULSES[None], 'pulse times have'), (VIBRATION, [], 'make 0 whole'),
+    (VIBRATION[:, :0], PULSES, 'make 0 whole')])
+def test_arrays_that_cannot_be_used_are_refused(vibration, pulses, text):
+    with pytest.raises(sa.SignalError, match=text):
+        sa.average(vibration, RATE, pulses)
+
+
+def test_a_block_of_other_channels_is_not_taken():
+    averager = sa.Averager(RATE)
+    averager.update(VIBRATION[:, :1000])
+    with pytest.raises(sa.SignalError, match='3 channels and had 2'):
+        averager.update(np.zeros((3, 10)))
+    averager.update(VIBRATION[:, 1000:], PULSES)
+    same(averager.flush(), sa.average(VIBRATION, RATE, PULSES))
+
+
+def test_one_cycle_is_an_average_that_cannot_be_corrected():
+    with pytest.warns(sa.DataWarning):
+        found = sa.average(VIBRATION, RATE, np.delete(PULSES, [46]), correct_jitter=True)
+    assert [item.trigger_cycles for item in found] == [45, 1]
+    last = found[-1].correction
+    assert not last.accepted
+    assert 'one trigger cycle' in last.reason
+    assert np.array_equal(last.amplitudes, found[-1].amplitudes)
+
+
+def test_the_two_signatures_are_one():
+    stream = dict(inspect.signature(sa.Averager).parameters)
+    whole = dict(inspect.signature(sa.average).parameters)
+    del stream['buffer_seconds'], whole['vibration'], whole['pulse_times']
+    assert [(item.name, item.default, item.annotation) for item in stream.values()] == [
+        (item.name, item.default, item.annotation) for item in whole.values()]
+
+
+def test_detected_pulses_are_those_of_the_waveform():
+    tach = np.where((TIME - PULSES[0]) % (1.0 / SPEED) < 0.004, 5.0, 0.0)
+    pulses = sa.detect_pulses(tach, RATE, start_time=3.0)
+    assert pulses == pytest.approx(3.0 + np.append(PULSES, 1.97), abs=0.6 / RATE)
+    tach[500:520] = np.nan
+    gappy = sa.detect_pulses(tach, RATE, start_time=3.0)
+    assert set(gappy.round(6)) < set(pulses.round(6))
+    assert gappy.size == pulses.size - 1
+
+
+def test_a_waveform_without_pulses_says_so():
+    with pytest.warns(sa.DataWarning, match='is the shaft turning'):
+        assert sa.detect_pulses(np.zeros(5000), RATE).size == 0
+    with pytest.warns(sa.DataWarning, match='the threshold 9'):
+        assert sa.detect_pulses(np.sin(TIME * 100.0), RATE, threshold=9.0).size == 0
+
+
+@pytest.mark.parametrize('tach', [np.zeros((2, 9)), ['a'], [1j]])
+def test_a_waveform_that_cannot_be_used_is_refused(tach):
+    with pytest.raises(sa.SignalError, match='keyphasor waveform'):
+        sa.detect_pulses(tach, RATE)

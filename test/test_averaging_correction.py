@@ -1,0 +1,187 @@
+"""Averages with corrected pulses, through the streaming averager."""
+
+import numpy as np
+import pytest
+from sa_jitter_ros.averaging.average import AverageSettings
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.pulses.validation import PulseValidator
+from sa_jitter_ros.samples import SampleBlock
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+
+RATE, SPEED, CLOCK, CYCLES = 20000.0, 20.0, 3000.0, 40
+ORDERS = (19.0, 38.0)
+AMPLITUDES = {19.0: 1.0, 38.0: 0.5}
+
+
+def averages_of(machine, *, ratio=1.0, seconds=6.2, **options):
+    """Averages of a simulated machine, with corrections."""
+    settings = AverageSettings(cycle_length=ratio, trigger_cycles=CYCLES, orders=ORDERS,
+                               correct_jitter=True, keyphasor_rate=CLOCK, **options)
+    averager = StreamingAverager({'shaft': settings}, validator=PulseValidator(),
+                                 timeline=VibrationTimeline(buffer_seconds=2.0 * seconds))
+    averager.add_pulses(machine.pulses(0.0, seconds).times)
+    samples = machine.vibration(0, round(seconds * RATE))
+    return [average for _, average in averager.add_samples(SampleBlock(samples, 0.0, RATE, 0))]
+
+
+def gearbox(ratio, noise, harmonics=(1.0, 0.5), seed=5):
+    """Return a gear of 19 teeth whose keyphasor is sampled at `CLOCK`."""
+    return Gearbox(
+        mesh('shaft', 19, harmonics=harmonics, channel_gains=(1.0, 0.7), seed=seed), RATE,
+        shafts={'shaft': ratio}, speed=((0.0, SPEED),), seed=seed,
+        effects=(DeclaredJitter('uniform', 1.0 / np.sqrt(12.0) / CLOCK), AdditiveNoise(noise)))
+
+
+@pytest.mark.parametrize('ratio', [1.0, 2.0, 2.40789])
+@pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
+def test_amplitudes_come_back_and_errors_are_found(ratio, law):
+    machine = gearbox(ratio, noise=0.3)
+    found = averages_of(machine, ratio=ratio, angle_law=law)
+    assert len(found) == 2 if law == 'spline' else 3
+    pulses = machine.pulses(0.0, 6.2)
+    true = dict(zip(pulses.times.tolist(), pulses.errors.tolist()))
+    for average in found:
+        correction = average.correction
+        assert correction.accepted
+        scale = np.array([[1.0], [0.7]])
+        wanted = scale * np.array([AMPLITUDES[order] for order in ORDERS])
+        # the noise of an amplitude, and what errors that are not known exactly leave of it
+        errors = np.array([true[time] for time in average.pulses.tolist()])
+        left = correction.pulse_errors - (errors - errors.mean())
+        angle = 2.0 * np.pi * np.array(ORDERS) * ratio * SPEED * left.std()
+        np.testing.assert_array_less(
+            np.abs(np.abs(correction.amplitudes) - wanted),
+            4.0 * correction.noise + wanted * angle**2 + 1e-3)
+        np.testing.assert_array_less(np.abs(average.amplitudes), wanted * 1.01)
+        assert left.std() < 0.1 / CLOCK
+        np.testing.assert_allclose(
+            correction.attenuation,
+            np.abs(average.amplitudes) / np.abs(correction.amplitudes))
+
+
+@pytest.mark.machines
+def test_attenuation_is_that_of_the_noiseless_machine_within_its_error():
+    ratio = 2.40789
+    noisy = averages_of(gearbox(ratio, noise=1.0), ratio=ratio, seconds=30.0)
+    clean = averages_of(gearbox(ratio, noise=0.0), ratio=ratio, seconds=30.0)
+    z = []
+    for average, truth in zip(noisy, clean, strict=True):
+        exact = np.abs(truth.amplitudes) / np.array([[1.0], [0.7]]) / [
+            AMPLITUDES[order] for order in ORDERS]
+        z.append((average.correction.attenuation - exact)
+                 / average.correction.attenuation_standard_error)
+    assert len(z) == 14
+    # 56 values; pulse errors that are not known exactly add some to the stated error
+    assert 0.6 < np.std(z) < 1.6
+
+
+def test_order_whose_phase_the_errors_do_not_tell_is_not_corrected():
+    found = averages_of(gearbox(2.40789, noise=6.0), ratio=2.40789, seconds=40.0)
+    accepted = [average.correction for average in found if average.correction.accepted]
+    assert len(accepted) > 10
+    amplitudes = np.abs([correction.amplitudes[0] for correction in accepted])
+    assert np.isnan(amplitudes[:, 1]).any()
+    low = amplitudes[:, 0] - 1.0
+    assert abs(low.mean()) < 0.03 + 3.0 * low.std() / np.sqrt(len(low))
+    for correction in accepted:
+        np.testing.assert_array_equal(np.isnan(correction.attenuation),
+                                      np.isnan(correction.amplitudes))
+
+
+def test_noise_alone_is_left_as_it_is():
+    machine = gearbox(1.0, noise=1.0, harmonics=(0.0, 0.0))
+    for average in averages_of(machine):
+        correction = average.correction
+        assert not correction.accepted
+        assert correction.reason
+        np.testing.assert_array_equal(
+            correction.waveform, average.waveform)
+
+
+def test_a_declared_order_that_is_no_integer_tells_the_errors(rng):
+    rate, speed = 6400.0, 25.0
+    true = 0.01 + np.arange(32) / speed
+    pulses = true + rng.uniform(-0.5, 0.5, 32) / rate
+    times = np.arange(round(32.5 / speed * rate)) / rate
+    samples = np.cos(2.0 * np.pi * 40.5 * speed * (times - 0.01))
+    averager = StreamingAverager(
+        {'shaft': AverageSettings(trigger_cycles=30, orders=(40.5,), correct_jitter=True,
+                                  keyphasor_rate=rate)},
+        validator=PulseValidator(), timeline=VibrationTimeline())
+    averager.add_pulses(pulses)
+    (_, average), = averager.add_samples(SampleBlock(
+        (samples + 0.01 * rng.standard_normal(len(samples)))[None], 0.0, rate, 0))
+    correction = average.correction
+    assert correction.accepted
+    errors = (pulses - true)[:31]
+    apart = (correction.pulse_errors - (errors - errors.mean())) / correction.standard_errors
+    assert np.sqrt(np.mean(apart**2)) < 1.5
+
+
+@pytest.mark.parametrize('amplitude', [1.0, 2.0])
+def test_errors_that_follow_another_shafts_order_are_refused(rng, amplitude):
+    """
+    Order 12.04 is not told from 12 by six cycles.
+
+    A displaced pulse, far beyond the declared jitter, leaves no other order to recover from.
+    """
+    rate, tones = 6400.0, {1.0: 1.0, 5.0: 1.0, 12.04: amplitude, 30.0: 0.8}
+    settings = AverageSettings(trigger_cycles=6, orders=(1.0, 5.0, 30.0), correct_jitter=True,
+                               keyphasor_rate=rate)
+    refused = wrong = 0
+    for displaced in np.linspace(-1.2e-3, 1.2e-3, 31):
+        speed = rng.uniform(22.0, 28.0)
+        true = 0.01 + np.arange(8) / speed
+        pulses = true + rng.uniform(-0.5, 0.5, 8) / rate
+        pulses[rng.integers(7)] += displaced
+        times = np.arange(round(8.5 / speed * rate)) / rate
+        phase = 2.0 * np.pi * rng.random(4)
+        samples = sum(a * np.cos(2.0 * np.pi * g * speed * times + at)
+                      for (g, a), at in zip(tones.items(), phase))
+        averager = StreamingAverager({'shaft': settings}, validator=PulseValidator(),
+                                     timeline=VibrationTimeline())
+        averager.add_pulses(pulses)
+        (_, average), = averager.add_samples(SampleBlock(samples[None], 0.0, rate, 0))
+        correction = average.correction
+        errors = (pulses - true)[:7]
+        apart = np.abs(
+            correction.pulse_errors - (errors - errors.mean())) / correction.standard_errors
+        wrong += correction.accepted and apart.max() > 8.0
+        refused += "another shaft's order" in correction.reason
+    assert wrong == 0
+    assert refused > 0
+
+
+def test_correction_needs_blocks_of_cycles():
+    with pytest.raises(ParameterError, match='set averaging to block'):
+        AverageSettings(correct_jitter=True, averaging='sliding')
+    with pytest.raises(ParameterError, match='give at least 2'):
+        AverageSettings(correct_jitter=True, trigger_cycles=1)
+
+
+@pytest.mark.machines
+def test_measured_gearbox_with_a_slow_keyphasor(shared_data):
+    recording = np.load(shared_data / 'gear0_gearbox.npz')
+    samples = recording['vibration'].astype(float)
+    rate, reference = float(recording['sample_rate']), recording['reference_pulse_times']
+    orders = (23.0, 46.0, 92.0, 115.0)
+
+    def amplitudes(pulses, clock):
+        settings = AverageSettings(trigger_cycles=CYCLES, orders=orders,
+                                   correct_jitter=clock > 0.0, keyphasor_rate=clock)
+        averager = StreamingAverager({'shaft': settings}, validator=PulseValidator(),
+                                     timeline=VibrationTimeline(buffer_seconds=20.0))
+        averager.add_pulses(pulses)
+        found = averager.add_samples(SampleBlock(samples, 0.0, rate, 0))
+        return np.abs([(average.correction if clock else average).amplitudes
+                       for _, average in found])
+
+    truth = amplitudes(reference, 0.0)
+    strongest = np.argmax(truth.mean(axis=0), axis=0)
+    for clock in (2560.0, 5120.0, 8000.0):
+        ratio = (amplitudes(np.ceil(reference * clock) / clock, clock) / truth)[
+            :, strongest, np.arange(len(orders))]
+        np.testing.assert_allclose(ratio[:, :3], 1.0, atol=0.01)
+        np.testing.assert_allclose(ratio[:, 3], 1.0, atol=0.015)

@@ -1,0 +1,190 @@
+"""The demo as a user meets it: separate processes over DDS, a table and figures."""
+
+import os
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sa_jitter_ros.commands import demo
+from sa_jitter_ros.commands.demo_plan import plan_recording
+from sa_jitter_ros.errors import RecordingError, SaJitterError
+from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.npz_format import write_npz
+from sa_jitter_ros.recordings.recording import ArraySource
+from sa_jitter_ros.simulation import Gearbox, make_effects, mesh
+from scipy.io import wavfile
+
+CLOCK, RATE, SPEED, SECONDS = 4000.0, 20000.0, 31.7, 6.0
+
+
+def run_demo(environment, *arguments):
+    """Run the demo as a process of its own."""
+    return subprocess.run(
+        [sys.executable, '-c',
+         'from sa_jitter_ros.commands.demo import main; raise SystemExit(main())', *arguments],
+        env=environment, capture_output=True, text=True, timeout=600, check=False)
+
+
+@pytest.fixture
+def machine():
+    """Return a gearbox whose keyphasor is sampled too slowly for its mesh orders."""
+    return Gearbox(mesh('shaft', 23, harmonics=(1.0, 0.5, 0.25)), RATE,
+                   speed=((0.0, SPEED),), seed=3, effects=make_effects(
+                       {'keyphasor_quantisation': {'clock_rate': CLOCK, 'period_std': 5e-5}}))
+
+
+@pytest.fixture
+def recording(machine, tmp_path):
+    """Return a recording of it in a file."""
+    count = round(RATE * SECONDS)
+    path = tmp_path / 'rig.npz'
+    write_npz(path, Recording(
+        ArraySource(machine.vibration(0, count)), RATE, units=('g',),
+        pulse_times=machine.pulses(0.0, SECONDS).times, tach_rate=CLOCK))
+    return path
+
+
+def test_orders_and_averages_are_chosen_from_the_recording(recording):
+    plan = plan_recording(recording, read(recording))
+    assert {23.0, 46.0, 69.0} < set(plan.orders)
+    assert plan.trigger_cycles == SECONDS * SPEED // 8
+    assert plan.speed == pytest.approx(SPEED, rel=0.01)
+    assert plan.keyphasor_rate == CLOCK
+
+
+def test_trigger_cycles_are_those_of_the_recording(tmp_path):
+    time = np.arange(round(RATE * SECONDS)) / RATE
+    path = tmp_path / 'wheel.npz'
+    write_npz(path, Recording(
+        ArraySource(np.cos(2.0 * np.pi * 6.0 * SPEED * time)[None]), RATE,
+        pulse_times=np.arange(0.1, SECONDS, 0.25 / SPEED), pulses_per_revolution=4,
+        pulses_per_trigger=2, ratio=2.0))
+    plan = plan_recording(path, read(path))
+    assert plan.speed == pytest.approx(SPEED, rel=1e-6)
+    assert plan.trigger_cycles == 2.0 * SPEED * SECONDS // 8
+    assert 3.0 in plan.orders
+    nodes = demo.processes(plan)
+    for name in ('synchronous_averager', 'jitter_predictor'):
+        assert (nodes[name]['pulses_per_revolution'], nodes[name]['pulses_per_trigger']) == (4, 2)
+
+
+def test_recording_without_keyphasor_is_refused(machine, tmp_path):
+    path = tmp_path / 'mute.npz'
+    write_npz(path, Recording(ArraySource(machine.vibration(0, 20000)), RATE))
+    with pytest.raises(RecordingError, match='no keyphasor'):
+        plan_recording(path, read(path))
+
+
+@pytest.mark.processes
+def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environment, tmp_path):
+    done = run_demo(process_environment, str(recording), '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert re.search(r'speed +31\.\d+ Hz \| averages +\d', done.stdout)
+    table = {float(row[0]): row for row in map(str.split, done.stdout.splitlines())
+             if row and re.fullmatch(r'\d+', row[0])}
+    for order, amplitude in ((23.0, 1.0), (46.0, 0.5), (69.0, 0.25)):
+        *_, raw, corrected, _, attenuation, predicted, _, _, _ = table[order]
+        assert float(corrected) == pytest.approx(amplitude, rel=0.01)
+        assert float(raw) < float(corrected)
+        assert float(attenuation) == pytest.approx(float(raw) / float(corrected), abs=0.01)
+        assert 0.0 < float(predicted) < 1.0
+    for name in ('waveform.png', 'orders.png'):
+        assert (tmp_path / 'out' / name).read_bytes().startswith(b'\x89PNG')
+
+
+@pytest.mark.processes
+def test_demo_plays_a_wav_whose_tach_channel_it_is_told(machine, process_environment, tmp_path):
+    count = round(RATE * SECONDS)
+    turns = np.interp(np.arange(count) / RATE, machine.pulses(0.0, SECONDS).times,
+                      np.arange(len(machine.pulses(0.0, SECONDS).times)), left=-1.0)
+    both = np.stack((machine.vibration(0, count)[0] / 10.0, (turns % 1.0 < 0.1) - 0.5))
+    wavfile.write(tmp_path / 'rig.wav', round(RATE), both.T.astype(np.float32))
+    done = run_demo(process_environment, str(tmp_path / 'rig.wav'), '--tach-channel', '1',
+                    '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert '1 channels' in done.stdout
+    assert re.search(r'^ +23 ', done.stdout, re.MULTILINE), done.stdout
+    without = run_demo(process_environment, str(tmp_path / 'rig.wav'))
+    assert without.returncode == 2
+    assert 'give --tach-channel' in without.stderr
+
+
+@pytest.mark.processes
+def test_demo_says_why_nothing_is_corrected(process_environment, tmp_path, rng):
+    path = tmp_path / 'noise.npz'
+    write_npz(path, Recording(
+        ArraySource(rng.standard_normal((1, round(RATE * SECONDS)))), RATE,
+        pulse_times=np.arange(0.1, SECONDS, 1.0 / SPEED), orders=(1.0,)))
+    done = run_demo(process_environment, str(path), '--output', str(tmp_path / 'out'))
+    assert done.returncode == 0, done.stderr
+    assert re.search('note: the correction of [0-9]+ averages was refused: .*synchronous order',
+                     done.stdout), done.stdout
+
+
+@pytest.mark.processes
+def test_unusable_recording_is_one_line_and_status_2(process_environment, tmp_path):
+    path = tmp_path / 'broken.npz'
+    path.write_bytes(b'PK\x03\x04 and nothing else')
+    done = run_demo(process_environment, str(path))
+    assert done.returncode == 2
+    assert done.stdout == ''
+    assert len(done.stderr.splitlines()) == 1
+    assert str(path) in done.stderr
+
+
+@pytest.mark.parametrize('place', ['file/out', 'file'])
+def test_unusable_output_is_one_line_and_status_2_before_the_run(
+        monkeypatch, tmp_path, capsys, place):
+    monkeypatch.setattr(demo, 'Watcher', None)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    (tmp_path / 'file').touch()
+    assert demo.main(['--output', str(tmp_path / place)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert re.fullmatch(f"demo: .*{tmp_path / 'file'}.*\n", captured.err)
+
+
+def test_output_that_fails_at_the_end_is_one_line_and_status_2(monkeypatch, tmp_path, capsys):
+    def report(*arguments):
+        raise OSError(28, 'No space left on device')
+
+    monkeypatch.setattr(demo, 'Watcher', lambda **node_kwargs: demo.rclpy.create_node(
+        'watcher', **node_kwargs))
+    monkeypatch.setattr(demo, 'processes', lambda plan, live=False: {})
+    monkeypatch.setattr(demo, 'watch', lambda *arguments, **options: None)
+    monkeypatch.setattr(demo, 'report', report)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    assert demo.main(['--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == 'demo: [Errno 28] No space left on device\n'
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize('name', ['gear0_gearbox', 'motor_30V_100kHz'])
+def test_measured_recordings_give_averages_whose_loss_is_known(
+        name, shared_data, process_environment, tmp_path):
+    done = run_demo(process_environment, str(shared_data / f'{name}.npz'), '--output',
+                    str(tmp_path))
+    assert done.returncode == 0, done.stderr
+    rows = [row for row in map(str.split, done.stdout.splitlines())
+            if row and re.fullmatch(r'\d+', row[0])]
+    attenuation = np.array([float(row[-5]) for row in rows])
+    assert len(rows) >= 5
+    np.testing.assert_allclose(attenuation, 1.0, atol=0.01)
+
+
+@pytest.mark.parametrize('chosen', [None, 'OFF'])
+def test_discovery_stays_on_this_host_unless_opened(monkeypatch, tmp_path, capsys, chosen):
+    name = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+    monkeypatch.setenv(name, chosen or '')
+    if chosen is None:
+        monkeypatch.delenv(name)
+
+    def watcher(**node_kwargs):
+        raise SaJitterError(f'range {os.environ[name]}')
+
+    monkeypatch.setattr(demo, 'Watcher', watcher)
+    monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
+    assert demo.main(['--output', str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f'demo: range {chosen or "LOCALHOST"}\n'

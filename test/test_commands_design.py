@@ -1,0 +1,151 @@
+"""The command `design`: its table keeps the limits, its figure is a figure, bad input one line."""
+
+import os
+from pathlib import Path
+import re
+import shlex
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sa_jitter_ros.commands import design
+from sa_jitter_ros.prediction.design import design as designed
+
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'choosing_keyphasor_and_revolutions.md'
+BENCH = ['--orders', '19', '38', '--trigger-speed', '41.5', '--ratio', '2.40789']
+
+
+KEYWORDS = {'orders': (19.0, 38.0), 'trigger_speed': 41.5, 'ratio': 2.40789}
+LINE = re.compile(r'^ +([\d.]+) +[\d.]+ +(-?[\d.]+) +([\d.]+)(?: +([\d.]+))?  [a-z]', re.MULTILINE)
+
+
+def rows(text):
+    """Return order, loss, variation and detection (NaN: none) of each line of the table."""
+    return np.array([[float(value or 'nan') for value in found] for found in LINE.findall(text)])
+
+
+def settings(text):
+    """Return the keyphasor rate and the number of trigger cycles that were printed."""
+    return (float(re.search(r'keyphasor rate +(\S+) Hz', text)[1]),
+            int(re.search(r'trigger cycles +(\d+)', text)[1]))
+
+
+@pytest.mark.parametrize('name', ['--loss', '--attenuation'])
+def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
+    output = tmp_path / 'design.png'
+    assert design.main([*BENCH, name, '0.03', '--variation', '0.01', '--noise-std', '0.5',
+                        '--sample-rate', '50000', '--output', str(output)]) == 0
+    text = capsys.readouterr().out
+    found = designed(**KEYWORDS, maximum_loss=0.03, maximum_variation=0.01, noise_std=0.5,
+                     sample_rate=5e4)
+    assert settings(text) == (found.keyphasor_rate, found.trigger_cycles)
+    assert 'chosen for a loss of at most 0.03' in text
+    assert 'broken' not in text
+    np.testing.assert_allclose(
+        rows(text)[:, :3], np.transpose([found.orders, found.loss, found.variation]), atol=6e-6)
+    assert output.read_bytes().startswith(b'\x89PNG')
+
+
+def test_given_settings_are_assessed(tmp_path, capsys):
+    output = tmp_path / 'design.svg'
+    assert design.main([*BENCH, '--keyphasor-rate', '5000', '--trigger-cycles', '41',
+                        '--pulses-per-revolution', '6', '--output', str(output)]) == 0
+    text = capsys.readouterr().out
+    assert settings(text) == (5000.0, 41)
+    expected = designed(**KEYWORDS, keyphasor_rate=5000.0, trigger_cycles=41)
+    np.testing.assert_allclose(rows(text)[:, 1], expected.loss, atol=6e-6)
+    assert text.count('(given)') == 2
+    assert text.count('broken') == 2
+    assert '41 revolutions of the tach shaft, 0.988 s' in text
+    svg = output.read_text(encoding='utf-8')
+    assert svg.count('<path') > 20
+
+
+def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, capsys):
+    sizes = []
+    for arguments in ([], ['--others', '18.6886', '--tones', '50', '1850', '--change', '-0.05',
+                           '--false-alarm-rate', '0.01']):
+        output = tmp_path / f'{len(arguments)}.svg'
+        assert design.main([*BENCH, '--loss', '0.03', '--variation', '0.005', *arguments,
+                            '--output', str(output)]) == 0
+        sizes.append(output.read_text(encoding='utf-8').count('<path'))
+    text = capsys.readouterr().out.split('figure:')[1]
+    found = designed(**KEYWORDS, maximum_loss=0.03, maximum_variation=0.005, others=[18.6886],
+                     tones=[50.0, 1850.0], change=-0.05, false_alarm_rate=0.01)
+    assert settings(text) == (found.keyphasor_rate, found.trigger_cycles)
+    assert '-5 % detected' in text
+    np.testing.assert_allclose(rows(text)[:, 3], found.detection, atol=6e-5)
+    left = found.leakage
+    printed = re.findall(
+        r'^(order 18.6886|50 Hz .*\)|1850 Hz .*\)) +([\d.]+) +([\d.]+) +([\d.]+)$', text,
+        re.MULTILINE)
+    np.testing.assert_allclose(np.array([line[1:] for line in printed], float),
+                               np.column_stack([left.share, left.waveform_share]), atol=6e-6)
+    best, shares = (np.array(re.search(rf'^{name} +(.*)$', text.split('leave least')[1],
+                                       re.MULTILINE)[1].split(), float)
+                    for name in ('trigger cycles', 'largest share'))
+    assert best.tolist() == left.best(5).tolist()
+    np.testing.assert_allclose(shares, [left.largest_share[count - left.candidates[0]]
+                                        for count in best.astype(int)], atol=6e-6)
+    assert sizes[1] > 1.3 * sizes[0]
+
+
+def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
+    examples = re.findall(r'^    \$ ros2 run sa_jitter_ros design (.*)\n((?:    .*\n|\n)+)',
+                          PAGE.read_text(encoding='utf-8'), re.MULTILINE)
+    assert len(examples) == 3
+    for arguments, printed in examples:
+        assert design.main([*shlex.split(arguments), '--output', str(tmp_path / 'a.png')]) == 0
+        lines = capsys.readouterr().out.splitlines()[:-2]  # without the name of the figure
+        assert [line.removeprefix('    ') for line in printed.strip('\n').splitlines()] == lines
+
+
+@pytest.mark.parametrize('orders', [['0.001'], ['38', '400']])
+def test_the_figure_bears_orders_without_iso_lines_and_pulses_that_could_swap(
+        tmp_path, capsys, orders):
+    assert design.main(['--orders', *orders, '--trigger-speed', '41.5', '--keyphasor-rate', '100',
+                        '--trigger-cycles', '41', '--output', str(tmp_path / 'a.png')]) == 0
+    assert (tmp_path / 'a.png').exists()
+
+
+@pytest.mark.parametrize(('arguments', 'message'), [
+    ([], 'required: --orders, --trigger-speed'),
+    ([*BENCH, '--loss', '1.5'], 'maximum_loss is 1.5: give a fraction'),
+    ([*BENCH, '--variation', 'nan'], 'maximum_variation is nan: give a fraction'),
+    ([*BENCH, '--variation', '1e-9', '--noise-std', '1', '--sample-rate', '20000'],
+     'needs more than 1000000 trigger cycles'),
+    ([*BENCH, '--change', '0.1'], 'change is given without false_alarm_rate'),
+    ([*BENCH, '--false-alarm-rate', '0.1'], 'false_alarm_rate is given without change'),
+    ([*BENCH, '--change', '0.1', '--false-alarm-rate', '1'], 'false_alarm_rate is 1.0: give'),
+    ([*BENCH, '--others', '19'], 'interfering order 19 is synchronous'),
+    ([*BENCH, '--tones', '-50'], 'tones hold -50 Hz'),
+    ([*BENCH, '--tones', '9000', '--sample-rate', '10000'], 'of 9000 Hz is above half'),
+    ([*BENCH, '--keyphasor-rate', '0'], 'keyphasor_rate is 0.0'),
+    ([*BENCH, '--keyphasor-rate', '30'], 'pulses could swap'),
+    ([*BENCH, '--trigger-cycles', '0'], 'trigger_cycles is 0'),
+    ([*BENCH, '--trigger-cycles', 'few'], "invalid int value: 'few'"),
+    ([*BENCH, '--noise-std', '1'], 'set sample_rate'),
+    ([*BENCH, '--jitter-distribution', 'cauchy'], "invalid choice: 'cauchy'"),
+    ([*BENCH, '--output', 'design.doc'], '--output design.doc: end the name in .png'),
+    ([*BENCH, '--output', '/nowhere/design.png'], 'No such file'),
+])
+def test_bad_input_is_one_line_and_status_2(capsys, arguments, message):
+    try:
+        status = design.main(arguments)
+    except SystemExit as stop:
+        status = stop.code
+    error = capsys.readouterr().err
+    assert status == 2
+    assert message in error
+    assert error.count('\n') == 1
+    assert error.startswith('design: ')
+
+
+def test_it_runs_as_a_process_and_explains_units(tmp_path):
+    result = subprocess.run(
+        [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--help'], cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}, capture_output=True,
+        text=True, check=True)
+    for word in ('Hz', 'fraction', "units of the component's amplitude", 'examples:'):
+        assert word in ' '.join(result.stdout.split())

@@ -1,0 +1,399 @@
+"""The loop off line on simulated machines: what is observed, what is left, and what is traced."""
+
+from dataclasses import replace
+import json
+import math
+
+import numpy as np
+import pytest
+from sa_jitter_ros.commands.close_loop import main
+from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.effects import EFFECTS, make_effect
+from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
+from sa_jitter_ros.inference.beat import find_beat
+from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.inference.record_pulses import record_pulses
+from sa_jitter_ros.inference.residual import residual
+from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.prediction.distributions import Normal
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.report.report import report, summary
+from sa_jitter_ros.simulation.components import mesh
+from sa_jitter_ros.simulation.effect import Effect
+from sa_jitter_ros.simulation.effects import make_effects
+from sa_jitter_ros.simulation.gearbox import Gearbox
+from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
+from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
+from scipy import stats
+from worse_pulses import with_added_jitter, with_slower_clock
+
+RATE, SPEED, CYCLES, NOISE = 5000.0, 25.0, 20, 0.05
+MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                      orders=(8.0, 16.0, 24.0, 32.0), noise_std=NOISE, sample_rate=RATE)
+
+
+class Hum(Effect):
+    """A trigger level that hums: in no module."""
+
+    def pulse_delay(self, setting, index, times):
+        return 100e-6 * np.sin(2.0 * np.pi * 0.2871 * setting.trigger_rate * times)
+
+
+def simulated(*effects, acquisitions=16, jitter=True, seed=3, reference=False):
+    """Return a recording with the declared jitter and noise, and effects that nobody declares."""
+    declared = [AdditiveNoise(NOISE, name='declared_noise')]
+    if jitter:
+        declared.append(DeclaredJitter('uniform', 1.0 / math.sqrt(12.0) / 5000.0))
+    gearbox = Gearbox(
+        mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6, 0.5), channel_gains=(1.0, 0.7), seed=seed),
+        RATE, speed=((0.0, SPEED),), effects=(*declared, *effects), seed=seed)
+    duration = (acquisitions * CYCLES + 3) / SPEED
+    pulses = gearbox.pulses(0.0, duration)
+    return Recording(
+        ArraySource(gearbox.vibration(0, round(duration * RATE))), RATE, pulse_times=pulses.times,
+        reference_pulse_times=pulses.true_times if reference else None, description='simulated')
+
+
+def traced(*effects, model=MODEL, **options):
+    """Trace a simulated recording."""
+    recording = simulated(*effects, **options)
+    return trace([observe(recording, model)], [recording])
+
+
+def test_order_that_is_declared_twice_counts_once():
+    recording = simulated(acquisitions=8)
+    twice = replace(MODEL, orders=(8.0, 16.0, 8.0, 24.0, 32.0, 16.0))
+    found, once = (trace([observe(recording, model)], [recording]) for model in (twice, MODEL))
+    assert found.observation.orders.tolist() == list(MODEL.orders)
+    assert found.verdict == once.verdict == 'none'
+    assert found.after.rms == pytest.approx(once.after.rms)
+
+
+def test_observation_finds_the_true_errors_and_attenuation():
+    recording = simulated(acquisitions=4)
+    truth = simulated(acquisitions=4, reference=True)
+    found, best = observe(recording, MODEL), observe(truth, MODEL)
+    assert not found.against_reference
+    assert best.against_reference
+    assert len(found.acquisitions) == 4
+    for item, other in zip(found.acquisitions, best.acquisitions):
+        assert item.recovered
+        off = (item.errors - other.errors) / item.standard_errors
+        assert np.sqrt(np.mean(off**2)) < 2.0
+        spread = np.hypot(item.attenuation_standard_error, 2e-3)
+        assert np.all(np.abs(item.attenuation - other.attenuation) < 5.0 * spread)
+    mean = found.stacked('attenuation').mean(axis=0)
+    assert np.all(np.diff(mean, axis=1) < 0.0)
+
+
+def test_reference_serves_unless_the_vibration_moves_against_it():
+    wander = make_effects({'phase_wander': {'std': 0.02}})
+    moved = simulated(*wander, acquisitions=4, reference=True)
+    assert not observe(moved, MODEL).against_reference
+    jitter = make_effects({'excess_jitter': {'std': 80e-6}})
+    recording = simulated(*jitter, acquisitions=10, reference=True)
+    found = trace([observe(recording, MODEL)], [recording])
+    assert found.observation.against_reference
+    assert [item.name for item in found.findings] == ['excess_jitter']
+    swapped = replace(recording, pulse_times=recording.reference_pulse_times,
+                      reference_pulse_times=recording.pulse_times)
+    with pytest.raises(RecordingError, match='the worse one'):
+        observe(swapped, MODEL)
+
+
+def test_declared_model_suffices():
+    found = traced()
+    content = report(found)
+    assert found.verdict == 'none'
+    assert content['error_after'] == content['error_before']
+    assert content['missing_effects'] == []
+    assert {item['name'] for item in content['candidates']} == set(EFFECTS)
+    assert all(item['rejected_because'] for item in content['candidates'])
+    assert content['acquisitions'] == {'fit': 8, 'held_out': 8}
+    assert 0.3 < content['error_before']['chi2_per_dof'] < 2.0
+
+
+@pytest.mark.parametrize(('name', 'values', 'parameter'), [
+    ('excess_jitter', {'std': 80e-6}, 'std'),
+    ('clock_skew', {'skew': 4e-4}, 'skew'),
+    pytest.param('speed_fluctuation', {'acceleration_std': 90.0}, 'acceleration_std',
+                 marks=pytest.mark.machines),
+    ('missing_pulses', {'probability': 0.015}, 'probability'),
+])
+def test_effect_on_the_mean_is_traced(name, values, parameter):
+    found = traced(*make_effects({name: values}))
+    content = report(found)
+    assert content['verdict'] == 'traced'
+    assert [item['name'] for item in content['missing_effects']] == [name]
+    fitted = content['missing_effects'][0]['parameters'][parameter]
+    assert abs(fitted['value'] - values[parameter]) < 4.0 * fitted['standard_error']
+    before, after = content['error_before']['rms'], content['error_after']['rms']
+    chance = content['error_after']['rms_standard_error']
+    assert after < max(before / 5.0, 2.5 * chance)  # few acquisitions
+
+
+@pytest.mark.parametrize(('name', 'values', 'parameter', 'tolerance'), [
+    ('additive_noise', {'std': 1.0}, 'std', 0.1),
+    ('amplitude_modulation', {'std': 0.3}, 'std', 0.08),
+    ('interfering_tone', {'frequency': 400.9, 'amplitude': 0.12}, 'amplitude', 0.01),
+])
+def test_effect_on_the_scatter_is_traced(name, values, parameter, tolerance):
+    content = report(traced(*make_effects({name: values})))
+    assert content['verdict'] == 'traced'
+    assert [item['name'] for item in content['missing_effects']] == [name]
+    fitted = content['missing_effects'][0]['parameters'][parameter]
+    assert fitted['value'] == pytest.approx(values[parameter], abs=tolerance)
+    assert content['error_before']['chi2_per_dof'] > 10.0
+    assert content['error_after']['chi2_per_dof'] < 2.5
+
+
+def test_clock_is_traced_pulse_by_pulse():
+    model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 2000.0})
+    quantised = make_effects({'keyphasor_quantisation': {'clock_rate': 2000.0,
+                                                         'period_std': 4e-6}})
+    content = report(traced(*quantised, model=model, jitter=False))
+    assert content['verdict'] == 'traced'
+    assert content['missing_effects'][0]['name'] == 'keyphasor_quantisation'
+    clock = content['missing_effects'][0]['parameters']['clock_rate']
+    assert clock['value'] == pytest.approx(2000.0, rel=1e-6)
+    assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+
+
+def test_interpolation_is_traced_by_its_beat():
+    content = report(traced(*make_effects({'interpolation_loss': {'method': 'linear'}})))
+    assert content['verdict'] == 'traced'
+    assert [item['name'] for item in content['missing_effects']] == ['interpolation_loss']
+    assert content['missing_effects'][0]['parameters']['method']['value'] == 'linear'
+    assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+
+
+@pytest.mark.parametrize('method', ['linear', 'cubic', 'spline'])
+def test_beat_tells_the_gain_of_the_interpolator(rng, method):
+    frequency = np.array([0.08, 0.16, 0.24, 0.32])
+    place = (0.0873 * np.arange(240)) % 1.0
+    index = np.arange(64)
+    waves = np.exp(2j * np.pi * np.outer(index, frequency))
+    at = 31.0 + place
+    read = interpolate(np.hstack((waves.real, waves.imag)), at, method=method)
+    gain = np.real((read[:, :4] + 1j * read[:, 4:]) * np.exp(
+        -2j * np.pi * np.outer(at, frequency)))
+    mean = gain.mean(axis=0)
+    found = find_beat(gain / mean - 1.0 + rng.normal(0.0, 2e-4, gain.shape), frequency)
+    assert found.method == method
+    assert found.gain == pytest.approx(mean, abs=0.06 * (1.0 - mean.min()) + 1e-3)
+
+
+def test_modulation_of_all_lines_alike_is_no_beat(rng):
+    radial = 0.05 * np.cos(0.7 * np.arange(240))[:, None] + rng.normal(0.0, 1e-3, (240, 4))
+    assert find_beat(radial, np.array([0.08, 0.16, 0.24, 0.32])).method == ''
+    assert find_beat(radial[:8], np.array([0.08, 0.16, 0.24, 0.32])).method == ''
+
+
+def test_effect_of_no_module_stays_unexplained():
+    content = report(traced(Hum()))
+    assert content['verdict'] == 'unexplained'
+    assert content['missing_effects'] == []
+    reasons = {item['name']: item['rejected_because'] for item in content['candidates']}
+    assert 'memory' in reasons['excess_jitter'] or 'line' in reasons['excess_jitter']
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert 'unexplained' in summary(content)
+
+
+def test_declared_effect_is_not_missing():
+    recording = simulated(*make_effects({'clock_skew': {'skew': 4e-4}}))
+    found = trace([observe(recording, MODEL)], [recording],
+                  declared=[make_effect('clock_skew', skew=4e-4)])
+    assert found.verdict == 'none'
+
+
+@pytest.mark.machines
+def test_measured_gearbox_needs_the_phases_of_its_pulses(shared_data):
+    recording = with_slower_clock(read(shared_data / 'gear0_gearbox.npz'), 3300.0)
+    model = DeclaredModel(keyphasor_rate=3300.0, trigger_speed=33.33, trigger_cycles=40,
+                          orders=(23.0, 46.0, 69.0, 92.0, 115.0))
+    content = report(trace([observe(recording, model)], [recording]))
+    assert content['missing_effects'][0]['name'] == 'keyphasor_quantisation'
+    assert content['error_before']['rms'] > 0.1
+    assert content['error_after']['rms'] < 0.015
+
+
+def test_residual_of_what_is_predicted_is_chance(rng):
+    shape = (30, 6)
+    draws = rng.normal(0.9, 0.02, shape)
+    predicted = np.full(shape, 0.9)
+    variance = np.full(shape, 4e-4)
+    probability = stats.norm.cdf(draws, 0.9, 0.02)
+
+    def of(shift):
+        return residual(draws + shift, predicted, variance, draws + shift, predicted, variance,
+                        probability)
+
+    right, wrong = of(0.0), of(0.03)
+    assert right.p_value > 0.01
+    assert right.chi2_per_dof == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / draws.size))
+    assert right.ks < 1.63 / np.sqrt(draws.size)
+    assert right.coverage == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / draws.size))
+    assert wrong.rms == pytest.approx(0.03, abs=4.0 * 0.02 / np.sqrt(30))
+    assert wrong.p_value < 1e-3
+    assert wrong.score < right.score
+
+
+def test_added_jitter_and_slower_clock_make_the_old_pulses_the_reference():
+    recording = simulated(acquisitions=4)
+    worse = with_added_jitter(recording, Normal(1e-4), seed=1)
+    assert worse.reference_pulse_times is recording.pulse_times
+    added = worse.pulse_times - recording.pulse_times
+    assert added.std() == pytest.approx(1e-4, rel=4.0 / np.sqrt(2.0 * added.size))
+    slower = with_slower_clock(recording, 1000.0)
+    ticks = slower.pulse_times * 1000.0
+    assert ticks == pytest.approx(np.rint(ticks), abs=1e-6)
+    late = slower.pulse_times - recording.pulse_times
+    assert late.min() >= -1e-9
+    assert late.max() <= 1e-3
+    with pytest.raises(ModelError, match='positive rate'):
+        with_slower_clock(recording, 0.0)
+
+
+def test_missing_pulses_are_counted():
+    every = 0.3 + np.arange(60) * 0.04
+    lost = [10, 20, 21, 31, 32, 33, 34, 35]
+    found = record_pulses(Recording(ArraySource(np.zeros((1, 15_000))), RATE,
+                                    pulse_times=np.delete(every, lost)), MODEL)
+    assert np.flatnonzero(found.missing).tolist() == [9, 18, 27]
+    assert found.missing[[9, 18, 27]].tolist() == [1, 2, 5]
+    # three in a row are put in, more are a gap that no acquisition may hold
+    assert found.bridged[:31] == pytest.approx(every[:31], abs=1e-12)
+    assert np.isnan(found.bridged[31:36]).all()
+    assert np.flatnonzero(found.starts_run).tolist() == [0, 28]
+    assert found.remarks == ('3 pulses are missing beside the 52 that were measured',
+                             '1 of 52 pulses come late, after a gap that is no whole number of '
+                             'intervals or longer than three missing pulses: no acquisition '
+                             'holds such a gap')
+
+
+def changed(**values):
+    """Return the model with some values changed."""
+    return DeclaredModel(**{**vars(MODEL), **values})
+
+
+@pytest.mark.parametrize(('model', 'error', 'text'), [
+    (changed(trigger_speed=50.0), ModelError, 'turns at 25'),
+    (changed(sample_rate=9000.0), ModelError, 'sample_rate is declared'),
+    (changed(trigger_cycles=500), RecordingError, 'lower trigger_cycles'),
+    (changed(orders=(11.3, 17.7)), SignalError, 'no declared order'),
+])
+def test_model_that_does_not_fit_is_refused(model, error, text):
+    recording = simulated(acquisitions=5)
+    with pytest.raises(error, match=text):
+        trace([observe(recording, model)], [recording])
+
+
+def test_too_few_acquisitions_and_no_pulses_are_refused():
+    recording = simulated(acquisitions=2)
+    with pytest.raises(ModelError, match='at least 4'):
+        trace([observe(recording, MODEL)], [recording])
+    bare = Recording(recording.vibration, RATE)
+    with pytest.raises(RecordingError, match='needs a keyphasor'):
+        record_pulses(bare, MODEL)
+
+
+def test_noise_alone_is_refused(rng):
+    machine = simulated(acquisitions=5)
+    noise = Recording(ArraySource(rng.normal(size=(2, machine.samples))), RATE,
+                      pulse_times=machine.pulse_times)
+    with pytest.raises(SignalError, match='cannot be recovered'):
+        observe(noise, MODEL)
+
+
+def test_recordings_of_different_machines_are_refused():
+    one = simulated(acquisitions=4)
+    louder = Recording(ArraySource(20.0 * one.read()), RATE, pulse_times=one.pulse_times)
+    observed = [observe(one, MODEL), observe(louder, MODEL)]
+    with pytest.raises(ModelError, match='different machines'):
+        trace(observed, [one, louder])
+
+
+PARAMETERS = """
+{node}:
+  ros__parameters:
+    keyphasor_rate: 5e3
+    trigger_speed: 25
+    trigger_cycles: 20
+    orders: [8, 16.0, 24, 32]
+    noise_std: 0.05
+    effects:
+      excess_jitter: {{enabled: true, std: 5e-6}}
+    effects.clock_skew.enabled: false
+    pinoin: 3.0
+"""
+
+
+@pytest.mark.parametrize('node', ['jitter_predictor', '/**', '/jitter_predictor',
+                                  '/plant/jitter_predictor', 'plant:\n  jitter_predictor'])
+def test_parameter_files_are_read_as_ros_reads_them(tmp_path, node):
+    text = PARAMETERS.format(node=node)
+    if '\n' in node:
+        head, _, rest = text.partition('jitter_predictor:')
+        text = head + 'jitter_predictor:' + rest.replace('\n', '\n  ')
+    path = tmp_path / 'model.yaml'
+    path.write_text(text)
+    found = read_declaration(path, sample_rate=RATE)
+    assert found.model == MODEL
+    assert found.effects == (make_effect('excess_jitter', std=5e-6),)
+    assert found.unknown == ('pinoin',)
+
+
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('other_node: {ros__parameters: {ratio: 1.0}}', 'no ros__parameters of jitter_predictor'),
+    ('/**: {ros__parameters: {ratio: fast}}', "ratio is 'fast'"),
+    ('/**: {ros__parameters: {orders: 3}}', 'give a list'),
+    ('/**: {ros__parameters: {trigger_cycles: 2.5}}', 'whole number'),
+    ('/**: {ros__parameters: {keyphasor_rate: -1.0}}', 'keyphasor_rate is -1'),
+    ('/**: {ros__parameters: {effects.clock_skew.enabled: 1}}', 'true or false'),
+    ('/**: {ros__parameters: {effects: {clock_skew: {enabled: true, skew: 2}}}}', 'at most 0.1'),
+    ('!!python/object/apply:os.system [true]', 'cannot be read as YAML'),
+    ('{', 'cannot be read as YAML'),
+    ('just text', 'no ros__parameters'),
+])
+def test_bad_parameter_files_are_refused(tmp_path, text, reason):
+    path = tmp_path / 'model.yaml'
+    path.write_text(text)
+    with pytest.raises(ModelError, match=reason):
+        read_declaration(path)
+
+
+def saved(folder, recording):
+    """Save a recording as a file, and its declared model."""
+    np.savez(folder / 'machine.npz', vibration=recording.read(), sample_rate=RATE,
+             pulse_times=recording.pulse_times)
+    (folder / 'model.yaml').write_text(PARAMETERS.format(node='/**').replace('true', 'false'))
+    return [str(folder / 'machine.npz'), '--declared', str(folder / 'model.yaml'), '--output',
+            str(folder / 'out')]
+
+
+@pytest.mark.machines
+def test_command_writes_the_report(tmp_path, capsys):
+    arguments = saved(tmp_path, simulated(*make_effects({'clock_skew': {'skew': 4e-4}}),
+                                          acquisitions=10))
+    assert main(arguments) == 0
+    printed = capsys.readouterr()
+    assert 'missing effect: clock_skew' in printed.out
+    assert 'pinoin is no parameter' in printed.err
+    content = json.loads((tmp_path / 'out' / 'report.json').read_text())
+    assert content['verdict'] == 'traced'
+    assert content['declared']['trigger_cycles'] == CYCLES
+    assert (tmp_path / 'out' / 'report.html').exists()
+    assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
+
+
+def test_command_refuses_in_one_line_and_writes_nothing(tmp_path, capsys):
+    arguments = saved(tmp_path, simulated(acquisitions=2))
+    assert main([*arguments, '--quiet']) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert 'at least 4' in lines[-1]
+    assert not (tmp_path / 'out').exists()
+    assert main([str(tmp_path / 'none.npz'), *arguments[1:], '--quiet']) == 2
+    assert 'no such file' in capsys.readouterr().err

@@ -1,0 +1,112 @@
+"""The loop as one function: what it takes, what it returns, what it writes."""
+
+from dataclasses import replace
+import doctest
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from sa_jitter_ros import loop
+from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.loop import close_loop
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+
+RATE, SPEED, STD = 5000.0, 25.0, 8e-5
+KEYWORDS = {'keyphasor_rate': 20e3, 'trigger_speed': SPEED, 'trigger_cycles': 20,
+            'orders': [8, 16, 24], 'noise_std': 0.02}
+FILE = """
+jitter_predictor:
+  ros__parameters: {keyphasor_rate: 2e4, trigger_speed: 25, trigger_cycles: 20,
+                    orders: [8.0, 16.0, 24.0], noise_std: 0.02, pinoin: 1}
+"""
+
+
+@pytest.fixture(scope='module')
+def recording():
+    """Return a recording with normal pulse errors of 80 us."""
+    machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6)), RATE, speed=((0.0, SPEED),),
+                      effects=(DeclaredJitter('normal', STD), AdditiveNoise(0.02)), seed=3)
+    return Recording(ArraySource(machine.vibration(0, 36_000)), RATE,
+                     pulse_times=machine.pulses(0.0, 7.2).times)
+
+
+def test_examples():
+    assert doctest.testmod(loop).failed == 0
+
+
+def test_every_way_to_name_recording_and_model_finds_the_same(recording, tmp_path):
+    path, declared = tmp_path / 'rig.npz', tmp_path / 'model.yaml'
+    np.savez(path, vibration=recording.read(), sample_rate=RATE, pulse_times=recording.pulse_times)
+    declared.write_text(FILE)
+    first = close_loop([recording], KEYWORDS)
+    model = DeclaredModel(**{**KEYWORDS, 'orders': (8.0, 16.0, 24.0), 'sample_rate': RATE})
+    with pytest.warns(UserWarning, match='pinoin is not a parameter of jitter_predictor'):
+        second = close_loop(path, declared)
+    third = close_loop([str(path)], model, names=['rig'])
+    for found, name in ((first, 'recording 1'), (second, str(path)), (third, 'rig')):
+        assert found.report == {**first.report, 'recordings': [name]}
+        assert found.verdict == found.report['verdict'] == 'traced'
+
+
+def test_effects_are_declared_by_name(recording):
+    excess = float(np.sqrt(STD**2 - (1.0 / 20e3) ** 2 / 12.0))
+    found = close_loop(recording, {**KEYWORDS, 'effects': {'excess_jitter': {'std': excess}}})
+    assert found.traces['shaft'].declared == (make_effect('excess_jitter', std=excess),)
+    assert found.verdict == 'none'
+
+
+def test_written_report_is_the_report(recording, tmp_path):
+    found = close_loop(recording, KEYWORDS)
+    found.write(tmp_path / 'a' / 'b')
+    content = json.loads((tmp_path / 'a' / 'b' / 'report.json').read_text())
+    assert content == found.report
+    assert {'report.html', 'residual.png'} <= {item.name for item in (
+        tmp_path / 'a' / 'b').iterdir()}
+
+
+def test_every_shaft_has_its_report(recording, tmp_path):
+    """The recording's ratio is that of one of them."""
+    declared = tmp_path / 'model.yaml'
+    declared.write_text("""
+jitter_predictor:
+  ros__parameters: {keyphasor_rate: 2e4, trigger_speed: 25, trigger_cycles: 20, noise_std: 0.02,
+                    shafts: [fast, slow], fast.ratio: 2.0, fast.orders: [4.0, 8.0, 12.0],
+                    slow.ratio: 1.0, slow.orders: [8.0, 16.0, 24.0]}
+""")
+    found = close_loop(replace(recording, ratio=2.0), declared)
+    assert list(found.shafts) == ['fast', 'slow']
+    assert found.report == {'verdict': 'traced', 'shafts': found.shafts}
+    one = close_loop(recording, KEYWORDS).report
+    assert found.shafts['slow'] == one
+    stds = [item['missing_effects'][0]['parameters']['std']['value']
+            for item in found.shafts.values()]
+    assert stds[0] == pytest.approx(stds[1], rel=1e-2)  # the same pulses, the same orders in Hz
+    assert 'shaft fast\nverdict: traced' in str(found)
+    found.write(tmp_path / 'out')
+    assert json.loads((tmp_path / 'out' / 'report.json').read_text()) == found.report
+    for shaft, content in found.shafts.items():
+        assert json.loads((tmp_path / 'out' / shaft / 'report.json').read_text()) == content
+        assert f'href="{shaft}/report.html"' in (tmp_path / 'out' / 'report.html').read_text()
+    assert not [item for item in (tmp_path / 'out').iterdir() if item.name.startswith('.')]
+    with pytest.raises(ModelError, match='the ratio 3, which none of the shafts fast, slow has'):
+        close_loop(replace(recording, ratio=3.0), declared)
+
+
+def test_what_cannot_be_used_is_named(recording, tmp_path):
+    with pytest.raises(ModelError, match='no recording: give at least one'):
+        close_loop([], KEYWORDS)
+    with pytest.raises(ModelError, match='pinoin is not a keyword of a declared model'):
+        close_loop(recording, {**KEYWORDS, 'pinoin': 1.0})
+    with pytest.raises(RecordingError, match='no such file'):
+        close_loop(tmp_path / 'none.npz', KEYWORDS)
+
+
+def test_figures_are_not_loaded_before_they_are_drawn():
+    code = ('import sys, sa_jitter_ros.loop; '
+            'raise SystemExit(bool({"matplotlib", "rclpy"} & sys.modules.keys()))')
+    assert subprocess.run([sys.executable, '-c', code], check=False).returncode == 0

@@ -1,0 +1,590 @@
+"""The averager node through real publishers, subscribers and parameter services."""
+
+import math
+import signal
+import subprocess
+import sys
+
+from bench import assert_true, AveragerBench
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from machine import Machine
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, INPUT_QOS
+from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
+from sensor_msgs.msg import Imu
+
+MACHINE = Machine()
+ORDERS = [1.0, 7.0, 23.0]
+
+
+@pytest.fixture
+def bench(ros_graph):
+    """Return a maker of benches; averages of 10 trigger cycles unless told otherwise."""
+    def make(**options):
+        options = {'trigger_cycles': 10, 'shaft__orders': ORDERS, **options}
+        return AveragerBench(ros_graph, **options)
+    return make
+
+
+# --- what is published ---------------------------------------------------------------------------
+
+
+def test_outputs_are_those_of_the_machine(bench):
+    b = bench(trigger_cycles=20)
+    b.play(MACHINE, 4.0)
+    averages = b.amplitudes()
+    assert len(averages) == 6
+    assert_true(averages, MACHINE, ORDERS)
+    for number, average in enumerate(averages):
+        assert average.names == messages.AMPLITUDE_FIELDS
+        assert average.header.sequence == number
+        assert average.header.trigger_cycles == 20 == average.header.fundamental_cycles
+        assert average.header.mean_trigger_speed == pytest.approx(MACHINE.speed, rel=1e-7)
+        assert np.isnan(average.values[..., 3:7]).all()
+        assert (average.values[..., 7] < 1e-4).all()
+    waveform = messages.decode_average(
+        'synchronous_average', b.received['shaft/synchronous_average'][-1])
+    angle = np.arange(waveform.values.shape[1]) / waveform.values.shape[1]
+    np.testing.assert_allclose(waveform.values, MACHINE.at(angle / MACHINE.speed), atol=1e-4)
+    error = messages.decode_average('standard_error', b.received['shaft/standard_error'][-1])
+    assert error.values.shape == waveform.values.shape
+    assert (error.values < 1e-4).all()
+    indicators = messages.decode_average(
+        'condition_indicator', b.received['shaft/condition_indicator'][-1])
+    assert indicators.names[0] == 'rms'
+    assert indicators.values[0, 0] == pytest.approx(
+        np.sqrt(sum(a * a for a, _ in MACHINE.components.values()) / 2.0), rel=1e-4)
+    np.testing.assert_allclose([item.data for item in b.received['shaft_speed']], MACHINE.speed,
+                               rtol=1e-6)
+    level, text, values = b.diagnostics()
+    assert set(DIAGNOSTIC_KEYS) <= values.keys()
+    assert all(values[key] == '0' for key in DIAGNOSTIC_KEYS)
+    assert (level, text) == (DiagnosticStatus.OK, '6 averages of 133 trigger cycles')
+
+
+def test_several_shafts_share_the_tach(bench):
+    ratio = 183 / 76
+    machine = Machine(components={1.0: (1.0, 0.4), 3.0 * ratio: (0.5, 1.0)})
+    b = bench(shafts=('input', 'output'), input__orders=[1.0, 3.0], output__orders=[1.0, 3.0],
+              output__ratio_teeth=[183, 76], output__samples_per_revolution=512,
+              shaft__orders=[1.0])
+    b.play(machine, 2.0)
+    assert len(b.amplitudes('input')) == 6 == len(b.amplitudes('output'))
+    assert_true(b.amplitudes('input'), machine, [1.0, 3.0])
+    assert_true(b.amplitudes('output'), machine, [1.0, 3.0], cycles=ratio)
+    waveforms = b.received['output/synchronous_average']
+    assert messages.decode_average('synchronous_average', waveforms[0]).values.shape == (2, 512)
+
+
+def test_pulses_per_trigger_counts_pulses_not_revolutions(bench):
+    b = bench(pulses_per_revolution=6, pulses_per_trigger=3)
+    machine = Machine(speed=6 * 25.0, components={1.0 / 6.0: (1.0, 0.4)})
+    b.play(machine, 1.5)
+    averages = b.amplitudes()
+    header = averages[0].header
+    assert header.end_time - header.start_time == pytest.approx(10 * 0.5 / 25.0)
+    assert header.mean_trigger_speed == pytest.approx(25.0)
+    assert header.fundamental_cycles == 5
+    assert averages[0].values[0, 0, 1] == pytest.approx(1.0, rel=2e-3)
+    np.testing.assert_allclose([item.data for item in b.received['shaft_speed']], 25.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize('kind', ['sliding', 'exponential'])
+def test_moving_averages_come_once_per_trigger_cycle(bench, kind):
+    b = bench(averaging=kind)
+    b.play(MACHINE, 1.0)
+    averages = b.amplitudes()
+    assert len(averages) >= 22
+    starts = [item.header.start_time for item in averages]
+    np.testing.assert_allclose(np.diff(starts), 1.0 / MACHINE.speed, rtol=1e-6)
+    for number, item in enumerate(averages):
+        assert item.header.sequence == number
+        # one angle for all: the phases of successive averages compare
+        np.testing.assert_allclose(item.values[0, :, 2], [0.4, -1.1, 2.0], atol=1e-3)
+
+
+# --- inputs --------------------------------------------------------------------------------------
+
+
+def test_float32_with_split_index(bench):
+    b = bench(vibration_type='std_msgs/msg/Float32MultiArray', sample_rate=12800.0,
+              start_time=-2.0 * 2**24 / 12800.0 - 0.5)
+    first = 2 * 2**24 + 6400 - 3200  # passes a multiple of 2^24 in single precision exactly
+
+    def encode(block):
+        return messages.encode_samples_float32(messages.SampleBlock(
+            block.samples, 0.0, block.sample_rate, block.index + first))
+
+    b.play(MACHINE, 1.0, start=-0.25, encode=encode)
+    assert len(b.amplitudes()) == 3
+    assert_true(b.amplitudes(), Machine(), ORDERS)
+    # pulses before 0 have a negative `sec`
+    assert b.amplitudes()[0].header.start_time == pytest.approx(-8 / 33.3)
+
+
+def test_ros_times_of_today_round_to_a_quarter_of_a_microsecond(bench):
+    b = bench()
+    machine = Machine(speed=32.0)  # whose pulses fall on whole seconds
+    b.play(machine, 2.0, start=1.7e9)
+    assert len(b.amplitudes()) == 6
+    for average in b.amplitudes():
+        np.testing.assert_allclose(average.values[0, :, 1], [1.0, 0.5, 0.2], rtol=1e-3)
+        np.testing.assert_allclose(average.values[0, :, 2], [0.4, -1.1, 2.0], atol=2e-3)
+    assert b.status()['clock_deviation'] == 0
+
+
+@pytest.mark.parametrize('kind', ['std_msgs/Float64MultiArray', 'std_msgs/Float32MultiArray'])
+def test_blocks_without_header_are_counted_and_the_node_says_so(bench, kind):
+    b = bench(vibration_type=kind, sample_rate=12800.0)
+
+    def encode(block):
+        message = messages.SAMPLE_TYPES[kind]()
+        message.data = block.samples[0].astype('f' if '32' in kind else 'd').tolist()
+        return message
+
+    b.play(MACHINE, 1.0, encode=encode)
+    assert len(b.amplitudes()) == 3
+    assert b.amplitudes()[0].values.shape[0] == 1
+    assert_true(b.amplitudes(), MACHINE, ORDERS)
+    level, text, _ = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'a loss would not be seen' in text
+
+
+def imu(time, *values):
+    """Return an Imu message."""
+    nanoseconds = round(time * 1e9)
+    message = Imu()
+    message.header.stamp = Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+    vector = message.linear_acceleration
+    vector.x, vector.y, vector.z = map(float, values)
+    return message
+
+
+def test_imu_axes_are_channels(bench, rng):
+    machine = Machine(speed=8.0, rate=400.0, components={1.0: (1.0, 0.4), 5.0: (0.5, 1.0)})
+    b = bench(vibration_type='sensor_msgs/Imu', imu_axis='zx', sample_rate=400.0,
+              shaft__orders=[1.0, 5.0])
+    times = np.arange(1200) / 400.0
+    wave = machine.at(times)
+    stamps = times + np.append(0.0, rng.uniform(-4e-4, 4e-4, 1199))
+    b.send_pulses(machine.pulses(3.0))
+    for stamp, (one, two) in zip(stamps, wave.T):
+        b.send('vibration', imu(stamp, two, 99.0, one))
+    b.settle()
+    assert len(b.amplitudes()) == 2
+    assert_true(b.amplitudes(), machine, [1.0, 5.0], rtol=1e-3)
+    assert b.status()['clock_deviation'] == 0
+
+
+def test_imu_losses_repeats_and_restarts_are_seen(bench):
+    machine = Machine(speed=8.0, rate=400.0, components={1.0: (1.0, 0.4)}, channels=1)
+    b = bench(vibration_type='sensor_msgs/Imu', sample_rate=400.0, shaft__orders=[1.0])
+    samples = [imu(k / 400.0, 0.0, 0.0, value) for k, value in enumerate(
+        machine.at(np.arange(1400) / 400.0)[0])]
+    samples[100:100] = [samples[99]]
+    del samples[400:404]
+    b.send_pulses(machine.pulses(3.5))
+    for message in samples:
+        b.send('vibration', message)
+    b.settle()
+    status = b.status()
+    assert (status['gaps'], status['repeats'], status['restarts']) == (1, 1, 0)
+    assert len(b.amplitudes()) == 1
+    assert_true(b.amplitudes(), machine, [1.0], rtol=1e-3)
+    b.send_pulses(machine.pulses(2.0))
+    for message in samples[:800]:
+        b.send('vibration', message)
+    b.settle()
+    assert b.status()['restarts'] == 1
+    assert_true(b.amplitudes(), machine, [1.0], rtol=1e-3)
+
+
+def test_pulse_arrays_carry_many_pulses(bench):
+    b = bench(tach_type='std_msgs/msg/Float64MultiArray')
+    b.play(MACHINE, 1.0)
+    assert len(b.amplitudes()) == 3
+    assert_true(b.amplitudes(), MACHINE, ORDERS)
+
+
+@pytest.mark.parametrize('named', [False, True])
+def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
+    b = bench(**({'keyphasor': 'kp'} if named else {}))
+    if named:
+        b.send_pulses([-0.5], source='other')
+
+    def and_another(number, block):
+        b.send_pulses([block.start_time + 0.003, block.start_time + 0.02], source='other')
+        return [block]
+
+    b.play(MACHINE, 1.0, change=and_another)
+    assert len(b.amplitudes()) == 3
+    assert_true(b.amplitudes(), MACHINE, ORDERS)
+    status = b.status()
+    assert status['pulses_dropped'] == 40 + named
+    assert status['keyphasor'] == 'kp'
+
+
+def test_a_keyphasor_without_a_name_is_one_too(bench):
+    b = bench()
+    b.send_pulses([-0.5], source='')
+    b.play(MACHINE, 1.0)
+    assert b.amplitudes() == []
+    assert b.status()['pulses_dropped'] == len(MACHINE.pulses(1.0))
+
+
+def test_an_error_that_nobody_thought_of_costs_its_message_only(bench, monkeypatch):
+    b = bench()
+    add_pulses = b.node._averager.add_pulses
+
+    def failing(times):
+        if 0.3 < times[0] < 0.33:
+            raise ZeroDivisionError('unthought of')
+        return add_pulses(times)
+
+    monkeypatch.setattr(b.node._averager, 'add_pulses', failing)
+    b.play(MACHINE, 1.0)
+    assert len(b.amplitudes()) == 2
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'ZeroDivisionError: unthought of' in text
+    assert values['messages_rejected'] == '1'
+
+
+def malformed():
+    """Yield what is wrong about a message, the message and what the node says."""
+    good = messages.encode_samples
+
+    def changed(**changes):
+        message = good(MACHINE.block(0, 100))
+        for name, value in changes.items():
+            if name == 'label':
+                message.layout.dim[0].label = value
+            elif name == 'size':
+                message.layout.dim[1].size = value
+            elif name == 'offset':
+                message.layout.data_offset = value
+            elif name == 'header':
+                for position, item in value.items():
+                    message.data[position] = item
+        return message
+
+    yield 'label', changed(label='sensor'), "dimensions ['sensor', 'sample']"
+    yield 'size', changed(size=101), 'layout 2x101'
+    yield 'huge size', changed(size=2**32 - 1), 'does not fit 203 elements'
+    yield 'empty', changed(size=0), 'layout 2x0'
+    yield 'offset', changed(offset=2), 'data_offset 2 received, 3 expected'
+    yield 'offset beyond', changed(offset=2**32 - 1), 'data_offset'
+    yield 'time', changed(header={0: math.nan}), 'header time nan s'
+    yield 'endless time', changed(header={0: math.inf}), 'header time inf s'
+    yield 'rate', changed(header={1: 0.0}), 'rate 0.0 Hz'
+    yield 'negative rate', changed(header={1: -1.0}), 'rate -1.0 Hz'
+    yield 'index', changed(header={2: 0.5}), 'index of the first sample is 0.5'
+    yield 'negative index', changed(header={2: -1.0}), 'index of the first sample is -1.0'
+    yield 'nan index', changed(header={2: math.nan}), 'index of the first sample is nan'
+    empty = messages.Float64MultiArray()
+    yield 'nothing', empty, 'empty block'
+    short = messages.Float64MultiArray(data=[0.0, 12800.0])
+    short.layout.data_offset = 3
+    yield 'short', short, '2 elements cannot hold 3 header elements'
+    deep = good(MACHINE.block(0, 100))
+    deep.layout.dim.append(deep.layout.dim[0])
+    yield 'three dimensions', deep, "['channel', 'sample', 'channel']"
+
+
+@pytest.mark.parametrize(('message', 'says'), [
+    pytest.param(message, says, id=name) for name, message, says in malformed()])
+def test_malformed_block_is_rejected_with_its_reason_and_nothing_else(bench, message, says):
+    b = bench()
+
+    def with_it(number, block):
+        return [block, message] if number == 5 else [block]
+
+    b.play(MACHINE, 0.8, change=with_it)
+    level, text, values = b.diagnostics()
+    if says.startswith('empty'):  # without header it needs a rate before it needs samples
+        assert 'vibration: ' in text
+    else:
+        assert says in text
+    assert level == DiagnosticStatus.WARN
+    assert values['messages_rejected'] == '1'
+    assert values['cycles_dropped'] == '0'
+    assert len(b.amplitudes()) == 2
+    assert_true(b.amplitudes(), MACHINE, ORDERS)
+    assert b.diagnostics()[0] == DiagnosticStatus.OK
+
+
+def test_malformed_pulses_are_rejected(bench):
+    b = bench(tach_type='std_msgs/Float64MultiArray')
+    wrong = messages.encode_pulse_array(np.array([0.1, 0.2]))
+    wrong.layout.dim[0].label = 'sample'
+    b.send('tach_pulse', wrong)
+    assert b.status()['messages_rejected'] == 1
+    b.send_pulses([math.nan, math.inf, 0.0])
+    assert b.status()['pulses_dropped'] == 2
+    b.play(MACHINE, 0.8)
+    assert_true(b.amplitudes(), MACHINE, ORDERS)
+    assert len(b.amplitudes()) == 2
+
+
+def test_rate_that_no_one_gives_is_asked_for(bench):
+    b = bench(vibration_type='std_msgs/Float32MultiArray')
+    b.send('vibration', messages.encode_samples_float32(MACHINE.block(0, 100)))
+    _, text, values = b.diagnostics()
+    assert 'set the parameter sample_rate' in text
+    assert values['messages_rejected'] == '1'
+
+
+def test_channels_that_change_for_good_are_averaged_from_then_on(bench):
+    b = bench()
+    other = Machine(channels=3)
+    b.play(MACHINE, 0.8)
+    b.play(Machine(channels=1), 0.05)  # one odd block is a fault
+    before = len(b.amplitudes())
+    assert b.status()['messages_rejected'] == 1
+    b.play(other, 1.0)
+    status = b.status()
+    assert status['messages_rejected'] == 2
+    assert status['channels'] == 3
+    assert status['restarts'] == 1
+    assert {item.values.shape[0] for item in b.amplitudes()[:before]} == {2}
+    assert {item.values.shape[0] for item in b.amplitudes()[before:]} == {3}
+    assert len(b.amplitudes()) - before >= 2
+    assert_true(b.amplitudes()[before:], other, ORDERS)
+
+
+def test_orders_and_shafts_beyond_nyquist(bench):
+    b = bench(shafts=('shaft', 'turbine'), shaft__orders=[1.0, 300.0], turbine__ratio=200.0)
+    b.play(MACHINE, 0.8)
+    assert b.received['turbine/order_amplitude'] == []
+    amplitude = b.amplitudes()[0].values[0]
+    assert amplitude[0, 1] == pytest.approx(1.0, rel=1e-4)
+    assert np.isnan(amplitude[1, 1:]).all()
+    _, text, values = b.diagnostics()
+    assert 'turbine: shaft frequency 6660 Hz is not below half the sampling rate' in text
+    assert int(values['cycles_dropped']) == int(values['trigger_cycles']) > 20
+
+
+# --- parameters ----------------------------------------------------------------------------------
+
+
+def test_parameters_are_described_with_their_ranges(bench):
+    b = bench()
+    ask = b.client()
+    names = ask('list_parameters', [], 0).result.names
+    ours = [name for name in names if name != 'use_sim_time'
+            and not name.startswith(('qos_overrides', 'start_type'))]
+    assert {'trigger_cycles', 'shaft.ratio', 'shaft.orders', 'shaft.samples_per_revolution',
+            'averaging', 'angle_law', 'interpolation', 'pulses_per_trigger'} <= set(ours)
+    described = {item.name: item for item in ask('describe_parameters', ours).descriptors}
+    assert all(item.description for item in described.values())
+    assert described['trigger_cycles'].integer_range[0].from_value == 1
+    assert described['vibration_type'].read_only
+    assert 'sliding' in described['averaging'].additional_constraints
+    values = ask('get_parameters', ['shaft.orders', 'trigger_cycles']).values
+    assert list(values[0].double_array_value) == ORDERS
+    assert values[1].integer_value == 10
+
+
+@pytest.mark.parametrize(('name', 'value', 'stored'), [
+    ('trigger_cycles', 5, 5), ('shaft.orders', [1, 7], [1.0, 7.0]), ('shaft.ratio', 2, 2.0),
+    ('averaging', 'sliding', 'sliding'), ('angle_law', 'spline', 'spline'),
+    ('interpolation', 'linear', 'linear'), ('shaft.samples_per_revolution', 64, 64),
+    ('shaft.mesh_orders', [23], [23.0]), ('shaft.ratio_teeth', [20, 10], [20, 10]),
+    ('minimum_interval', 0, 0.0),
+])
+def test_parameter_can_be_set_while_it_runs(bench, name, value, stored):
+    b = bench()
+    b.play(MACHINE, 0.5)
+    assert b.set_parameter(name, value) == (True, '')
+    got = b.node.get_parameter(name).value
+    assert (list(got) if isinstance(stored, list) else got) == stored
+    assert type(got[0] if isinstance(stored, list) else got) is type(
+        stored[0] if isinstance(stored, list) else stored)
+    before = len(b.amplitudes())
+    b.play(MACHINE, 2.0, change=lambda number, block: [block])
+    last = b.amplitudes()[-1]
+    assert len(b.amplitudes()) > before
+    assert last.header.trigger_cycles == (5 if name == 'trigger_cycles' else 10)
+    if name == 'shaft.orders':
+        assert list(last.values[0, :, 0]) == [1.0, 7.0]
+    if name in ('shaft.ratio', 'shaft.ratio_teeth'):
+        assert last.header.fundamental_cycles == 20
+    elif name == 'averaging':
+        assert len(b.amplitudes()) - before > 30
+    else:
+        np.testing.assert_allclose(last.values[0, :2, 1], [1.0, 0.5], rtol=1e-2)
+    if name == 'shaft.samples_per_revolution':
+        shape = messages.decode_average(
+            'synchronous_average', b.received['shaft/synchronous_average'][-1]).values.shape
+        assert shape == (2, 64)
+
+
+@pytest.mark.parametrize(('name', 'value', 'reason'), [
+    ('trigger_cycles', 0, 'trigger_cycles out of range. Min: 1'),  # rclpy says it first
+    ('trigger_cycles', 10.5, 'trigger_cycles is 10.5: give a whole number'),
+    ('trigger_cycles', 'many', "trigger_cycles is 'many': give a whole number"),
+    ('shaft.ratio', 0.0, 'shaft.ratio out of range Min: 0.001, Max: 1000.0'),
+    ('shaft.ratio', math.nan, 'shaft.ratio out of range'),
+    ('shaft.ratio_teeth', [1, 10**9], 'shaft: ratio is 1e-09: give at least 0.001'),
+    ('shaft.ratio', True, 'shaft.ratio is True: give a number'),
+    ('shaft.orders', [1.0, -1.0], 'shaft.orders[1] is -1.0: give more than 0.0'),
+    ('shaft.orders', 3.0, 'give a list of numbers'),
+    ('shaft.ratio_teeth', [3], 'give pairs of driver and driven'),
+    ('shaft.samples_per_revolution', 2, 'give at least 4, or 0 to choose it'),
+    ('averaging', 'median', 'one of block, sliding, exponential'),
+    ('angle_law', '', 'one of linear, quadratic, spline'),
+    ('interpolation', 'best', 'one of band_limited'),
+    ('pulses_per_trigger', 2, 'pulses_per_trigger is 2 of 1 pulses_per_revolution'),
+    ('shafts', ['other'], 'read-only'),
+    ('vibration_type', 'sensor_msgs/Imu', 'read-only'),
+])
+def test_wrong_value_is_refused_with_its_reason_and_changes_nothing(bench, name, value, reason):
+    b = bench()
+    b.play(MACHINE, 0.4)
+    before = b.node.get_parameter(name).value
+    successful, text = b.set_parameter(name, value)
+    assert not successful
+    assert reason in text
+    assert b.node.get_parameter(name).value == before
+    assert b.status()['averages_dropped'] == 0
+
+
+def test_an_atomic_change_is_refused_as_a_whole(bench):
+    b = bench()
+    result = b.client()('set_parameters_atomically', [
+        Parameter('trigger_cycles', value=7), Parameter('shaft.ratio', value=-1.0)]).result
+    assert not result.successful
+    assert b.node.get_parameter('trigger_cycles').value == 10
+    result = b.client()('set_parameters_atomically', [
+        Parameter('shaft.ratio', value=1), Parameter('trigger_cycles', value=7)]).result
+    assert result.successful, result.reason
+    assert b.node.get_parameter('trigger_cycles').value == 7
+
+
+def test_ratio_and_teeth_together_are_refused(ros_graph):
+    with pytest.raises(ParameterError, match=r'shaft.ratio is 2.0 .* \[3, 2\]: give one of them'):
+        ros_graph.add(SynchronousAverager, {'shaft.ratio': 2.0, 'shaft.ratio_teeth': [3, 2]})
+
+
+@pytest.mark.parametrize(('name', 'value', 'says'), [
+    ('shafts', ['Input'], 'small letters'), ('shafts', ['a', 'a'], 'different names'),
+    ('vibration_type', 'std_msgs/String', 'give one of std_msgs/Float64MultiArray'),
+    ('tach_type', 'std_msgs/Header', 'give one of sensor_msgs/TimeReference'),
+    ('imu_axis', 'w', 'imu_axis'), ('trigger_cycles', 'x', 'give a whole number'),
+    ('buffer_seconds', 0.0, 'more than 0.0'),
+])
+def test_node_refuses_to_start_with(ros_graph, name, value, says):
+    with pytest.raises(ParameterError, match=says):
+        ros_graph.add(SynchronousAverager, {name: value})
+
+
+def test_override_that_matches_nothing_is_named(bench, capfd):
+    bench(overrides=[Parameter('shaft.ration', value=2.0)])
+    assert 'parameter shaft.ration matches nothing' in capfd.readouterr().err
+
+
+# --- quality of service, process -----------------------------------------------------------------
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_incompatible_publisher_is_an_error_that_names_the_override(bench):
+    b = bench(qos=BEST_EFFORT)
+    named = ['qos_overrides./vibration.subscription.reliability',
+             'qos_overrides./tach_pulse.subscription.reliability']
+    assert b.spin(lambda: all(name in b.diagnostics()[1] for name in named))
+    assert b.diagnostics()[0] == DiagnosticStatus.ERROR
+    for publisher in b.publishers.values():
+        b.graph.node.destroy_publisher(publisher)
+    assert b.spin(lambda: b.diagnostics()[0] == DiagnosticStatus.OK)  # nobody is there to fit
+
+
+def test_durability_can_be_overridden_as_the_error_says(bench):
+    names = [f'qos_overrides./{topic}.subscription.durability'
+             for topic in ('vibration', 'tach_pulse')]
+    b = bench(qos=QoSProfile(depth=10), overrides=[
+        Parameter(name, value='transient_local') for name in names])
+    assert b.spin(lambda: all(name in b.diagnostics()[1] for name in names))
+
+
+def test_quality_of_service_can_be_overridden(bench):
+    b = bench(qos=BEST_EFFORT, overrides=[
+        Parameter(f'qos_overrides./{topic}.subscription.reliability', value='best_effort')
+        for topic in ('vibration', 'tach_pulse')])
+    b.play(MACHINE, 0.5)
+    assert len(b.amplitudes()) == 1
+    assert b.diagnostics()[0] == DiagnosticStatus.OK
+
+
+def test_an_override_is_for_its_topic_only(ros_graph):
+    node = ros_graph.add(SynchronousAverager, {
+        'qos_overrides./vibration.subscription.reliability': 'best_effort'})
+    found = {item.topic_name: item.qos_profile.reliability for item in node.subscriptions}
+    assert found['/vibration'] == ReliabilityPolicy.BEST_EFFORT
+    assert found['/tach_pulse'] == INPUT_QOS.reliability == ReliabilityPolicy.RELIABLE
+
+
+def test_topics_follow_namespace(ros_graph):
+    node = ros_graph.add(SynchronousAverager, namespace='/press/motor')
+    topics = {name for name, _ in node.get_topic_names_and_types()}
+    assert {'/press/motor/vibration', '/press/motor/tach_pulse', '/diagnostics',
+            '/press/motor/shaft/order_amplitude', '/press/motor/shaft_speed'} <= topics
+
+
+RUN = """
+import sys
+from rclpy.executors import SingleThreadedExecutor
+from sa_jitter_ros.nodes.synchronous_averager import main
+spin = SingleThreadedExecutor.spin
+def say_and_spin(executor):
+    print('spinning', flush=True)
+    spin(executor)
+SingleThreadedExecutor.spin = say_and_spin
+sys.exit(main())
+"""
+
+
+def run(environment, *arguments):
+    """Start the node as a process."""
+    return subprocess.Popen(
+        [sys.executable, '-c', RUN, '--ros-args', *arguments], env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, tmp_path, number):
+    file = tmp_path / 'averager.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    trigger_cycles: 12\n    shaft:\n'
+                    '      ratio: 2\n      orders: [1, 38]\n')
+    process = run(process_environment, '--params-file', str(file))
+    assert process.stdout.readline() == 'spinning\n'
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 0, errors
+    assert errors == ''
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(('argument', 'says'), [
+    ('trigger_cycles:=0', 'trigger_cycles is 0: give at least 1'),
+    ('averaging:=median', "averaging is 'median'"),
+    ('shaft.orders:=[1.0, x]', "Couldn't parse parameter override rule"),
+    ('use_sim_time:=3', 'expecting type'),
+])
+def test_main_says_in_one_line_what_is_wrong(process_environment, argument, says):
+    process = run(process_environment, '-p', argument)
+    output, errors = process.communicate(timeout=600)
+    assert process.returncode == 2
+    assert output == ''
+    *logged, line = errors.strip().splitlines()
+    assert all('[rcl]' in item for item in logged), errors
+    assert line.startswith('error: ')
+    assert says in line

@@ -1,0 +1,548 @@
+"""The live view: what is published reaches the page, through HTTP and in a real browser."""
+
+from concurrent.futures import ThreadPoolExecutor
+import http.client
+import json
+import math
+import os
+from pathlib import Path
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+
+from bench import NodeBench, SteadyClock
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from hypothesis import given, strategies as st
+from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
+from rclpy.parameter import Parameter
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.nodes import live_view_board as board
+from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
+from sa_jitter_ros.nodes.live_view import LiveView
+from sa_jitter_ros.nodes.live_view_server import is_own_name, PORTS_TRIED
+from std_msgs.msg import Float64, Float64MultiArray, String
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+ORDERS = np.array([19.0, 38.0, 57.0])
+NAN = float('nan')
+REPORT = {
+    'missing_effects': [{
+        'name': 'excess_jitter', 'evidence': 'wider than declared', 'p_value': 1e-9,
+        'parameters': {'std': {'value': 1.93e-5, 'standard_error': 4e-7, 'unit': 's'}},
+        'indistinguishable_from': ['phase_wander']}],
+    'error_before': {'rms': 0.0123}, 'error_after': {'rms': 0.0018}, 'verdict': 'traced',
+    'lines': [{'channel': 'channel 0', 'order': 19.0, 'observed': 0.9,
+               'predicted_before': 0.95, 'predicted_after': 0.901}]}
+
+
+class ViewBench(NodeBench):
+    """A bench around the view: publishers of all that it shows, and a client of its page."""
+
+    def __init__(self, graph, **parameters):
+        latched = {'prediction': Float64MultiArray, 'missing_effect': String}
+        inputs = {f'shaft/{kind}': Float64MultiArray for kind in (
+            'synchronous_average', 'standard_error', 'corrected_average', 'order_amplitude',
+            'pulse_error', 'condition_indicator')}
+        super().__init__(
+            graph, LiveView, qos=RESULT_QOS, outputs={},
+            inputs={**inputs, 'residual': Float64MultiArray, 'shaft_speed': Float64},
+            **{'port': 0, **parameters})
+        for topic, kind in latched.items():
+            graph.publisher(topic, kind, qos=LATCHED_QOS)
+        self.port = int(re.search(r':(\d+)/', self.diagnostics()[2]['address'])[1])
+
+    def ask(self, path='/snapshot.json', method='GET', host=None):
+        """Return status, headers and body of an answer while the node goes on."""
+        def talk():
+            connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=60.0)
+            connection.request(method, path, headers={
+                'Host': f'127.0.0.1:{self.port}' if host is None else host})
+            answer = connection.getresponse()
+            result = answer.status, dict(answer.headers), answer.read()
+            connection.close()
+            return result
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(talk)
+            assert self.spin(asked.done)
+        return asked.result()
+
+    def snapshot(self, since=0):
+        """Return a snapshot once all that was sent is on the board."""
+        self.settle()
+        status, headers, body = self.ask(f'/snapshot.json?since={since}')
+        assert status == 200
+        assert headers['Content-Type'] == 'application/json'
+        return json.loads(body)
+
+    def part(self, name):
+        """Return the content of one part."""
+        return self.snapshot()['parts'][name]['content']
+
+
+@pytest.fixture
+def bench(ros_graph):
+    """Return a maker of benches around the view."""
+    return lambda **parameters: ViewBench(ros_graph, **parameters)
+
+
+def header(sequence=7):
+    """Return the header of an average."""
+    return messages.AverageHeader(10.0 * sequence, 10.0 * sequence + 2.0, sequence, 30, 72, 15.0)
+
+
+def average(kind, values, names=(), sequence=7):
+    """Return a message of one average."""
+    return messages.encode_average(kind, messages.AverageMessage(header(sequence), values, names))
+
+
+def amplitudes(attenuation=0.9, channels=2):
+    """Return a table (channel, order, field) of order amplitudes."""
+    table = np.full((channels, len(ORDERS), 8), 0.25)
+    table[..., 0] = ORDERS
+    table[..., 1] = 0.4321 * attenuation
+    table[..., 3] = 0.4321
+    table[..., 5] = attenuation
+    table[..., 6] = 0.0123
+    return table
+
+
+def prediction():
+    """Return the message of a prediction, of ratio 2.4: 72 revolutions in 30 cycles."""
+    table = np.stack([ORDERS, *(np.full(3, value) for value in (
+        0.8765, 1e-4, 0.01, 0.85, 0.88, 0.93))], axis=1)
+    return messages.encode_prediction(
+        messages.PredictionMessage(table, 15.0, 1e4, 30, 2.4, 2.9e-5, 0.0))
+
+
+def pulse_errors(first=70.0, count=31):
+    """Return a table (pulse, field) of pulse errors."""
+    number = np.arange(count)
+    return np.stack([first + number / 15.0, 1e-5 * np.cos(number), np.full(count, 1e-6)], axis=1)
+
+
+def publish_all(b):
+    """Publish one message of everything; return the waveforms."""
+    angle = 2.0 * np.pi * np.arange(512) / 512
+    raw = np.stack([np.sin(19.0 * angle), 0.5 * np.sin(38.0 * angle)])
+    b.send('shaft/synchronous_average', average('synchronous_average', raw))
+    b.send('shaft/standard_error', average('standard_error', np.full(raw.shape, 0.05)))
+    b.send('shaft/condition_indicator', average(
+        'condition_indicator', np.array([[0.7071, NAN], [0.3536, 1.523]]), ('rms', 'fm0')))
+    b.send('shaft/corrected_average', average('corrected_average', 1.1 * raw))
+    b.send('shaft/order_amplitude', average(
+        'order_amplitude', amplitudes(), messages.AMPLITUDE_FIELDS))
+    b.send('shaft/pulse_error', average(
+        'pulse_error', pulse_errors(), messages.PULSE_ERROR_FIELDS))
+    b.send('prediction', prediction())
+    table = np.stack([ORDERS, *(np.full(3, value) for value in (
+        0.90, 0.91, -0.01, 0.004, -2.5))], axis=1)
+    b.send('residual', messages.encode_residual(
+        messages.ResidualMessage(table, 20, 1.07, 0.38, 0.01)))
+    b.send('missing_effect', String(data=json.dumps(REPORT)))
+    b.send('shaft_speed', Float64(data=16.625))
+    b.send('/diagnostics', DiagnosticArray(status=[DiagnosticStatus(
+        level=DiagnosticStatus.WARN, name='rig/averager', message='pulses_dropped grew',
+        values=[KeyValue(key='pulses_dropped', value='321')])]))
+    assert b.spin(lambda: 'rig/averager' in b.node._nodes)
+    b.settle()
+    return raw
+
+
+# --- what is published is what is served ---
+
+
+def test_snapshot_holds_what_was_published(bench):
+    b = bench(vibration_unit='g', channel_names=['casing', 'shaft end'])
+    raw = publish_all(b)
+    news = b.snapshot()
+    parts = {name: item['content'] for name, item in news['parts'].items()}
+    assert set(parts) == {
+        'settings', 'shaft/synchronous_average', 'shaft/standard_error',
+        'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
+        'shaft/condition_indicator', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
+        '/diagnostics'}
+    assert parts['settings'] == {'shafts': ['shaft'], 'vibration_unit': 'g',
+                                 'channel_names': ['casing', 'shaft end']}
+    assert parts['shaft/synchronous_average']['header'] == vars(header())
+    for kind, factor in (('synchronous_average', 1.0), ('corrected_average', 1.1)):
+        np.testing.assert_allclose(parts[f'shaft/{kind}']['channels'], factor * raw, atol=2e-5)
+        assert parts[f'shaft/{kind}']['points'] == 512
+    assert parts['shaft/standard_error']['channels'] == [[0.05] * 512] * 2
+    assert parts['shaft/condition_indicator'] == {
+        'header': vars(header()), 'names': ['rms', 'fm0'],
+        'values': [[0.7071, None], [0.3536, 1.523]]}
+    for name, values in zip(messages.AMPLITUDE_FIELDS, np.moveaxis(amplitudes(), -1, 0)):
+        assert parts['shaft/order_amplitude'][name] == values.tolist()
+    for name, values in zip(messages.PULSE_ERROR_FIELDS, pulse_errors().T):
+        assert parts['shaft/pulse_error'][name] == values.tolist()
+    assert parts['prediction']['mean_attenuation'] == [0.8765] * 3
+    assert parts['prediction']['ratio'] == 2.4
+    assert parts['residual']['z'] == [-2.5] * 3
+    assert parts['residual']['acquisitions'] == 20
+    assert parts['missing_effect'] == REPORT
+    assert parts['shaft_speed'] == {'value': 16.625, 'history': [16.625]}
+    node = parts['/diagnostics']['rig/averager']
+    assert (node['level'], node['message']) == (1, 'pulses_dropped grew')
+    assert node['values'] == {'pulses_dropped': '321'}
+    assert news['silence'] >= 0.0
+
+
+def test_only_news_are_served_to_one_who_has_the_rest(bench):
+    b = bench()
+    publish_all(b)
+    known = b.snapshot()
+    b.send('shaft_speed', Float64(data=17.0))
+    news = b.snapshot(known['version'])
+    assert 'shaft_speed' in news['parts']
+    assert set(news['parts']) <= {'shaft_speed', '/diagnostics'}
+    assert news['version'] > known['version']
+    assert news['run'] == known['run']
+
+
+def test_what_is_undefined_is_null(bench):
+    b = bench()
+    assert b.snapshot()['silence'] is None
+    table = amplitudes(attenuation=NAN)
+    b.send('shaft/order_amplitude', average(
+        'order_amplitude', table, messages.AMPLITUDE_FIELDS))
+    b.send('missing_effect', String(data='{"a": NaN, "b": -Infinity, "c": 1e999, "d": 1.5}'))
+    b.send('shaft/synchronous_average', average('synchronous_average', np.full((1, 8), NAN)))
+    assert b.part('shaft/order_amplitude')['attenuation'] == [[None] * 3] * 2
+    assert b.part('shaft/order_amplitude')['corrected_amplitude'] == [[0.4321] * 3] * 2
+    assert b.part('shaft/synchronous_average')['channels'] == [[None] * 8]
+    assert b.part('missing_effect') == {'a': None, 'b': None, 'c': None, 'd': 1.5}
+
+
+def test_histories_follow_time_and_are_bounded(bench):
+    b = bench()
+    for k in range(40):
+        b.send('shaft/order_amplitude', average(
+            'order_amplitude', amplitudes(0.5 + 0.01 * k), messages.AMPLITUDE_FIELDS, k))
+        b.send('shaft/pulse_error', average(
+            'pulse_error', pulse_errors(2.0 * k), messages.PULSE_ERROR_FIELDS, k))
+        b.send('shaft_speed', Float64(data=float(k)))
+        b.settle()
+    history = np.array(b.part('shaft/order_amplitude')['history'])
+    np.testing.assert_allclose(history[:, 0, 0], 0.5 + 0.01 * np.arange(10, 40))
+    time = np.array(b.part('shaft/pulse_error')['time'])
+    # An average's last pulse is the next one's first: 30 of each are kept.
+    np.testing.assert_allclose(time, (np.arange(-len(time), 0) + 1) / 15.0 + 80.0)
+    assert len(time) == board.PULSES
+    assert b.part('shaft_speed')['history'] == [float(k) for k in range(40)]
+    b.send('shaft/pulse_error', average(
+        'pulse_error', pulse_errors(0.0), messages.PULSE_ERROR_FIELDS))  # a restart
+    assert b.part('shaft/pulse_error')['time'] == pulse_errors(0.0)[:, 0].tolist()
+    b.send('shaft/order_amplitude', average(
+        'order_amplitude', amplitudes(0.7, channels=1), messages.AMPLITUDE_FIELDS))
+    assert b.part('shaft/order_amplitude')['history'] == [[[0.7] * 3]]
+
+
+def test_a_snapshot_of_much_stays_small(bench, rng):
+    b = bench()
+    b.send('shaft/synchronous_average', average(
+        'synchronous_average', rng.normal(size=(100, 20000))))
+    table = np.full((100, 400, 8), 0.5)
+    for _ in range(3):
+        b.send('shaft/order_amplitude', average(
+            'order_amplitude', table, messages.AMPLITUDE_FIELDS))
+    part = b.part('shaft/order_amplitude')
+    assert np.shape(part['order']) == (board.CHANNELS, board.ORDERS)
+    assert len(part['history']) == 1
+    channels = b.part('shaft/synchronous_average')['channels']
+    assert np.shape(channels) == (board.CHANNELS, board.ALL_POINTS // board.CHANNELS)
+
+
+@given(values=arrays(float, st.tuples(st.integers(1, 3), st.integers(1, 400)),
+                     elements=st.floats(-1e6, 1e6)), half=st.integers(1, 60))
+def test_an_envelope_keeps_every_peak(values, half):
+    shown = board.envelope(values, 2 * half)
+    assert shown.shape[1] <= 2 * half
+    np.testing.assert_array_equal(shown.max(axis=1), values.max(axis=1))
+    np.testing.assert_array_equal(shown.min(axis=1), values.min(axis=1))
+    limit = 1e-5 * np.abs(values).max() + 1e-300  # where digits of a float end
+    np.testing.assert_allclose(board.rounded(values), values, atol=limit, rtol=0.0)
+
+
+# --- what must not be ---
+
+
+BAD = {
+    'label': ('shaft/synchronous_average', lambda: messages.encode_array(
+        np.zeros((1, 4)), ('wire', 'angle'), (0.0,) * 6)),
+    'count': ('shaft/synchronous_average', lambda: messages.encode_array(
+        np.zeros((1, 4)), ('channel', 'angle'), (0.0, 1.0, NAN, 1.0, 1.0, 1.0))),
+    'fields': ('shaft/order_amplitude', lambda: messages.encode_array(
+        np.zeros((1, 2, 3)), ('channel', 'order', 'field'), (0.0,) * 6)),
+    'pulse fields': ('shaft/pulse_error', lambda: messages.encode_array(
+        np.zeros((5, 2)), ('pulse', 'field'), (0.0,) * 6)),
+    'prediction': ('prediction', lambda: messages.encode_array(
+        np.zeros((2, 3)), ('order', 'field'), (0.0,) * 6)),
+    'residual': ('residual', lambda: messages.encode_array(
+        np.zeros((2, 3)), ('order', 'field'), (0.0,) * 4)),
+    'speed': ('shaft_speed', lambda: Float64(data=NAN)),
+    'no JSON': ('missing_effect', lambda: String(data='{"verdict":')),
+    'nested JSON': ('missing_effect', lambda: String(data='[' * 200000)),
+    'JSON list': ('missing_effect', lambda: String(data='[1]')),
+    'long JSON': ('missing_effect', lambda: String(data=' ' * 1000001)),
+}
+
+
+@pytest.mark.parametrize('bad', BAD)
+def test_a_malformed_message_is_counted_and_not_shown(bench, bad):
+    b = bench()
+    topic, message = BAD[bad]
+    b.send(topic, message())
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert topic in text
+    assert values['messages_rejected'] == '1'
+    assert topic not in b.snapshot()['parts']
+    publish_all(b)
+    assert topic in b.snapshot()['parts']
+
+
+def test_nothing_but_get(bench):
+    b = bench()
+    methods = ('HEAD', 'POST', 'PUT', 'DELETE', 'OPTIONS', 'PATCH')
+    for method in methods:
+        status, headers, _ = b.ask('/', method=method)
+        assert status == 405
+        assert headers['Allow'] == 'GET'
+    assert b.status()['requests_refused'] == len(methods)
+
+
+def test_other_paths_are_not_found(bench):
+    b = bench()
+    for path in ('/nothing', '/../live_view.py', '/%2e%2e/live_view.py', '//etc/passwd', '*',
+                 '/live_view_page/', '/page.js/', '/snapshot'):
+        assert b.ask(path)[0] == 404
+    assert b.ask('/page.js')[0] == 200
+
+
+def test_a_bad_version_is_refused(bench):
+    b = bench()
+    for since in ('-1', 'x', '1.5', '1' * 30, '%C2%B2'):
+        assert b.ask(f'/snapshot.json?since={since}')[0] == 400
+
+
+def test_a_name_that_is_not_ours_is_refused(bench):
+    b = bench()
+    hosts = ('evil.example', 'evil.example:8420', '127.0.0.1.evil.example', '', '[::1',
+             'localhost.evil', 'x@evil.example')
+    for host in hosts:
+        for path in ('/', '/snapshot.json'):
+            status, _, body = b.ask(path, host=host)
+            assert status == 403
+            assert b'run' not in body
+    assert b.status()['requests_refused'] == 2 * len(hosts)
+
+
+@pytest.mark.parametrize('host', [
+    'localhost', 'localhost:9', '127.0.0.1:80', '[::1]:8420', '192.0.2.7', socket.gethostname()])
+def test_addresses_and_own_names_are_served(host):
+    assert is_own_name(host)
+
+
+def test_the_page_is_complete_and_asks_nobody_else(bench):
+    b = bench()
+    status, headers, body = b.ask('/')
+    assert status == 200
+    assert headers['Content-Type'].startswith('text/html')
+    assert "default-src 'self'" in headers['Content-Security-Policy']
+    assert headers['X-Content-Type-Options'] == 'nosniff'
+    needed = re.findall(r'(?:src|href)="([^"]+)"', body.decode())
+    texts = {name: b.ask(f'/{name}') for name in needed if not name.startswith('data:')}
+    assert set(texts) == {'style.css', 'page.js'}
+    imported = re.findall(r"from '\./(\w+\.js)'", texts['page.js'][2].decode())
+    texts.update({name: b.ask(f'/{name}') for name in imported})
+    for status, headers, content in texts.values():
+        assert status == 200
+        assert headers['Content-Type'].split(';')[0] in ('text/css', 'text/javascript')
+        assert not re.sub(rb'http://www.w3.org/2000/svg', b'', content).count(b'://')
+        assert b'innerHTML' not in content
+
+
+# --- starting and stopping ---
+
+
+@pytest.mark.parametrize('host', ['0.0.0.0', '::', '192.0.2.7', 'rig.example'])
+def test_other_machines_are_let_in_only_on_request(ros_graph, host):
+    with pytest.raises(ParameterError, match='open_to_network'):
+        ros_graph.add(LiveView, {'host': host, 'port': 0})
+
+
+def test_opened_to_the_network_it_listens_there(ros_graph):
+    node = ros_graph.add(LiveView, {'host': '0.0.0.0', 'open_to_network': True, 'port': 0})
+    assert socket.gethostname() in node.summary()[1]['address']
+
+
+def test_an_address_that_is_not_here_is_refused(ros_graph):
+    with pytest.raises(ParameterError, match=r'cannot listen on 192\.0\.2\.7'):
+        ros_graph.add(LiveView, {'host': '192.0.2.7', 'open_to_network': True, 'port': 0})
+
+
+@pytest.mark.parametrize('shaft', ['Shaft', 'a b', ''])
+def test_names_that_no_topic_can_have_are_refused(ros_graph, shaft):
+    with pytest.raises(ParameterError, match='small letters'):
+        ros_graph.add(LiveView, {'shafts': [shaft], 'port': 0})
+
+
+def test_a_port_in_use_gives_the_next(bench):
+    first = bench()
+    second = bench(port=first.port)
+    assert first.port < second.port < first.port + PORTS_TRIED
+    assert second.snapshot()['run'] != first.snapshot()['run']
+
+
+def test_the_port_is_free_again_after_the_node(ros_graph):
+    node = LiveView(context=ros_graph.context, parameter_overrides=[Parameter('port', value=0)])
+    port = int(re.search(r':(\d+)/', node.summary()[1]['address'])[1])
+    node.destroy_node()
+    with socket.socket() as probe:
+        assert probe.connect_ex(('127.0.0.1', port)) != 0
+
+
+def test_the_parameter_file_starts_the_node(ros_graph):
+    text = (ROOT / 'config' / 'live_view.yaml').read_text(encoding='utf-8')
+    given = yaml.safe_load(text)['/**']['ros__parameters']
+    node = ros_graph.add(LiveView, given)
+    assert {name: node.get_parameter(name).value for name in given} == given
+
+
+def test_labels_change_while_it_runs(bench):
+    b = bench()
+    assert b.set_parameter('vibration_unit', 'g') == (True, '')
+    assert b.part('settings')['vibration_unit'] == 'g'
+    assert not b.set_parameter('port', 1)[0]
+
+
+def test_diagnostics_say_where_the_page_is_and_what_is_on_it(bench, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(board, 'time', clock)
+    b = bench()
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.OK
+    assert text == f'no data received yet on http://127.0.0.1:{b.port}/'
+    assert set(DIAGNOSTIC_KEYS) <= values.keys()
+    publish_all(b)
+    assert b.diagnostics()[1].startswith('1 averages shown')
+    clock.now += 10.0
+    assert b.diagnostics()[1].startswith('no data for 10 s')
+
+
+# --- the page in a browser ---
+
+
+BROWSER = next(filter(None, map(shutil.which, (
+    'chromium', 'chromium-browser', 'google-chrome'))), None)
+FLAGS = (
+    '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
+    '--disable-background-networking', '--disable-component-update', '--disable-sync',
+    '--window-size=1300,2000', '--virtual-time-budget=2500')
+
+
+def shown(b, *flags):
+    """Return the page's document after two seconds in a browser, while the node goes on."""
+    if BROWSER is None:
+        pytest.skip('no chromium: apt install chromium')
+    with tempfile.TemporaryDirectory() as profile, tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            [BROWSER, *FLAGS, f'--user-data-dir={profile}', '--dump-dom', *flags,
+             f'http://127.0.0.1:{b.port}/'], stdout=output, stderr=subprocess.DEVNULL,
+            env={**os.environ, 'DBUS_SESSION_BUS_ADDRESS': 'disabled:'})
+        try:
+            assert b.spin(lambda: process.poll() is not None, timeout=600.0)
+        finally:
+            process.kill()
+            process.wait()
+        output.seek(0)
+        return output.read().decode()
+
+
+def text_of(document, name):
+    """Return the text in the element with an id."""
+    found = re.search(rf'<(\w+) [^>]*id="{name}"[^>]*>(.*?)</\1>', document, re.DOTALL)
+    return re.sub(r'<[^>]+>', ' ', found[2]).replace('&nbsp;', ' ')
+
+
+def test_the_browser_shows_the_numbers(bench):
+    b = bench(vibration_unit='g', channel_names=['casing', '<b>end</b>'])
+    publish_all(b)
+    page = shown(b)
+    assert re.fullmatch(r'live|no data for \d+ s', text_of(page, 'state'))
+    assert text_of(page, 'speed') == '16.625 Hz'
+    assert text_of(page, 'average') == 'No. 7'
+    assert text_of(page, 'average-note') == '30 trigger cycles, 72 revolutions of shaft'
+    rms = 1e6 * math.sqrt((pulse_errors()[:, 1]**2).mean())
+    assert text_of(page, 'pulses') == f'{rms:.3g} µs RMS'
+    assert text_of(page, 'pulses-note') == '31 pulses; declared 29 µs'
+    assert text_of(page, 'band') == '100 %'
+    assert text_of(page, 'error') == '0.012 → 0.0018'
+    rows = text_of(page, 'orders').split()
+    row = ('19', '0.3889', '0.4321', '0.25', '0.9', '±', '0.012', '0.8765', '0.85', 'to', '0.93',
+           'yes')
+    assert ' '.join(row) in ' '.join(rows)
+    assert 'raw [g]' in text_of(page, 'orders')
+    assert text_of(page, 'indicators').split() == [
+        'channel', 'rms', 'fm0', 'casing', '0.7071', '–', '&lt;b&gt;end&lt;/b&gt;', '0.3536',
+        '1.523']
+    assert page.count('class="spread" d="M') == 2
+    assert 'excess_jitter (std = 19.3 ± 0.4 µs)' in text_of(page, 'effects')
+    assert 'cannot be told from phase_wander' in text_of(page, 'effects')
+    assert re.search(r'rig/averager\s+WARN\s+pulses_dropped grew\s+pulses_dropped 321',
+                     text_of(page, 'nodes'))
+    assert page.count('class="curve raw"') == page.count('class="curve corrected"') - 1 == 2
+    assert page.count('class="mark measured"') == 6  # attenuations and residuals of 3 orders
+    assert page.count('class="mark corrected"') == 3 + 31 + 1
+    assert page.count('<rect class="band"') == 3 + 1
+    assert '&lt;b&gt;end' in page
+    assert '<b>end' not in page
+
+
+def test_the_browser_bears_a_report_that_is_not_as_ours_are(bench):
+    b = bench()
+    publish_all(b)
+    b.send('missing_effect', String(data='{"lines": [null], "missing_effects": 3}'))
+    page = shown(b)
+    assert text_of(page, 'speed') == '16.625 Hz'
+    assert 'rig/averager' in text_of(page, 'nodes')
+
+
+def test_the_browser_says_when_there_is_nothing(bench):
+    page = shown(bench())
+    assert text_of(page, 'state') == 'no data received yet'
+    assert 'no synchronous average received yet' in page
+    assert 'live_view' in text_of(page, 'nodes')
+    assert 'NaN' not in page
+
+
+@pytest.mark.processes
+def test_the_demo_prints_an_address_that_answers(process_environment, tmp_path):
+    demo = subprocess.Popen(
+        [sys.executable, '-c',
+         'from sa_jitter_ros.commands.demo import main; raise SystemExit(main())', '--live',
+         '--output', str(tmp_path)], env={**process_environment, 'PYTHONUNBUFFERED': '1'},
+        stdout=subprocess.PIPE, text=True)
+    try:
+        address = next(filter(None, (re.search(r'http://127\.0\.0\.1:(\d+)/', line)
+                                     for line in demo.stdout)))
+        connection = http.client.HTTPConnection('127.0.0.1', int(address[1]), timeout=60.0)
+        connection.request('GET', '/snapshot.json')
+        parts = json.loads(connection.getresponse().read())['parts']
+        connection.close()
+        assert parts['settings']['content']['vibration_unit'] == 'm/s^2'
+        assert parts['settings']['content']['channel_names'] == ['channel 0', 'channel 1']
+    finally:
+        demo.send_signal(signal.SIGINT)
+        demo.communicate(timeout=600.0)  # reads on: it may be printing
+        assert demo.returncode == 130
+    with socket.socket() as probe:
+        assert probe.connect_ex(('127.0.0.1', int(address[1]))) != 0

@@ -1,0 +1,260 @@
+"""From keyphasor waveform to pulse times: exact crossings, any cutting, real tachos, bad input."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.detection import counter_pulses, KeyphasorDetector
+
+RATE = 10_000.0
+
+
+def detect(samples, *, rate=RATE, start=0.0, cuts=(), **options):
+    """Return the pulses of a waveform given in blocks, and the detector."""
+    detector = KeyphasorDetector(**options)
+    found, index = [], 0
+    for block in np.split(samples, sorted(cuts)):
+        found.append(detector.update(block, start + index / rate, rate))
+        index += block.size
+    found.append(detector.flush())
+    return np.concatenate(found), detector
+
+
+def pulse_train(times, *, seconds, width=2e-3, slope=4e-4, high=1.0, low=0.0):
+    """Return trapezoidal pulses whose rising edges pass the middle at `times`."""
+    t = np.arange(round(seconds * RATE)) / RATE
+    wave = np.zeros(t.size)
+    for time in times:
+        wave += np.interp(t, time + np.array([-slope, slope, width - slope, width + slope]),
+                          [0.0, 1.0, 1.0, 0.0])
+    return low + (high - low) * wave
+
+
+TRUE = 0.0312345 + np.cumsum(0.04 + 0.002 * np.sin(np.arange(45)))
+
+
+@pytest.mark.parametrize(('high', 'low', 'polarity'), [
+    (1.0, 0.0, 'positive'), (5.0, 0.2, 'positive'), (-24.0, -2.0, 'negative'),
+    (1.0, -1.0, 'positive')])
+def test_interpolated_edges_are_exact(high, low, polarity):
+    wave = pulse_train(TRUE, seconds=2.0, high=high, low=low)
+    for edge, shift in (('rising', 0.0), ('falling', 2e-3), ('centre', 1e-3)):
+        pulses, _ = detect(wave, polarity=polarity, edge=edge)
+        # the modal bin of the lower level holds a few samples of the edges too
+        assert pulses == pytest.approx(TRUE + shift, abs=1e-7)
+
+
+def test_sampled_keyphasor_rounds_up_to_its_clock():
+    wave = pulse_train(TRUE, seconds=2.0)
+    pulses, _ = detect(wave, start=3.0, interpolate=False)
+    assert pulses - 3.0 == pytest.approx(np.ceil(TRUE * RATE) / RATE, abs=1e-9)
+
+
+def test_threshold_given_without_hysteresis_needs_no_learning():
+    wave = pulse_train(TRUE, seconds=0.1)
+    detector = KeyphasorDetector(threshold=0.25, hysteresis=0.0)
+    pulses = detector.update(wave, 0.0, RATE)
+    # the slope of 0.8 ms from low to high passes a quarter 0.2 ms before the middle
+    assert pulses == pytest.approx(TRUE[:pulses.size] - 2e-4, abs=1e-9)
+    assert pulses.size == 1
+
+
+@given(cuts=st.lists(st.integers(0, 20_000), max_size=40),
+       edge=st.sampled_from(['rising', 'centre']), interpolate=st.booleans(),
+       seed=st.integers(0, 3))
+def test_every_cutting_gives_the_same_pulses(cuts, edge, interpolate, seed):
+    rng = np.random.default_rng(seed)
+    drift = np.linspace(0.0, 0.8, 20_000)
+    wave = pulse_train(TRUE, seconds=2.0) + drift + rng.normal(0.0, 0.02, 20_000)
+    options = {'edge': edge, 'interpolate': interpolate, 'learning_time': 0.21}
+    whole, one = detect(wave, start=100.0, **options)
+    parts, many = detect(wave, start=100.0, cuts=cuts, **options)
+    assert np.array_equal(whole, parts)
+    assert one.state == many.state
+    assert whole.size == TRUE.size
+
+
+def test_no_pulse_is_lost_while_learning():
+    wave = pulse_train(TRUE, seconds=2.0)
+    detector = KeyphasorDetector()
+    assert detector.update(wave[:4999], 0.0, RATE).size == 0
+    assert detector.update(wave[4999:5001], 0.4999, RATE).size == np.sum(TRUE < 0.499)
+
+
+def test_a_steady_waveform_keeps_its_threshold(rng):
+    wave = pulse_train(TRUE, seconds=2.0) + rng.normal(0.0, 0.01, 20_000)
+    detector = KeyphasorDetector()
+    thresholds = set()
+    for k in range(20):
+        detector.update(wave[1000 * k:1000 * (k + 1)], k / 10.0, RATE)
+        thresholds.add(detector.state.threshold)
+    learnt = [level for level in thresholds if np.isfinite(level)]
+    assert len(learnt) == 1
+    # a bin of the histogram is 1 % of the range
+    assert learnt[0] == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize('drift', [3.0, -3.0])
+def test_a_drifting_level_is_followed(drift, rng):
+    times = 0.05 + 0.04 * np.arange(240)
+    wave = pulse_train(times, seconds=10.0) + rng.normal(0.0, 0.01, 100_000)
+    pulses, _ = detect(wave + np.linspace(0.0, drift, wave.size))
+    assert pulses.size == times.size
+    # the threshold lags by at most the dead band and one and a half windows: 0.1 + 0.75 s 0.3/s
+    assert np.max(np.abs(pulses - times)) < (0.1 + 0.75 * abs(drift) / 10.0) * 8e-4 + 5e-5
+
+
+@pytest.mark.parametrize('noise', ['normal', 'uniform', 'bit', 'constant'])
+def test_a_stopped_machine_gives_no_pulses(noise, rng):
+    n = 100_000
+    wave = {'normal': rng.normal(size=n), 'uniform': rng.uniform(size=n),
+            'bit': rng.integers(0, 2, n), 'constant': np.full(n, 0.7)}[noise]
+    pulses, detector = detect(wave)
+    assert pulses.size == 0
+    assert detector.state.windows_without_levels >= 19
+
+
+def test_stop_and_start_again(rng):
+    times = 0.05 + 0.04 * np.arange(24)
+    wave = np.concatenate([pulse_train(times, seconds=1.0), np.zeros(30_000),
+                           pulse_train(times, seconds=1.0)])
+    hum = 0.02 * np.sin(2.0 * np.pi * 50.0 * np.arange(wave.size) / RATE)
+    pulses, _ = detect(wave + hum + rng.normal(0.0, 0.005, wave.size))
+    # hum and noise move a crossing by their size over the slope: 0.025/(1/0.8 ms)
+    assert pulses == pytest.approx(np.concatenate([times, times + 4.0]), abs=5e-5)
+
+
+def test_hysteresis_ignores_noise_at_the_threshold(rng):
+    t = np.arange(40_000) / RATE
+    wave = np.sin(2.0 * np.pi * 20.0 * t - 0.3) + rng.normal(0.0, 0.02, t.size)
+    pulses, _ = detect(wave)
+    bare, _ = detect(wave, hysteresis=0.0)
+    assert pulses.size == 80
+    assert bare.size > 100
+    error = pulses - (np.arange(80) + 0.3 / (2.0 * np.pi)) / 20.0
+    # white noise over the slope of the sine, the last of a few crossings
+    assert np.std(error) < 3.0 * 0.02 / (40.0 * np.pi)
+
+
+def test_minimum_interval_drops_bounces():
+    bounces = np.sort(np.concatenate([TRUE, TRUE + 6e-3]))
+    wave = pulse_train(bounces, seconds=2.0)
+    for cuts in ((), (313, 374, 9000)):
+        pulses, detector = detect(wave, minimum_interval=0.01, cuts=cuts)
+        assert pulses == pytest.approx(TRUE, abs=1e-7)
+        assert detector.state.too_close == TRUE.size
+
+
+def test_a_gap_invents_no_pulse():
+    wave = pulse_train(TRUE, seconds=2.0)
+    inside = round((TRUE[20] + 1e-3) * RATE)  # while the pulse is high
+    detector = KeyphasorDetector(edge='centre')
+    first = detector.update(wave[:10_000 - 8100 + 6000], 0.0, RATE)
+    second = detector.update(wave[inside:], inside / RATE, RATE)
+    assert detector.state.gaps == 1
+    known = TRUE[(TRUE < 0.78) | (np.arange(TRUE.size) > 20)]
+    assert np.concatenate([first, second]) == pytest.approx(known + 1e-3, abs=1e-7)
+
+
+def test_a_refused_block_is_a_gap_and_no_pulse():
+    wave = pulse_train(TRUE, seconds=2.0)
+    start, end = round((TRUE[20] + 1e-3) * RATE), round((TRUE[22] + 1e-3) * RATE)
+    bad = wave[start:end].copy()
+    bad[3] = np.nan
+    detector = KeyphasorDetector()
+    first = detector.update(wave[:start], 0.0, RATE)
+    with pytest.raises(SignalError, match='sample 3 of the block is nan'):
+        detector.update(bad, start / RATE, RATE)
+    last = detector.update(wave[end:], end / RATE, RATE)
+    assert np.concatenate([first, last]) == pytest.approx(np.delete(TRUE, [21, 22]), abs=1e-7)
+    assert detector.state.gaps == 1
+
+
+def test_time_running_back_starts_again():
+    wave = pulse_train(TRUE, seconds=2.0)
+    detector = KeyphasorDetector()
+    detector.update(wave, 50.0, RATE)
+    assert detector.update(wave, 0.0, RATE) == pytest.approx(TRUE, abs=1e-7)
+    assert detector.state.gaps == 1
+    detector.reset()
+    assert detector.state.pulses == 0
+    assert np.isnan(detector.state.threshold)
+
+
+@pytest.mark.parametrize(('samples', 'start', 'rate', 'message'), [
+    (np.zeros((2, 5)), 0.0, RATE, r'shape \(2, 5\)'),
+    (np.array(0.0), 0.0, RATE, r'shape \(\)'),
+    (np.zeros(5, complex), 0.0, RATE, 'complex128'),
+    (np.array([0.0, np.inf]), 0.0, RATE, 'sample 1 of the block is inf'),
+    (np.zeros(5), np.nan, RATE, 'start time nan'),
+    (np.zeros(5), 0.0, 0.0, 'sample rate 0.0'),
+    (np.zeros(5), 0.0, 2.0 * RATE, 'differs from 10000.0')])
+def test_bad_blocks_are_refused(samples, start, rate, message):
+    detector = KeyphasorDetector()
+    detector.update(np.zeros(10), 0.0, RATE)
+    with pytest.raises(SignalError, match=message):
+        detector.update(samples, start, rate)
+    assert detector.state.samples == 10
+
+
+@pytest.mark.parametrize('options', [
+    {'threshold': np.nan}, {'hysteresis': 1.0}, {'hysteresis': -0.1}, {'polarity': 'up'},
+    {'edge': 'top'}, {'minimum_interval': -1.0}, {'learning_time': 0.0},
+    {'minimum_difference': -1.0}])
+def test_bad_options_are_refused(options):
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        KeyphasorDetector(**options)
+
+
+def test_counter():
+    assert counter_pulses([3, 3, 4, 4, 6], start_time=1.0, sample_rate=10.0) == pytest.approx(
+        [1.2, 1.35, 1.4])
+    assert counter_pulses(np.empty(0, int), sample_rate=1.0).size == 0
+    with pytest.raises(SignalError, match='falls from 4 to 2 at sample 1'):
+        counter_pulses([4, 2], sample_rate=1.0)
+    with pytest.raises(SignalError, match='float64'):
+        counter_pulses([0.5], sample_rate=1.0)
+    with pytest.raises(SignalError, match='sample rate'):
+        counter_pulses([1], sample_rate=0.0)
+
+
+@pytest.mark.parametrize(('name', 'speed', 'jitter'), [
+    ('motor_10V_100kHz', 19.6, 6e-6), ('motor_30V_100kHz', 94.4, 0.25e-6)])
+def test_motor_tacho(shared_data, name, speed, jitter):
+    with np.load(shared_data / f'{name}.npz') as data:
+        tach, rate = data['tach'], float(data['tach_rate'])
+    pulses, detector = detect(tach, rate=rate)
+    assert detector.state.pulses == pulses.size
+    revolutions = pulses[::8]
+    assert 1.0 / np.diff(revolutions).mean() == pytest.approx(speed, rel=5e-3)
+    assert np.std(np.diff(revolutions, 2)) / np.sqrt(6.0) < jitter
+    assert pulses.size == pytest.approx(8.0 * speed * tach.size / rate, abs=1.5)
+
+
+def test_motor_run_up_from_rest(shared_data):
+    with np.load(shared_data / 'motor_runup_20V_40kHz.npz') as data:
+        tach, rate = data['tach'], float(data['tach_rate'])
+    pulses, _ = detect(tach, rate=rate)
+    late = pulses[pulses > 1.5]
+    assert 1.0 / (8.0 * np.diff(late[:9]).mean()) == pytest.approx(39.0, rel=0.02)
+    assert 1.0 / (8.0 * np.diff(late[-9:]).mean()) == pytest.approx(48.0, rel=0.02)
+    assert np.diff(late).max() < 1.1 * np.diff(late).min() * 48.0 / 39.0
+    assert pulses[0] > 0.2  # nothing from the least significant bits at rest
+
+
+@pytest.mark.parametrize('name', ['weight', 'weight_5', 'without_weight'])
+def test_one_bit_optical_mark(shared_data, name):
+    with np.load(shared_data / f'rotorbalancer_{name}.npz') as data:
+        tach, rate = data['tach'], float(data['tach_rate'])
+    for row in tach:
+        pulses, _ = detect(row, rate=rate, polarity='negative', interpolate=False)
+        assert pulses * rate == pytest.approx(np.flatnonzero(np.diff(row) < 0.0) + 1, abs=1e-6)
+
+
+def test_revolution_counter(shared_data):
+    with np.load(shared_data / 'uia_bearing_rig_1.npz') as data:
+        counts, rate = data['tach_count'], float(data['tach_rate'])
+    pulses = counter_pulses(counts, sample_rate=rate)
+    assert pulses.size == counts[-1] - counts[0]
+    assert 1.0 / np.diff(pulses).mean() == pytest.approx(4.19, rel=2e-3)

@@ -1,0 +1,447 @@
+"""Pulse validation: what is dropped, what is bridged, what breaks a run, for any cutting."""
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
+from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
+
+STEADY = 5.0 + np.arange(40.0) / 30.0
+
+
+def validate(times, cuts=(), **options):
+    """Return trigger times, the runs they fall into, the restarts and the counts."""
+    pulses, counts = trigger_pulses(times, cuts, **options)
+    found, starts, restarts = pulses.times, pulses.starts_run, pulses.restarted
+    assert not np.any(restarts & ~starts)
+    assert np.all(np.diff(pulses.count)[~starts[1:]] == 1)  # within a run none is missing
+    runs = np.split(found, np.flatnonzero(starts)[1:])
+    assert all(run.size != 1 for run in runs)  # no run without a valid trigger cycle
+    return found, runs, restarts, counts
+
+
+def trigger_pulses(times, cuts=(), **options):
+    """Return the trigger pulses of a stream cut in these places, and the counts."""
+    validator = PulseValidator(**options)
+    pulses = TriggerPulses.joined([
+        validator.update(part) for part in np.split(np.asarray(times, float), sorted(cuts))])
+    shapes = {getattr(pulses, name).shape for name in TriggerPulses.__dataclass_fields__}
+    assert shapes == {pulses.times.shape}
+    return pulses, validator.counts
+
+
+def wheel(revolutions, *, gaps, teeth, speed=20.0, ripple=0.0):
+    """Return the pulse times of a wheel without the teeth `gaps`, tooth 0 at time 1 s."""
+    number = np.arange(revolutions * teeth)
+    present = ~np.isin(number % teeth, gaps)
+    angle = number[present] / teeth
+    return 1.0 + (angle + ripple / (4.0 * np.pi) * np.sin(4.0 * np.pi * angle)) / speed
+
+
+def test_a_steady_stream_passes_unchanged():
+    found, runs, restarts, counts = validate(STEADY)
+    assert np.array_equal(found, STEADY)
+    assert len(runs) == 1
+    assert not restarts.any()
+    assert counts == PulseCounts(accepted=STEADY.size)
+
+
+@pytest.mark.parametrize('per_trigger', [1, 2, 6, 12, 5])
+def test_one_of_several(per_trigger):
+    found, runs, *_ = validate(STEADY, pulses_per_revolution=6, pulses_per_trigger=per_trigger)
+    assert np.array_equal(found, STEADY[::per_trigger])
+    assert len(runs) == 1
+
+
+def test_a_cycle_is_usable_when_it_ends():
+    validator = PulseValidator(pulses_per_revolution=2)
+    given = [validator.update([time]).times.size for time in STEADY[:9]]
+    assert given == [0, 0, 2, 0, 1, 0, 1, 0, 1]
+
+
+def test_double_pulses_are_dropped():
+    doubled = np.sort(np.concatenate([STEADY, STEADY[3::4] + 0.3 / 30.0]))
+    found, runs, _, counts = validate(doubled)
+    assert np.array_equal(found, STEADY)
+    assert counts.doubles == 10
+    assert len(runs) == 1
+
+
+@pytest.mark.parametrize('delay', [0.02, 0.3, 0.48])
+@pytest.mark.parametrize('which', [slice(0, 1), slice(1, 2), slice(None)])
+def test_doubles_at_the_start_poison_nothing(delay, which):
+    doubled = np.sort(np.concatenate([STEADY, STEADY[which] + delay / 30.0]))
+    found, runs, *_ = validate(doubled, interval_tolerance=0.05)
+    assert np.array_equal(runs[-1], STEADY[-runs[-1].size:])
+    assert found.size >= STEADY.size - 3
+
+
+def test_missing_pulses_break_or_are_bridged():
+    gappy = np.delete(STEADY, [7, 20, 21])
+    _, runs, _, counts = validate(gappy)
+    assert [run.size for run in runs] == [7, 12, 18]
+    assert (counts.missing_broken, counts.cycles_discarded) == (3, 2)
+    found, runs, _, counts = validate(gappy, missing_pulses='bridge')
+    assert found == pytest.approx(STEADY, abs=1e-12)
+    assert (len(runs), counts.missing_bridged, counts.cycles_discarded) == (1, 3, 0)
+
+
+def test_bridging_keeps_one_of_six_in_step():
+    found, runs, *_ = validate(np.delete(STEADY, [7, 12, 24, 25]), missing_pulses='bridge',
+                               pulses_per_revolution=6)
+    assert found == pytest.approx(STEADY[::6], abs=1e-12)
+    assert len(runs) == 1
+
+
+def test_a_break_starts_one_of_six_anew():
+    _, runs, *_ = validate(np.delete(STEADY, 14), pulses_per_revolution=6)
+    assert np.array_equal(runs[0], STEADY[[0, 6, 12]])
+    assert np.array_equal(runs[1], STEADY[15:40:6])
+
+
+@pytest.mark.parametrize('missing_pulses', ['break', 'bridge'])
+@pytest.mark.parametrize('lost', [[7], [7, 20, 21], [20, 22]])
+def test_counts_run_on_over_missing_pulses(missing_pulses, lost):
+    pulses, _ = trigger_pulses(np.delete(STEADY, lost), missing_pulses=missing_pulses)
+    measured = pulses.measured
+    assert pulses.times[measured] == pytest.approx(STEADY[pulses.count[measured]], abs=1e-12)
+    assert set(lost) == set(range(40)) - set(pulses.count[measured]) - (
+        {21} if missing_pulses == 'break' and 22 in lost else set())  # no whole cycle at pulse 21
+    assert measured.all() == (missing_pulses == 'break')
+
+
+def test_counts_of_one_of_six_tell_which_trigger_pulse_was_not_measured():
+    pulses, _ = trigger_pulses(np.delete(STEADY, [7, 12, 24, 25]), missing_pulses='bridge',
+                               pulses_per_revolution=6)
+    assert np.array_equal(pulses.count, np.arange(7))
+    assert np.array_equal(np.flatnonzero(~pulses.measured), [2, 4])
+
+
+@pytest.mark.parametrize(('times', 'expected'), [
+    (np.concatenate([STEADY, STEADY + 60.0]), 40),  # a standstill
+    (np.concatenate([STEADY, STEADY - 4.0]), 40),  # time runs back
+    (np.delete(STEADY, 14), 3)])  # one of six: the trigger pulses are others behind the gap
+def test_counts_begin_again_where_the_number_is_unknown(times, expected):
+    six = {'pulses_per_revolution': 6} if expected == 3 else {}
+    pulses, _ = trigger_pulses(times, **six)
+    starts = np.flatnonzero(pulses.starts_run)
+    assert np.array_equal(starts, [0, expected])
+    assert np.array_equal(pulses.count[starts], [0, 0])
+
+
+def test_an_early_pulse_leaves_the_count_as_it_is():
+    pulses, _ = trigger_pulses(np.sort(np.append(STEADY, STEADY[9] + 0.6 / 30.0)))
+    assert np.array_equal(pulses.times, STEADY)
+    assert np.array_equal(pulses.count, np.arange(40))
+
+
+@pytest.mark.parametrize('per_trigger', [1, 3])
+def test_a_double_makes_the_end_of_its_cycle_doubtful(per_trigger):
+    doubled = np.sort(np.concatenate([STEADY, STEADY[[4, 20]] + 0.3 / 30.0]))
+    pulses, _ = trigger_pulses(doubled, pulses_per_revolution=per_trigger)
+    assert np.array_equal(pulses.times[pulses.doubtful],
+                          STEADY[[5, 21]] if per_trigger == 1 else STEADY[[6, 21]])
+
+
+def test_a_standstill_is_not_bridged():
+    stopped = np.concatenate([STEADY, STEADY + 60.0])
+    _, runs, _, counts = validate(stopped, missing_pulses='bridge')
+    assert [run.size for run in runs] == [40, 40]
+    assert counts.missing_bridged == 0
+    assert counts.late == 1
+
+
+def test_an_early_pulse_costs_one_cycle():
+    _, runs, _, counts = validate(np.sort(np.append(STEADY, STEADY[9] + 0.6 / 30.0)))
+    assert (counts.early, counts.cycles_discarded) == (1, 1)
+    assert [run.size for run in runs] == [10, 30]
+
+
+@pytest.mark.parametrize('shift', [-0.4, -0.3, 0.3, 0.4])
+def test_displaced_pulses_are_in_no_cycle(shift):
+    displaced = STEADY.copy()
+    displaced[12] += shift / 30.0
+    _, runs, _, counts = validate(displaced)
+    assert counts.early + counts.late >= 1
+    assert all(set(run) <= set(STEADY) for run in runs)
+    assert sum(run.size for run in runs) >= 38
+
+
+@pytest.mark.parametrize('factor', [0.4, 0.5, 0.7, 1.5, 2.0, 2.5, 10.0, 0.01])
+@pytest.mark.parametrize('missing_pulses', ['break', 'bridge'])
+def test_a_step_in_speed_is_learnt(factor, missing_pulses):
+    step = np.concatenate([STEADY, STEADY[-1] + np.arange(1.0, 200.0) * factor / 30.0])
+    _, runs, *_ = validate(step, missing_pulses=missing_pulses)
+    assert runs[-1].size >= 194
+    assert np.diff(runs[-1]) == pytest.approx(factor / 30.0, rel=1e-6)
+
+
+def test_run_up_from_standstill():
+    # constant acceleration: the angle is t^2, intervals shrink by 59, 23, 16, 12 % ...
+    run_up = np.sqrt(np.arange(300.0))
+    found, runs, *_ = validate(run_up)
+    assert len(runs) == 1
+    assert np.array_equal(found, run_up[2:])
+
+
+@pytest.mark.parametrize('change', [0.82, 1.2])
+def test_twenty_percent_per_pulse_is_followed(change):
+    times = np.cumsum(0.05 * change ** np.arange(25))
+    found, *_ = validate(times)
+    assert np.array_equal(found, times)
+
+
+def test_time_running_back_is_another_run():
+    found, runs, restarts, counts = validate(np.concatenate([STEADY, STEADY - 4.0]))
+    assert np.array_equal(found, np.concatenate([STEADY, STEADY - 4.0]))
+    assert [run.size for run in runs] == [40, 40]
+    assert np.array_equal(np.flatnonzero(restarts), [40])
+    assert (counts.restarts, counts.out_of_order) == (1, 0)
+
+
+def test_a_short_step_back_is_another_run_if_it_fits():
+    found, _, restarts, counts = validate(np.concatenate([STEADY, STEADY[-1] + STEADY - 5.05]))
+    assert counts.restarts == 1
+    assert found.size == 80
+    assert restarts[40]
+
+
+@pytest.mark.parametrize('wrong', [[1.0], [1.0, 1.03], [6.0, 5.9], [0.0, 6.2]])
+def test_one_or_two_pulses_of_an_earlier_time_are_ignored(wrong):
+    found, runs, _, counts = validate(np.concatenate([STEADY[:39], wrong, STEADY[39:]]))
+    assert np.array_equal(found, STEADY)
+    assert len(runs) == 1
+    assert (counts.out_of_order, counts.restarts) == (len(wrong), 0)
+
+
+@pytest.mark.parametrize('far', [6.6, 1e9])
+def test_a_pulse_of_a_later_time_costs_one_cycle(far):
+    _, runs, restarts, counts = validate(np.concatenate([STEADY[:9], [far], STEADY[9:]]))
+    assert [run.size for run in runs] == [9, 31]
+    assert np.array_equal(np.concatenate(runs), STEADY)
+    assert not restarts.any()
+    assert counts.out_of_order == 1
+
+
+def test_slightly_out_of_order_pulses_are_dropped():
+    found, _, _, counts = validate(np.insert(STEADY, 11, STEADY[10] - 0.005))
+    assert np.array_equal(found, STEADY)
+    assert counts.out_of_order == 1
+
+
+def test_what_is_not_finite_is_counted():
+    found, _, _, counts = validate(np.insert(STEADY, [3, 4, 30], [np.nan, np.inf, -np.inf]))
+    assert np.array_equal(found, STEADY)
+    assert counts.non_finite == 3
+
+
+def test_minimum_interval_removes_a_burst():
+    burst = STEADY[10] + 1e-4 * np.arange(1, 30)
+    found, runs, _, counts = validate(np.sort(np.append(STEADY, burst)), minimum_interval=5e-3)
+    assert np.array_equal(found, STEADY)
+    assert counts.doubles == 29
+    _, runs, *_ = validate(np.sort(np.append(STEADY, burst)))
+    assert np.array_equal(runs[-1], STEADY[-runs[-1].size:])
+    assert runs[-1].size >= 20
+
+
+@given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 600), max_size=30),
+       wheel_teeth=st.booleans(), bridge=st.booleans())
+def test_every_cutting_gives_the_same_result(seed, cuts, wheel_teeth, bridge):
+    rng = np.random.default_rng(seed)
+    times = np.cumsum(0.01 * np.exp(np.cumsum(rng.normal(0.0, 0.03, 600))))
+    if wheel_teeth:
+        times = wheel(60, gaps=[10, 11], teeth=12)
+    times = times[rng.random(times.size) > rng.choice([0.0, 0.02])]
+    extra = rng.uniform(0.0, times[-1], rng.integers(0, 12))
+    times = np.sort(np.concatenate([times, extra]))
+    times = np.insert(times, rng.integers(0, times.size, 3), rng.uniform(-1.0, 9.0, 3))
+    if rng.random() < 0.5:
+        times = np.concatenate([times[:300], times[:300] - 1.0])
+    options = {'pulses_per_revolution': 12, 'missing_teeth': 2 * wheel_teeth,
+               'pulses_per_trigger': 6, 'missing_pulses': 'bridge' if bridge else 'break'}
+    whole, counts = trigger_pulses(times, **options)
+    parts, counts_of_parts = trigger_pulses(
+        times, [cut for cut in cuts if cut <= times.size], **options)
+    for name in TriggerPulses.__dataclass_fields__:
+        assert np.array_equal(getattr(whole, name), getattr(parts, name)), name
+    assert counts == counts_of_parts
+
+
+@pytest.mark.parametrize(('teeth', 'gaps'), [
+    (60, [58, 59]), (36, [35]), (36, [34, 35]), (36, [18, 34, 35]), (4, [3]), (3, [2])])
+@pytest.mark.parametrize('first', [0, 1, 2])
+def test_wheels_trigger_at_the_tooth_after_the_gap(teeth, gaps, first):
+    times = wheel(12, gaps=gaps, teeth=teeth)[first:]
+    found, runs, _, counts = validate(
+        times, pulses_per_revolution=teeth, missing_teeth=len(gaps))
+    truth = 1.0 + np.arange(12) / 20.0
+    assert found == pytest.approx(truth[truth >= times[0]], abs=1e-12)
+    assert len(runs) == 1
+    assert counts.accepted == times.size
+
+
+def test_missing_teeth_count_as_trigger_pulses():
+    times = wheel(12, gaps=[10, 11], teeth=12)
+    found, *_ = validate(
+        times, pulses_per_revolution=12, pulses_per_trigger=3, missing_teeth=2)
+    # the last tooth but two is number 9 of the last revolution
+    assert found == pytest.approx(1.0 + np.arange(48) / 80.0, abs=1e-12)
+
+
+def test_a_wheel_at_an_uneven_speed():
+    times = wheel(12, gaps=[34, 35], teeth=36, ripple=0.35)
+    found, runs, *_ = validate(times, pulses_per_revolution=36, missing_teeth=2)
+    assert found == pytest.approx(1.0 + np.arange(12) / 20.0, abs=1e-12)
+    assert len(runs) == 1
+
+
+def test_teeth_out_of_place_next_to_a_gap():
+    times = wheel(12, gaps=[34, 35], teeth=36)
+    times[33::34] += 2.0 / 360.0 / 20.0
+    found, runs, *_ = validate(times, pulses_per_revolution=36, missing_teeth=2)
+    assert found == pytest.approx(1.0 + np.arange(12) / 20.0, abs=1e-12)
+    assert len(runs) == 1
+
+
+@pytest.mark.parametrize('lost', [34 * 5 + 12, 34 * 5, 34 * 5 + 33])
+def test_a_lost_tooth_costs_its_revolution(lost):
+    times = np.delete(wheel(12, gaps=[34, 35], teeth=36), lost)
+    truth = 1.0 + np.arange(12) / 20.0
+    _, runs, *_ = validate(times, pulses_per_revolution=36, missing_teeth=2)
+    assert len(runs) == 2
+    got = np.concatenate(runs)
+    assert np.min(np.abs(got[:, None] - truth), axis=1) == pytest.approx(0.0, abs=1e-12)
+    assert got.size >= 10
+    for run in runs:
+        assert np.diff(run) == pytest.approx(0.05, abs=1e-12)
+
+
+def test_a_lost_tooth_is_bridged():
+    times = np.delete(wheel(12, gaps=[34, 35], teeth=36), 34 * 5 + 12)
+    found, runs, _, counts = validate(
+        times, pulses_per_revolution=36, missing_teeth=2, missing_pulses='bridge')
+    assert found == pytest.approx(1.0 + np.arange(12) / 20.0, abs=1e-12)
+    assert (len(runs), counts.missing_bridged) == (1, 1)
+
+
+def test_noise_on_a_wheel_gives_no_wrong_cycle(rng):
+    clean = wheel(200, gaps=[34, 35], teeth=36)
+    noise = rng.uniform(1.0, 11.0, 40)
+    _, runs, *_ = validate(np.sort(np.append(clean, noise)), pulses_per_revolution=36,
+                           missing_teeth=2, interval_tolerance=0.2)
+    lengths = np.concatenate([np.diff(run) for run in runs])
+    # a noise pulse within the tolerance in front of the index tooth stands for it
+    assert np.max(np.abs(lengths * 20.0 - 1.0)) < 2.0 * 0.45 / 36.0
+    assert np.mean(np.abs(lengths * 20.0 - 1.0) < 1e-9) > 0.95
+    assert lengths.size > 100
+
+
+@pytest.mark.parametrize('options', [
+    {'pulses_per_revolution': 0}, {'pulses_per_trigger': 0}, {'pulses_per_trigger': 1.5},
+    {'missing_teeth': -1}, {'missing_teeth': 1}, {'missing_pulses': 'ignore'},
+    {'interval_tolerance': 0.5}, {'maximum_missing': -1}, {'minimum_interval': -1.0},
+    {'time_tolerance': np.nan},
+    {'pulses_per_trigger': 7, 'missing_teeth': 2, 'pulses_per_revolution': 36}])
+def test_bad_options_are_refused(options):
+    with pytest.raises(ParameterError, match=next(iter(options))):
+        PulseValidator(**options)
+
+
+@pytest.mark.parametrize('times', [1.0, [[1.0, 2.0]], ['1'], [1j], [True]])
+def test_bad_arrays_are_refused(times):
+    with pytest.raises(SignalError, match='give real numbers'):
+        PulseValidator().update(times)
+
+
+def edges(folder, name, channel):
+    with np.load(folder / f'engine_edges_{name}.npz') as data:
+        return data[f'edges_{channel}']
+
+
+@pytest.mark.parametrize(('name', 'missing', 'widest'), [
+    ('4b11_running', 3, 2.5), ('toyota_3_tooth_cam', 2, 2.0)])
+def test_engine_crank_wheels(shared_data, name, missing, widest):
+    crank = edges(shared_data, name, 1)
+    intervals = np.diff(crank)
+    after_gap = crank[2:][intervals[1:] > widest * np.median(intervals)]
+    found, runs, _, counts = validate(crank, pulses_per_revolution=36, missing_teeth=missing)
+    assert len(runs) == 1
+    assert counts == PulseCounts(accepted=crank.size)
+    # the index is the tooth after the widest gap: the true revolutions
+    assert found == pytest.approx(after_gap, abs=1e-12)
+
+
+@pytest.mark.parametrize(('name', 'missing', 'cam_teeth'), [
+    ('4b11_running', 3, 1), ('toyota_3_tooth_cam', 2, 3)])
+def test_crank_and_cam_agree(shared_data, name, missing, cam_teeth):
+    crank, *_ = validate(
+        edges(shared_data, name, 1), pulses_per_revolution=36, missing_teeth=missing)
+    _, runs, *_ = validate(edges(shared_data, name, 2), pulses_per_revolution=cam_teeth)
+    cam = runs[0][(runs[0] >= crank[0]) & (runs[0] <= crank[-1])]
+    assert cam.size >= 5
+    # the cam turns at half the speed of the crank; a linear law inside crank revolutions
+    turned = np.diff(np.interp(cam, crank, np.arange(crank.size)))
+    assert turned == pytest.approx(2.0, abs=0.05)
+
+
+def test_cranking_engine_with_noise(shared_data):
+    # 12 teeth and a 13th a third of the way to the next, which is a double pulse; 23 noise edges
+    crank = edges(shared_data, 'civic_K20_cranking', 1)
+    _, runs, _, counts = validate(crank, pulses_per_revolution=12, interval_tolerance=0.45,
+                                  minimum_interval=5e-4)
+    steady = runs[-1]
+    assert steady.size >= 29
+    # the extra tooth comes once a revolution: a third of the interval before
+    intervals = np.diff(crank[crank >= steady[0]])
+    extra = (intervals[1:] < 0.45 * intervals[:-1]) & (intervals[1:] > 5e-4)
+    assert np.count_nonzero(extra) == pytest.approx(steady.size - 1, abs=1)
+    assert counts.doubles >= 23 + steady.size - 2
+    assert counts.cycles_discarded <= 3
+    # without the limit the noise is learnt and left again
+    _, bare, *_ = validate(crank, pulses_per_revolution=12, interval_tolerance=0.45)
+    assert bare[-1] == pytest.approx(steady, abs=1e-12)
+
+
+@pytest.mark.parametrize('channel', [2, 3])
+def test_uneven_cam_locks(shared_data, channel):
+    cam = edges(shared_data, 'civic_K20_cranking', channel)
+    _, runs, *_ = validate(cam, minimum_interval=5e-4, interval_tolerance=0.4)
+    assert runs[-1].size >= 55
+    # four teeth a cam revolution, half the speed of the crank: 20 crank revolutions a second
+    assert 4.0 * np.median(np.diff(runs[-1])) == pytest.approx(0.102, rel=0.03)
+
+
+@given(st.lists(st.sampled_from([-1.0, 0.0, 1.0, 3.0, 3.3]), max_size=40))
+@example([3.3, 1.0, -1.0, 0.0, 1.0, -1.0, -1.0, 1.0, 3.0, 3.3, 3.3, 3.3, 3.3, 3.0, 1.0, 3.0, -1.0,
+          3.0, 1.0, -1.0, 3.3, -1.0, 0.0, 3.0])
+def test_a_few_times_over_and_over_in_any_order(times):
+    _, runs, *_ = validate(times, cuts=range(1, len(times)))
+    assert all((np.diff(run) > 0.0).all() for run in runs)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_every_pulse_is_counted_once(seed):
+    """Whatever comes: regular stretches, strays, repeats, steps ahead and back, no numbers."""
+    rng = np.random.default_rng(seed)
+    parts, time = [], 0.0
+    for _ in range(40):
+        stretch = time + 0.05 * np.arange(rng.integers(1, 12))
+        parts += [stretch, rng.choice(stretch, 1) + rng.normal(0.0, 0.04, 1),
+                  rng.choice([stretch[-1], np.nan, 1e6], 1)]
+        time = stretch[-1] + rng.choice([0.05, 0.1, 0.065, -3.0, 7.0, 0.0])
+    pulses = np.concatenate(parts)
+    validator = PulseValidator()
+    for block in np.array_split(pulses, 30):
+        validator.update(block)
+    counts = validator.finish()
+    assert pulses.size == sum((
+        counts.accepted, counts.doubles, counts.early, counts.out_of_order, counts.non_finite,
+        counts.unlocked))
+
+
+def test_denormal_intervals_are_no_overflow():
+    tiny = np.arange(8.0) * 5e-324
+    validate(np.concatenate((tiny, 1.0 + np.arange(10.0) / 30.0)))

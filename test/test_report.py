@@ -1,0 +1,248 @@
+"""The files of a report: figures that show what they must, one page that needs nothing else."""
+
+import base64
+from dataclasses import replace
+from html.parser import HTMLParser
+import io
+import json
+
+from matplotlib.image import imread
+import numpy as np
+import pytest
+from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.report.figures import illustrate
+from sa_jitter_ros.report.html_report import html, report_files, verdict_sentence
+from sa_jitter_ros.report.report import report
+from sa_jitter_ros.simulation import (AdditiveNoise, band_limited, DeclaredJitter, Gearbox,
+                                      make_effects, mesh)
+
+pytestmark = pytest.mark.machines
+RATIO, SPEED, RATE, CLOCK = 183 / 76, 25.0, 8192.0, 20000.0
+NAMES = {'residual', 'distribution', 'pulse_errors', 'trigger_cycle', 'amplitudes'}
+MODEL = DeclaredModel(keyphasor_rate=CLOCK, trigger_speed=SPEED, trigger_cycles=20,
+                      orders=(19.0, 38.0), ratio=RATIO)
+
+
+def traced(marks=1, **effects):
+    """Return the trace of a simulated machine with these undeclared effects."""
+    # a target of some marks that turns as much slower
+    model = replace(MODEL, pulses_per_revolution=marks, pulses_per_trigger=1,
+                    trigger_speed=SPEED / marks, ratio=RATIO * marks)
+    machine = Gearbox(
+        mesh('shaft', 19, harmonics=(1.0, 0.6), channel_gains=(1.0, 0.7), seed=3), RATE,
+        shafts={'shaft': RATIO}, speed=((0.0, SPEED),), seed=1,
+        fluctuation=band_limited(std=2e-4, band=(0.1, 2.0), seed=1, name='speed'),
+        effects=(DeclaredJitter('uniform', 1.0 / (CLOCK * np.sqrt(12.0))), AdditiveNoise(0.05),
+                 *make_effects(effects)))
+    seconds = 16.0
+    recording = Recording(
+        ArraySource(machine.vibration(0, int(seconds * RATE))), RATE, ratio=model.ratio,
+        pulse_times=machine.pulses(0.0, seconds).times, channel_names=('<left>', 'right & top'))
+    return trace([observe(recording, model)], [recording])
+
+
+@pytest.fixture(scope='module')
+def traces():
+    """Return traces of each verdict."""
+    found = {'none': traced(), 'traced': traced(excess_jitter={'std': 5e-5}),
+             'geometry': traced(3, target_geometry={'pulse_angles': (0.0, 0.006, -0.004)}),
+             'grid': traced(keyphasor_quantisation={'clock_rate': 4000.0, 'period_std': 2e-5})}
+    found['unexplained'] = replace(found['traced'], findings=(), verdict='unexplained',
+                                   after=found['traced'].before,
+                                   prediction_after=found['traced'].prediction_before)
+    found['blind'] = replace(found['unexplained'], evidence=None)
+    return found
+
+
+@pytest.fixture(scope='module')
+def files(traces):
+    """Return the files of some reports."""
+    return {verdict: report_files(
+        traces[verdict], report(traces[verdict], recordings=['a<b>.npz']))
+            for verdict in ('none', 'traced', 'blind')}
+
+
+class Page(HTMLParser):
+    """What a page consists of."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.links, self.text, self.open = [], [], '', []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        self.links += [value for name, value in attributes if name in ('src', 'href')]
+        if tag not in ('meta', 'img'):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
+def test_page_is_whole_and_needs_nothing_else(files, verdict):
+    found = files[verdict]
+    names = NAMES if verdict != 'blind' else {'residual', 'distribution'}
+    assert found.keys() == {'report.json', 'report.html', *(f'{name}.png' for name in names)}
+    content = json.loads(found['report.json'])
+    page = Page(found['report.html'].decode())
+    assert 'script' not in page.tags
+    assert 'link' not in page.tags
+    assert len(page.links) == len(names)
+    for link in page.links:
+        head, data = link.split(',', 1)
+        assert head == 'data:image/png;base64'
+        assert base64.b64decode(data, validate=True) in found.values()
+    assert verdict_sentence(content) in page.text
+    for shown in ('a<b>.npz', '<left>', 'right & top',
+                  *(item['rejected_because'] for item in content['candidates'])):
+        assert shown in page.text
+    for effect in content['missing_effects']:
+        assert effect['evidence'] in page.text
+
+
+@pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
+def test_nothing_runs_over_the_edge_of_a_picture(files, verdict):
+    for name, data in files[verdict].items():
+        if name.endswith('.png'):
+            picture = imread(io.BytesIO(data))
+            assert (picture[[0, -1]] == 1.0).all(), name
+            assert (picture[:, [0, -1]] == 1.0).all(), name
+
+
+def test_many_effects_leave_room_in_the_panels(traces):
+    (effect,) = traces['traced'].findings
+    axes = panel(replace(traces['traced'], findings=(effect, effect, effect)), 'pulse_errors',
+                 'autocorrelation')
+    assert 'with 3 effects' in axes.get_legend_handles_labels()[1]
+
+
+@pytest.mark.parametrize('verdict', ['none', 'traced', 'geometry', 'grid', 'unexplained'])
+def test_panels_are_labelled(traces, verdict):
+    figures = illustrate(traces[verdict])
+    assert {item.name for item in figures} == NAMES
+    for item in figures:
+        for axes in item.figure.axes:
+            assert axes.get_ylabel(), item.name
+            assert axes.get_title() or item.name == 'residual'
+            _, labels = axes.get_legend_handles_labels()
+            assert len(labels) < 2 or axes.get_legend() is not None
+        assert item.figure.axes[-1].get_xlabel()
+
+
+def test_sentence_says_what_was_found_and_what_it_was_worth(traces):
+    content = report(traces['traced'])
+    (effect,) = content['missing_effects']
+    std = effect['parameters']['std']
+    assert verdict_sentence(content).startswith(
+        f'The declared model lacks excess_jitter (std = {std["value"]:.4g} ± '
+        f'{std["standard_error"]:.2g} s): with it the held-out error goes from '
+        f'{content["error_before"]["rms"]:.4g} to {content["error_after"]["rms"]:.4g}')
+
+
+@pytest.mark.parametrize(('verdict', 'says'), [
+    ('none', 'The declared model suffices'),
+    ('unexplained', 'none of the known effects explains it')])
+def test_sentence_of_other_verdicts(traces, verdict, says):
+    assert says in verdict_sentence(report(traces[verdict]))
+
+
+def test_sentence_names_what_was_added_in_vain(traces):
+    content = report(replace(traces['traced'], verdict='unexplained'))
+    assert 'even with excess_jitter (std = ' in verdict_sentence(content)
+
+
+def test_undefined_numbers_are_dashes(traces):
+    trace = traces['none']
+    content = report(replace(trace, before=replace(trace.before, ks=float('nan'))))
+    assert content['error_before']['ks'] is None
+    assert '<td class="number">–</td>' in html(content, (), {})
+
+
+def curve(axes, label):
+    """Return x and y of a labelled line."""
+    (line,) = [item for item in axes.lines if item.get_label() == label]
+    return np.array(line.get_data(), dtype=float)
+
+
+def panel(trace, name, title):
+    """Return the axes with a title, or part of one, of one figure."""
+    (figure,) = [item.figure for item in illustrate(trace) if item.name == name]
+    (axes,) = [item for item in figure.axes if title in item.get_title()]
+    return axes
+
+
+def test_expected_profile_is_that_of_the_declared_jitter(traces):
+    # the linear law halves the variance in the middle: (1-u)^2 + u^2
+    u, size = curve(panel(traces['none'], 'trigger_cycle', 'over the trigger cycle'),
+                    'declared model')
+    np.testing.assert_allclose(
+        size, 1e6 / (CLOCK * np.sqrt(12.0)) * np.sqrt((1.0 - u) ** 2 + u**2), rtol=1e-3)
+
+
+def test_evidence_follows_the_effect_that_it_convicted(traces):
+    trace = traces['traced']
+    label = 'with excess_jitter'
+    axes = panel(trace, 'trigger_cycle', 'over the trigger cycle')
+    with_effect, seen = curve(axes, label)[1], curve(axes, 'recovered')[1]
+    # 9 acquisitions of 21 pulses: the RMS of n normal errors is known to 1/sqrt(2n)
+    np.testing.assert_allclose(seen, with_effect, rtol=4.0 / np.sqrt(2.0 * 9 * 21))
+    assert (seen > 2.0 * curve(axes, 'declared model')[1]).all()
+
+
+def test_declared_effects_belong_to_the_declared_model(traces):
+    trace = traces['grid']
+    (clock,) = trace.findings
+    declared = replace(
+        trace, findings=(), verdict='none', evidence=replace(
+            trace.evidence, explained=(clock.effect,), errors=trace.evidence.errors - np.array(
+                [item.errors - item.errors.mean() for item in trace.evidence.pulses])))
+    for case, label in ((trace, 'with keyphasor_quantisation'), (declared, 'declared model')):
+        axes = panel(case, 'trigger_cycle', 'over the trigger cycle')
+        np.testing.assert_allclose(curve(axes, 'recovered')[1], curve(axes, label)[1], rtol=0.1)
+
+
+def test_target_is_folded_by_its_own_period(traces):
+    trace = traces['geometry']
+    period = len(trace.findings[0].effect.pulse_angles)
+    assert period == 3
+    axes = panel(trace, 'trigger_cycle', f'folded by {period} pulses')
+    truth = 1e6 * np.resize([0.0, 0.006, -0.004], period) / (2.0 * np.pi * SPEED)
+    known = curve(axes, 'with target_geometry')[1]
+    # the marks' place in the record is arbitrary: the first trigger pulse need not be mark 0
+    gaps = [np.abs(known - known.mean() - np.roll(truth - truth.mean(), k)).max()
+            for k in range(3)]
+    assert min(gaps) < 5e6 / (CLOCK * np.sqrt(12.0)) / np.sqrt(9 * 21 / period)
+
+
+def test_lattice_panel_names_the_clock_of_the_pulse_times(traces):
+    axes = panel(traces['grid'], 'pulse_errors', 'clock of the pulse times, 4000 Hz')
+    imposed, seen = axes.lines[0].get_data()
+    assert np.corrcoef(imposed, seen)[0, 1] > 0.99
+    assert panel(traces['none'], 'pulse_errors', f'declared clock, {CLOCK:g} Hz')
+
+
+def test_lines_have_the_names_of_their_channels(traces):
+    axes = panel(traces['none'], 'amplitudes', 'cycle by cycle')
+    labels = axes.get_legend_handles_labels()[1]
+    assert {label.split(', ')[1] for label in labels} == {'<left>', 'right & top'}
+
+
+def test_fold_counts_the_pulses_that_lack(traces):
+    trace = traces['geometry']
+    first, *rest = trace.evidence.pulses
+    # from pulse 7 of the first acquisition on, one pulse lacks: its marks are the next ones
+    missing = np.where(np.arange(len(first.times) - 1) == 6, 1, 0)
+    gap = replace(trace, evidence=replace(trace.evidence, pulses=(
+        replace(first, missing=missing), *rest)))
+    whole, shifted = (curve(panel(item, 'trigger_cycle', 'folded by 3 pulses'),
+                            'with target_geometry')[1] for item in (trace, gap))
+    np.testing.assert_allclose(shifted, whole, atol=1.0)  # us, each pattern has mean 0
