@@ -69,7 +69,7 @@ def test_registry_has_the_effects_of_the_contract():
 
 
 @pytest.mark.parametrize('name', EFFECTS)
-def test_every_effect_lowers_the_mean_or_widens_the_law(name):
+def test_every_effect_lowers_the_mean_or_widens_the_distribution(name):
     before, after = predict(MODEL), predict_with(MODEL, [make_effect(name, **SMALL[name])])
     lower = before.mean_attenuation - after.mean_attenuation
     wider = after.standard_deviation - before.standard_deviation
@@ -126,7 +126,7 @@ def test_cycles_that_remember_each_other_count_as_fewer(rng, correlation, cycles
     prediction, drawn = predict_with(model, [effect]), average_of(errors)
     check(prediction, drawn)
     for i in range(3):
-        assert kstest(drawn[:, i], lambda x, i=i: prediction.law.cdf(x)[i]).statistic < (
+        assert kstest(drawn[:, i], lambda x, i=i: prediction.cdf(x)[i]).statistic < (
             0.005 + 1.95 * np.sqrt(1.0 / len(drawn) + 1.0 / 4096))
 
 
@@ -275,7 +275,7 @@ def test_moments_with_missing_pulses_are_exact(rng, probability, ratio, cycles):
 
 @pytest.mark.parametrize('angles', [(0.0, 0.05, -0.05), (0.02, -0.02)])
 @pytest.mark.parametrize('cycles', [1, 3, 10, 40])
-def test_geometry_has_the_law_of_drawn_averages(rng, angles, cycles):
+def test_geometry_has_the_distribution_of_drawn_averages(rng, angles, cycles):
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
     pattern = np.array(angles) / (2.0 * np.pi * 25.0)
     index = rng.integers(0, len(angles), (20_000, 1)) + np.arange(cycles + 1)
@@ -283,7 +283,7 @@ def test_geometry_has_the_law_of_drawn_averages(rng, angles, cycles):
     prediction = predict_with(model, [make_effect('target_geometry', pulse_angles=angles)])
     check(prediction, drawn)
     for i in range(3):
-        assert kstest(drawn[:, i], lambda x, i=i: prediction.law.cdf(x)[i]).statistic < 0.025
+        assert kstest(drawn[:, i], lambda x, i=i: prediction.cdf(x)[i]).statistic < 0.025
 
 
 @pytest.mark.parametrize('name', ['target_geometry', 'clock_skew', 'missing_pulses',
@@ -368,7 +368,7 @@ def test_a_normal_gain_alone_is_normal(std):
     prediction = predict_with(model, [make_effect('amplitude_modulation', std=std)])
     z = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
     levels = 1.0 + np.sqrt(prediction.moments.variance[0]) * z
-    np.testing.assert_allclose(prediction.law.cdf(levels)[0], norm.cdf(z), atol=1e-4)
+    np.testing.assert_allclose(prediction.cdf(levels)[0], norm.cdf(z), atol=1e-4)
 
 
 def test_effects_combine(rng):

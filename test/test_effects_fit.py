@@ -14,7 +14,7 @@ from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
 from sa_jitter_ros.effects.pulse_covariance import (
-    _law_p_value, fit_covariance, log_likelihood, white)
+    _distribution_p_value, fit_covariance, log_likelihood, white)
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.inference.cycle_reader import RIPPLE_VARIANCE
 from sa_jitter_ros.prediction.prediction import DeclaredModel
@@ -374,9 +374,9 @@ def test_rare_shocks_that_fade_are_no_correlated_jitter(rng):
 
     found = [against(shocks()) for _ in range(15)]
     assert all(found)
-    assert sum('law' in text for text in found) >= 8  # some shocks alone are a memory, a line
+    assert sum('distribution' in text for text in found) >= 8  # some are a memory, a line
     normal = [against(stationary(rng, 1e-8 * 0.7**LAGS)) for _ in range(60)]
-    assert sum('law' in text for text in normal) <= 1
+    assert sum('distribution' in text for text in normal) <= 1
 
 
 def test_modulation_is_told_by_few_acquisitions(rng):
@@ -400,7 +400,7 @@ def test_likelihood_prefers_what_is_there(rng):
         assert better * gain > 7.0
 
 
-def test_law_of_errors_beside_a_clock_is_without_the_declared_jitter(rng):
+def test_distribution_of_errors_beside_a_clock_is_without_the_declared_jitter(rng):
     """The clock takes the place of the uniform jitter: what is left is normal."""
     clock = make_effect('keyphasor_quantisation', clock_rate=5_000.0)
     slow = make_effect('correlated_jitter', std=60e-6, correlation=0.8)
@@ -408,10 +408,11 @@ def test_law_of_errors_beside_a_clock_is_without_the_declared_jitter(rng):
     for _ in range(15):
         errors = stationary(rng, 60e-6**2 * 0.8**LAGS, 120) + rng.normal(0.0, 4e-5, (120, PULSES))
         evidence = evidence_of(rng, errors, explained=(clock, slow))
-        p_values.append(_law_p_value(evidence, fit_covariance(evidence, white)))
+        p_values.append(_distribution_p_value(evidence, fit_covariance(evidence, white)))
     bare = replace(MODEL, jitter_distribution='table', jitter_table=(0.0,))
     same = replace(evidence, model=bare, explained=(slow,))
-    assert p_values[-1] == pytest.approx(_law_p_value(same, fit_covariance(same, white)), rel=0.1)
+    assert p_values[-1] == pytest.approx(
+        _distribution_p_value(same, fit_covariance(same, white)), rel=0.1)
     assert np.median(p_values) > 0.01
 
 
@@ -430,7 +431,7 @@ def test_chance_of_a_modulation_is_as_rare_as_stated(rng, noise, acquisitions, c
 
 
 def test_few_acquisitions_tell_no_noise_that_is_declared(rng):
-    """Their own scatter is uncertain: Student's law."""
+    """Their own scatter is uncertain: Student's distribution."""
     model = replace(MODEL, noise_std=1.0)
     p_values = []
     for _ in range(4000):

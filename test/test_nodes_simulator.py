@@ -110,12 +110,12 @@ def test_every_effect_can_be_switched_on_while_it_runs(bench):
 def test_declared_jitter_of_every_kind(bench):
     simulator = bench()
     set_parameters = simulator.node.set_parameters
-    for law in ('uniform', 'normal', 'triangular', 'table', 'sampled', 'none'):
+    for distribution in ('uniform', 'normal', 'triangular', 'table', 'sampled', 'none'):
         set_parameters([Parameter('jitter_table', value=[0.0, 2e-4])])
-        assert set_parameters([Parameter('jitter_distribution', value=law)])[0].successful
+        assert set_parameters([Parameter('jitter_distribution', value=distribution)])[0].successful
         std = np.std(simulator.node.machine.pulses(0.0, 80.0).errors)
-        wanted = {'table': 1e-4, 'none': 0.0, 'sampled': std}.get(law, 1e-4 / np.sqrt(12))
-        # 2000 pulses; the kurtosis of no law exceeds 3.
+        wanted = {'table': 1e-4, 'none': 0.0, 'sampled': std}.get(distribution, 1e-4 / np.sqrt(12))
+        # 2000 pulses; the kurtosis of no distribution exceeds 3.
         assert std == pytest.approx(wanted, rel=4 / np.sqrt(2 * 2000))
     set_parameters([Parameter('jitter_distribution', value='sampled')])
     ticks = simulator.node.machine.pulses(0.0, 1.0).times * 10_000

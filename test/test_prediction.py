@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.amplitude_law import AmplitudeLaw
+from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.angle_error import (
     gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
 from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
-from sa_jitter_ros.prediction.sampled_law import SampledLaw
+from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 from scipy import signal, stats
 
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=41,
@@ -26,7 +26,7 @@ def simulate(model, order, iterations, seed):
              if model.noise_std else 0.0)
 
     class Scaled:
-        """The declared law in fundamental cycles."""
+        """The declared distribution in fundamental cycles."""
 
         def draw(self, rng, shape):
             return model.fundamental_frequency * model.distribution.draw(rng, shape)
@@ -51,7 +51,7 @@ def test_prediction_agrees_with_an_independent_simulation(changes, order, bias):
     prediction = predict(model)
     draws = simulate(model, order, 20_000, seed=21)
     root_n = np.sqrt(draws.size)
-    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[1]).statistic
+    distance = stats.kstest(draws, lambda x: prediction.cdf(x)[1]).statistic
     assert distance < bias + 1.95 / root_n
     assert prediction.mean_attenuation[1] == pytest.approx(
         draws.mean(), abs=4.5 * draws.std() / root_n + 0.01 * draws.std())
@@ -67,13 +67,13 @@ def test_prediction_agrees_with_an_independent_simulation(changes, order, bias):
 
 
 def test_few_cycles_are_sampled_and_many_are_not():
-    assert isinstance(predict(replace(MODEL, trigger_cycles=3)).law, SampledLaw)
-    assert isinstance(predict(MODEL).law, AmplitudeLaw)
+    assert isinstance(predict(replace(MODEL, trigger_cycles=3)).distribution, SampledDistribution)
+    assert isinstance(predict(MODEL).distribution, AmplitudeDistribution)
     first, second = (predict(replace(MODEL, trigger_cycles=2)).quantile_50 for _ in range(2))
     np.testing.assert_array_equal(first, second)
 
 
-def test_declared_laws_and_lengths():
+def test_declared_distributions_and_lengths():
     assert MODEL.distribution == Uniform(2e-4)
     std = 1.0 / (np.sqrt(12.0) * 5000.0)
     normal = replace(MODEL, jitter_distribution='normal')
@@ -120,11 +120,11 @@ def test_excess_jitter_of_few_cycles_is_sampled_with_the_declared_one(rng):
     frequency = model.fundamental_frequency
     excess = IndependentPulseJitter(Normal(8e-5), frequency)
     prediction = predict(model, processes=[excess])
-    assert isinstance(prediction.law, SampledLaw)
+    assert isinstance(prediction.distribution, SampledDistribution)
     errors = frequency * (model.distribution.draw(rng, (20_000, 4)) + 8e-5 * rng.normal(
         size=(20_000, 4)))
     draws = np.abs(AveragedSignal(3, model.cycle_length, 19.0).whole_trigger_cycles(errors))
-    assert stats.ks_2samp(draws, prediction.law.draws[0]).pvalue > 1e-3
+    assert stats.ks_2samp(draws, prediction.distribution.draws[0]).pvalue > 1e-3
 
 
 def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):
@@ -135,7 +135,7 @@ def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):
     errors = (noise[:, 1:] + noise[:, :-1]
               + model.fundamental_frequency * model.distribution.draw(rng, (20_000, 21)))
     draws = np.abs(AveragedSignal(20, 2.40789, 19.0).whole_trigger_cycles(errors))
-    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[0]).statistic
+    distance = stats.kstest(draws, lambda x: prediction.cdf(x)[0]).statistic
     assert distance < 0.01 + 1.95 / np.sqrt(draws.size)
     assert prediction.mean_attenuation[0] == pytest.approx(
         draws.mean(), abs=4.5 * draws.std() / np.sqrt(draws.size))
@@ -159,7 +159,7 @@ def test_slow_wander_is_predicted_beside_jitter(cycles, std, rng):
     u = (np.arange(points)[:, None] + 0.5) / points
     angle = errors[:-1] * (1.0 - u) + errors[1:] * u + std / 38.0 * wander
     draws = np.abs(np.exp(2j * np.pi * 38.0 * angle).mean(axis=(0, 1)))
-    distance = stats.kstest(draws, lambda x: prediction.law.cdf(x)[0]).statistic
+    distance = stats.kstest(draws, lambda x: prediction.cdf(x)[0]).statistic
     assert distance < 0.012 + 1.95 / np.sqrt(n)
     assert prediction.standard_deviation[0] == pytest.approx(draws.std(), rel=0.075)
     assert prediction.mean_attenuation[0] == pytest.approx(draws.mean(), abs=0.004)
@@ -226,13 +226,13 @@ def test_gain_and_noise_that_are_none_are_refused(arguments, message):
 
 def test_distribution_function_of_nothing_is_nothing():
     for cycles in (3, 41):
-        below = predict(replace(MODEL, trigger_cycles=cycles)).law.cdf([-1.0, np.nan, np.inf])
+        below = predict(replace(MODEL, trigger_cycles=cycles)).cdf([-1.0, np.nan, np.inf])
         np.testing.assert_allclose(below, np.tile([0.0, np.nan, 1.0], (3, 1)), atol=1e-8)
 
 
 @pytest.mark.parametrize(('call', 'error', 'message'), [
     (lambda: Normal('wide'), ModelError, 'std is wide s: it must be finite'),
-    (lambda: predict(MODEL).law.ppf('half'), ParameterError, 'must be numbers between 0 and 1'),
+    (lambda: predict(MODEL).ppf('half'), ParameterError, 'must be numbers between 0 and 1'),
 ])
 def test_what_is_no_number_is_refused(call, error, message):
     with pytest.raises(error, match=message):

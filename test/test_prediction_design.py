@@ -189,7 +189,7 @@ def test_detection_agrees_with_simulated_averages(change):
     ratio = 1.0 + change
     faulty = ratio * simulate(replace(model, noise_std=3.0 / ratio), 38.0, 20_000, seed=32)
     for rate in (0.01, 0.1, 0.5):
-        threshold = predict(model).law.ppf([1.0 - rate if change > 0.0 else rate])[0, 0]
+        threshold = predict(model).ppf([1.0 - rate if change > 0.0 else rate])[0, 0]
         detected = detection_probability(model, change, rate)[0, 0]
         for draws, expected in ((healthy, rate), (faulty, detected)):
             beyond = np.mean(np.sign(change) * (draws - threshold) > 0.0)

@@ -1,4 +1,4 @@
-"""Laws of the pulse error: their characteristic functions, variances and draws agree."""
+"""Distributions of the pulse error: their characteristic functions, variances and draws agree."""
 
 import numpy as np
 import pytest
@@ -8,51 +8,52 @@ from sa_jitter_ros.prediction.distributions import (
 from scipy import stats
 
 SKEWED = np.random.default_rng(3).exponential(1e-5, 500)
-LAWS = [Uniform(3e-5), Normal(1e-5), Triangular(1e-5), Empirical(SKEWED),
-        Sum(Uniform(2e-5), Normal(4e-6), Empirical(SKEWED))]
+DISTRIBUTIONS = [Uniform(3e-5), Normal(1e-5), Triangular(1e-5), Empirical(SKEWED),
+                 Sum(Uniform(2e-5), Normal(4e-6), Empirical(SKEWED))]
 FREQUENCIES = np.array([-4e4, -1e3, 0.0, 100.0, 1e3, 1e4, 3.3e4, 1.2e5])
 
 
-@pytest.mark.parametrize('law', LAWS, ids=lambda law: type(law).__name__)
-def test_draws_have_the_law_that_the_characteristic_function_says(law, rng):
-    assert isinstance(law, PulseErrorDistribution)
-    draws = law.draw(rng, 400_000)
+@pytest.mark.parametrize('distribution', DISTRIBUTIONS, ids=lambda item: type(item).__name__)
+def test_draws_have_the_distribution_that_the_characteristic_function_says(distribution, rng):
+    assert isinstance(distribution, PulseErrorDistribution)
+    draws = distribution.draw(rng, 400_000)
     phasors = np.exp(2j * np.pi * np.outer(FREQUENCIES, draws))
-    error = np.abs(phasors.mean(axis=1) - law.characteristic_function(FREQUENCIES))
+    error = np.abs(phasors.mean(axis=1) - distribution.characteristic_function(FREQUENCIES))
     assert np.all(error <= 4.5 / np.sqrt(draws.size))  # E|error|^2 <= 1/n
-    assert abs(draws.mean()) < 4.5 * np.sqrt(law.variance / draws.size)
+    assert abs(draws.mean()) < 4.5 * np.sqrt(distribution.variance / draws.size)
     fourth = np.mean(draws**4)
     assert draws.var() == pytest.approx(
-        law.variance, abs=4.5 * np.sqrt((fourth - law.variance**2) / draws.size))
-    assert law.draw(rng, (3, 4)).shape == (3, 4)
+        distribution.variance, abs=4.5 * np.sqrt((fourth - distribution.variance**2) / draws.size))
+    assert distribution.draw(rng, (3, 4)).shape == (3, 4)
 
 
-@pytest.mark.parametrize('law', LAWS, ids=lambda law: type(law).__name__)
-def test_variance_is_the_curvature_of_the_characteristic_function(law):
-    step = 1e-3 / np.sqrt(law.variance)
-    values = law.characteristic_function([-step, 0.0, step])
+@pytest.mark.parametrize('distribution', DISTRIBUTIONS, ids=lambda item: type(item).__name__)
+def test_variance_is_the_curvature_of_the_characteristic_function(distribution):
+    step = 1e-3 / np.sqrt(distribution.variance)
+    values = distribution.characteristic_function([-step, 0.0, step])
     curvature = np.real(values[0] - 2.0 * values[1] + values[2]) / (2.0 * np.pi * step) ** 2
-    assert -curvature == pytest.approx(law.variance, rel=1e-4)
+    assert -curvature == pytest.approx(distribution.variance, rel=1e-4)
     assert values[1] == 1.0
 
 
-def test_bounded_laws_fill_their_width_and_no_more(rng):
-    for law in (Uniform(2.0), Triangular(0.5), Empirical(SKEWED), Sum(Uniform(1.0), Uniform(2.0))):
-        draws = law.draw(rng, 200_000)
-        assert 0.95 * law.width < np.ptp(draws) <= law.width * (1.0 + 1e-12)
+def test_bounded_distributions_fill_their_width_and_no_more(rng):
+    for distribution in (Uniform(2.0), Triangular(0.5), Empirical(SKEWED),
+                         Sum(Uniform(1.0), Uniform(2.0))):
+        draws = distribution.draw(rng, 200_000)
+        assert 0.95 * distribution.width < np.ptp(draws) <= distribution.width * (1.0 + 1e-12)
     assert stats.norm.cdf(-0.5 * Normal(1.0).width) < 4e-5
 
 
 def test_a_table_is_centred_and_its_fast_sum_is_the_direct_one():
-    law = Empirical(SKEWED)
-    assert abs(law.table.mean()) < 1e-20
-    assert law.variance == pytest.approx(SKEWED.var(), rel=1e-12)
+    distribution = Empirical(SKEWED)
+    assert abs(distribution.table.mean()) < 1e-20
+    assert distribution.variance == pytest.approx(SKEWED.var(), rel=1e-12)
     frequencies = np.linspace(-3e4, 3e4, 100_001)
-    fast = law.characteristic_function(frequencies)[::997]
-    direct = np.exp(2j * np.pi * np.outer(frequencies[::997], law.table)).mean(axis=1)
+    fast = distribution.characteristic_function(frequencies)[::997]
+    direct = np.exp(2j * np.pi * np.outer(frequencies[::997], distribution.table)).mean(axis=1)
     np.testing.assert_allclose(fast, direct, atol=1e-12)
     with pytest.raises(ValueError, match='read-only'):
-        law.table[0] = 1.0
+        distribution.table[0] = 1.0
 
 
 def test_a_constant_table_is_no_jitter():
@@ -60,10 +61,10 @@ def test_a_constant_table_is_no_jitter():
 
 
 def test_a_sum_multiplies_and_adds():
-    law = Sum(Uniform(2e-5), Normal(4e-6))
-    assert law.variance == pytest.approx(4e-10 / 12.0 + 1.6e-11)
+    distribution = Sum(Uniform(2e-5), Normal(4e-6))
+    assert distribution.variance == pytest.approx(4e-10 / 12.0 + 1.6e-11)
     np.testing.assert_allclose(
-        law.characteristic_function(FREQUENCIES),
+        distribution.characteristic_function(FREQUENCIES),
         np.sinc(FREQUENCIES * 2e-5) * np.exp(-2.0 * (np.pi * FREQUENCIES * 4e-6) ** 2))
 
 
@@ -76,8 +77,8 @@ def test_a_sum_multiplies_and_adds():
     (lambda: Empirical([[1.0, 2.0]]), r'shape \(1, 2\)'),
     (lambda: Empirical([1.0, float('nan')]), r'table\[1\] is nan'),
     (lambda: Empirical(['a', 'b']), 'holds a value that is no number'),
-    (lambda: Sum(), 'a sum of 0 laws'),
+    (lambda: Sum(), 'a sum of 0 distributions'),
 ])
-def test_what_is_no_law_is_refused(make, message):
+def test_what_is_no_distribution_is_refused(make, message):
     with pytest.raises(ModelError, match=message):
         make()

@@ -65,24 +65,24 @@ def test_closed_forms_agree_with_quadrature_to_1e_10():
 
 def test_small_jitter_has_the_limits_of_a_taylor_series():
     sigma = 2e-3
-    for law, fourth in ((Uniform(np.sqrt(12.0) * sigma), 0.117), (Normal(sigma), 0.25)):
-        moments = cycle_moments([1.0], [IndependentPulseJitter(law)]).averaged(500)
+    for distribution, fourth in ((Uniform(np.sqrt(12.0) * sigma), 0.117), (Normal(sigma), 0.25)):
+        moments = cycle_moments([1.0], [IndependentPulseJitter(distribution)]).averaged(500)
         angle = (2.0 * np.pi * sigma) ** 2
         assert 1.0 - moments.mean[0].real == pytest.approx(angle / 3.0, rel=1e-3)
         assert moments.imag_variance[0] == pytest.approx(angle / 500, rel=2e-3)
         assert moments.real_variance[0] == pytest.approx(fourth * angle**2 / 500, rel=5e-3)
 
 
-@pytest.mark.parametrize('law', [
+@pytest.mark.parametrize('distribution', [
     Uniform(0.9), Triangular(0.2), EXPONENTIAL, Sum(Uniform(0.5), Normal(0.1))],
-    ids=lambda law: type(law).__name__)
+    ids=lambda distribution: type(distribution).__name__)
 @pytest.mark.parametrize('cycles', [1, 3, 8])
-def test_moments_and_third_cumulants_agree_with_monte_carlo(law, cycles, rng):
+def test_moments_and_third_cumulants_agree_with_monte_carlo(distribution, cycles, rng):
     order = 0.7
-    jitter = [IndependentPulseJitter(law)]
+    jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
     moments = single.averaged(cycles)
-    draws = averages(law.draw(rng, (40_000, cycles + 1)), order)
+    draws = averages(distribution.draw(rng, (40_000, cycles + 1)), order)
     assert_moments(draws, moments)
     off = draws - moments.mean[0]
     for sample, expected in zip((off**3, off * np.abs(off) ** 2),
@@ -171,10 +171,10 @@ def test_a_zero_offset_changes_nothing():
 
 @pytest.mark.parametrize(('ratio', 'cycles'), [(1.0, 6), (2.0, 3), (0.4137, 3), (5.8154, 4)])
 def test_leakage_between_components(ratio, cycles, rng):
-    law, sources, amplitudes = EXPONENTIAL, (1.0, 2.0, 3.0), (1.0, 0.5j, -2.0)
-    moments = multi_harmonic_moments([2.0], sources, amplitudes, [IndependentPulseJitter(law)],
-                                     cycles, ratio)
-    errors = law.draw(rng, (40_000, cycles + 1))
+    distribution, sources, amplitudes = EXPONENTIAL, (1.0, 2.0, 3.0), (1.0, 0.5j, -2.0)
+    moments = multi_harmonic_moments(
+        [2.0], sources, amplitudes, [IndependentPulseJitter(distribution)], cycles, ratio)
+    errors = distribution.draw(rng, (40_000, cycles + 1))
     x, w = np.polynomial.legendre.leggauss(64)
     u = 0.5 * (x + 1.0)
     draws = 0.0

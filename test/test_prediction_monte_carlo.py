@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.amplitude_law import curved_law
+from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Normal, Triangular, Uniform
@@ -49,19 +49,20 @@ def test_for_an_integer_ratio_all_models_are_one(rng):
 
 def test_even_orders_do_not_change_sign_between_trigger_cycles():
     signal = AveragedSignal(41, 2.40789, 38.0)
-    law = Uniform(0.2 / 38.0)
-    approximate, exact = (np.abs(monte_carlo(model, law, 41, 2000, seed=1)).mean() for model in (
-        signal.majority_assignment, signal.whole_fundamental_cycles))
+    jitter = Uniform(0.2 / 38.0)
+    approximate, exact = (
+        np.abs(monte_carlo(model, jitter, 41, 2000, seed=1)).mean()
+        for model in (signal.majority_assignment, signal.whole_fundamental_cycles))
     assert exact == pytest.approx(0.957, abs=0.003)
     assert approximate == pytest.approx(exact, abs=0.01)
 
 
 def test_folding_differs_from_whole_trigger_cycles():
-    law = Uniform(0.6)
+    distribution = Uniform(0.6)
     signal = AveragedSignal(3, 0.4137)
-    folded, whole = (monte_carlo(model, law, 3, 40_000, seed=2) for model in (
+    folded, whole = (monte_carlo(model, distribution, 3, 40_000, seed=2) for model in (
         signal.whole_fundamental_cycles, signal.whole_trigger_cycles))
-    exact = cycle_moments([1.0], [IndependentPulseJitter(law)]).averaged(3)
+    exact = cycle_moments([1.0], [IndependentPulseJitter(distribution)]).averaged(3)
     square = whole.imag**2
     assert square.mean() == pytest.approx(exact.imag_variance[0],
                                           abs=4.5 * square.std() / np.sqrt(square.size))
@@ -77,27 +78,27 @@ def test_large_ratios_need_no_splitting():
 
 @pytest.mark.parametrize('ratio', [1.0, 2.286])
 def test_leakage_is_a_bias_only_for_integer_ratios(ratio):
-    law, cycles = Uniform(0.2), 100
+    distribution, cycles = Uniform(0.2), 100
     signal = AveragedSignal(cycles, ratio, 1.0, (1.0, 2.0), (1.0, 20.0))
-    draws = monte_carlo(signal.whole_trigger_cycles, law, cycles, 4000, seed=4)
+    draws = monte_carlo(signal.whole_trigger_cycles, distribution, cycles, 4000, seed=4)
     moments = multi_harmonic_moments([1.0], [1.0, 2.0], [1.0, 20.0],
-                                     [IndependentPulseJitter(law)], cycles, ratio)
+                                     [IndependentPulseJitter(distribution)], cycles, ratio)
     error = np.sqrt(moments.variance[0] / draws.size)
     assert abs(draws.mean() - moments.mean[0]) < 4.5 * error
     attenuation = 0.956794 - abs(moments.mean[0])
     assert (attenuation > 0.4) if ratio == 1.0 else (abs(attenuation) < 0.01)
 
 
-@pytest.mark.parametrize(('law', 'order', 'cycles', 'ratio', 'noise'), [
+@pytest.mark.parametrize(('distribution', 'order', 'cycles', 'ratio', 'noise'), [
     (Triangular(0.1), 1.0, 40, 0.4137, 0.3), (Normal(0.03), 5.0, 25, 5.8154, 0.05)])
-def test_prediction_of_the_law_holds_for_other_laws_ratios_and_strong_noise(
-        law, order, cycles, ratio, noise):
-    jitter = [IndependentPulseJitter(law)]
+def test_prediction_of_the_distribution_holds_for_other_jitters_ratios_and_strong_noise(
+        distribution, order, cycles, ratio, noise):
+    jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
-    predicted = curved_law(single.averaged(cycles).with_noise(noise),
-                           *third_cumulants([order], jitter, cycles, single))
+    predicted = curved_distribution(single.averaged(cycles).with_noise(noise),
+                                    *third_cumulants([order], jitter, cycles, single))
     signal = AveragedSignal(cycles, ratio, order)
-    draws = np.abs(monte_carlo(signal.whole_trigger_cycles, law, cycles, 20_000, seed=6,
+    draws = np.abs(monte_carlo(signal.whole_trigger_cycles, distribution, cycles, 20_000, seed=6,
                                line_variance=noise))
     result = stats.kstest(draws, lambda x: predicted.cdf(x)[0])
     assert result.pvalue > 1e-3

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from validation import angle_laws, bench, reproduce, residual_kurtosis
 from validation.order_tracking import as_in_table_1, HarmonicCase, simulate, synchronous_average
 from validation.report import page
-from validation.results import agreement, compare, Finding, one_law, QUICK, Results, stage
+from validation.results import agreement, compare, Finding, one_distribution, QUICK, Results, stage
 from validation.single_harmonic import TABLE_3
 
 DOCS = Path(__file__).resolve().parents[1] / 'docs'
@@ -69,8 +69,8 @@ def test_an_average_needs_enough_pulses():
 
 # --- statistics ---------------------------------------------------------------------------------
 
-def test_the_test_of_laws_has_its_level_and_its_power(rng):
-    # 400 tests of one law: the count below 5 % is binomial, mean 20, standard deviation 4.4.
+def test_the_test_of_distributions_has_its_level_and_its_power(rng):
+    # Of 400 tests of one distribution the count below 5 % is binomial: mean 20, deviation 4.4.
     reference = rng.normal(size=20_000)
     p_values = [compare(rng.normal(size=150), reference).p_value for _ in range(400)]
     assert abs(np.sum(np.array(p_values) < 0.05) - 20) < 4 * 4.4
@@ -79,8 +79,8 @@ def test_the_test_of_laws_has_its_level_and_its_power(rng):
     assert shifted.distance == pytest.approx(2 * ndtr(0.25) - 1, abs=0.12)
     assert shifted.p_value < 1e-4
     same = [replace(shifted, p_value=p) for p in (0.004, 0.5, 0.9)]
-    assert one_law(same)
-    assert not one_law([*same, shifted])
+    assert one_distribution(same)
+    assert not one_distribution([*same, shifted])
 
 
 def test_agreement_takes_all_conditions():
@@ -88,7 +88,7 @@ def test_agreement_takes_all_conditions():
         'yes', 'partly', 'no']
 
 
-def test_detection_of_a_shifted_normal_law(rng):
+def test_detection_of_a_shifted_normal_distribution(rng):
     n, shift = 20_000, 1.5
     found = residual_kurtosis.detection(rng.normal(size=n), rng.normal(shift, 1.0, n))
     # standard errors: area below 0.5 / sqrt(n), detection (with its threshold) below 1.5 / sqrt(n)

@@ -3,9 +3,9 @@ The analytic approximation of Camerini et al. 2019, with its errata, and what it
 
 Eqs. 40-46 give the moments of one trigger cycle for uniform jitter (`approximate_cycle_moments`),
 Eqs. 47-52 the cumulants of the squared amplitude of a normal X, and Eqs. 53-63 a Laguerre
-expansion of its law (`LaguerreLaw`). `inversion_cdf` is the same law without approximation, by
-inverting the characteristic function of the quadratic form. `amplitude_law` needs neither; these
-are here to reproduce the paper and to check each other.
+expansion of its distribution (`LaguerreDistribution`). `inversion_cdf` is the same distribution
+without approximation, by inverting the characteristic function of the quadratic form. The package
+needs neither; these are here to reproduce the paper and to check each other.
 """
 
 from dataclasses import dataclass, field
@@ -67,9 +67,9 @@ def squared_amplitude_cumulants(moments: AverageMoments, count: int) -> Array:
 
 
 @dataclass(frozen=True)
-class LaguerreLaw:
+class LaguerreDistribution:
     """
-    The Laguerre expansion of the law of |X|^2, one entry per order (Eqs. 53-63, corrected).
+    The Laguerre expansion of the distribution of |X|^2, one entry per order (Eqs. 53-63).
 
     A gamma density of shape `shape` and scale `scale` times 1 + sum_i `weights[i]` q_i(y), y
     standardised and q_i the Laguerre polynomials in it. In y nothing cancels; in x a shape of 2e5,
@@ -116,7 +116,7 @@ class LaguerreLaw:
         return t, (t - shape) / np.sqrt(shape), np.exp(shape * np.log(t) - t - gammaln(shape))
 
     def _polynomials(self, y: Array, count: int, shift: int) -> Array:
-        """Return q_0 .. q_{count-1} of the gamma law of shape `shape + shift`, monic in y."""
+        """Return q_0 .. q_{count-1} of the gamma density of shape `shape + shift`, monic in y."""
         root = np.sqrt(self.shape[:, None])
         values = [np.ones_like(y), y - shift / root]
         for i in range(1, count - 1):
@@ -125,16 +125,16 @@ class LaguerreLaw:
         return np.array(values[:count])
 
 
-def laguerre_law(moments: AverageMoments, *, degree: int = 4) -> LaguerreLaw:
+def laguerre_distribution(moments: AverageMoments, *, degree: int = 4) -> LaguerreDistribution:
     """
-    Return the Laguerre expansion of the law of |X|^2 for a normal X with these moments.
+    Return the Laguerre expansion of the distribution of |X|^2 for a normal X with these moments.
 
     At 100 cycles every degree improves it (2e-4 off at degree 4, 2e-5 at 10). At 20 cycles of
     jitter below 0.4 cycles it diverges: degree 4 is the best, 0.005 off, degree 12 useless.
-    Raises ParameterError for a degree below 2 (the gamma law itself).
+    Raises ParameterError for a degree below 2 (the gamma distribution itself).
     """
     if degree < 2:
-        raise ParameterError(f'degree is {degree}: the gamma law alone has degree 2')
+        raise ParameterError(f'degree is {degree}: the gamma distribution alone has degree 2')
     cumulants = squared_amplitude_cumulants(moments, degree)
     mean, variance = cumulants[:2]
     standard = cumulants / variance ** (0.5 * np.arange(1, degree + 1)[:, None])
@@ -159,7 +159,7 @@ def laguerre_law(moments: AverageMoments, *, degree: int = 4) -> LaguerreLaw:
         norm = norm * (i + 1) * (1.0 + i / shape)
         weights.append(np.sum(rows[1] * np.array(raw), axis=0) / norm)
     weights[1] = weights[2] = np.zeros_like(mean)  # zero but for rounding: two moments are met
-    return LaguerreLaw(shape, variance / mean, np.array(weights))
+    return LaguerreDistribution(shape, variance / mean, np.array(weights))
 
 
 def inversion_cdf(moments: AverageMoments, amplitude: ArrayLike) -> Array:

@@ -5,14 +5,14 @@ from typing import Any
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.prediction.amplitude_law import curved_law
+from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Uniform
 from sa_jitter_ros.prediction.moments import cycle_moments, CycleMoments, uniform_mean
 from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
 from scipy.stats import skew
-from validation.analytic import approximate_cycle_moments, laguerre_law
+from validation.analytic import approximate_cycle_moments, laguerre_distribution
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import agreement, Effort, Finding, Progress, Results
 
@@ -71,17 +71,18 @@ def _distance(sample: Array, cdf: Any) -> float:
 
 
 def _eighth(cycles: int, width: float, sample: Array) -> dict[str, float]:
-    law = laguerre_law(approximate_cycle_moments(width).averaged(cycles))
+    expansion = laguerre_distribution(approximate_cycle_moments(width).averaged(cycles))
     processes = [IndependentPulseJitter(Uniform(width))]
     moments = cycle_moments([1.0], processes)
     average = moments.averaged(cycles)
-    curved = curved_law(average, *third_cumulants([1.0], processes, cycles, moments))
-    return {'distance_of_the_approximation': _distance(sample, law.amplitude_cdf),
-            'distance_with_exact_moments': _distance(sample, laguerre_law(average).amplitude_cdf),
-            'distance_of_the_curved_law': _distance(sample, curved.cdf),
+    curved = curved_distribution(average, *third_cumulants([1.0], processes, cycles, moments))
+    return {'distance_of_the_approximation': _distance(sample, expansion.amplitude_cdf),
+            'distance_with_exact_moments': _distance(
+                sample, laguerre_distribution(average).amplitude_cdf),
+            'distance_of_the_curved_distribution': _distance(sample, curved.cdf),
             'mean_square': float(np.mean(sample**2)),
             'mean_square_standard_error': float(np.std(sample**2) / np.sqrt(sample.size)),
-            'approximate_mean_square': float((law.shape * law.scale)[0]),
+            'approximate_mean_square': float((expansion.shape * expansion.scale)[0]),
             'skewness': float(skew(sample**2))}
 
 
@@ -94,7 +95,7 @@ def _findings(
                       for name in _TERMS)
     distances = [item['distance_of_the_approximation'] for item in eighth.values()]
     normal = [item['distance_with_exact_moments'] for item in eighth.values()]
-    curved = [item['distance_of_the_curved_law'] for item in eighth.values()]
+    curved = [item['distance_of_the_curved_distribution'] for item in eighth.values()]
     skewness = [item['skewness'] for item in eighth.values()]
     most_skewed = max(eighth, key=lambda name: abs(eighth[name]['skewness']))
     resolution = 1.63 / np.sqrt(effort.iterations)
@@ -161,10 +162,10 @@ def _eighth_figure(samples: dict[tuple[int, float], Array]) -> Figure:
     figure, axes = panels(2)
     for one, cycles in zip(axes, CYCLES):
         for colour, width in zip(COLOURS, WIDTHS):
-            law = laguerre_law(approximate_cycle_moments(width).averaged(cycles))
+            expansion = laguerre_distribution(approximate_cycle_moments(width).averaged(cycles))
             squared = samples[cycles, width] ** 2
             places = np.linspace(squared.min(), squared.max(), 300)
-            one.plot(places, law.cdf(places)[0], color=colour, label=f'D = {width}')
+            one.plot(places, expansion.cdf(places)[0], color=colour, label=f'D = {width}')
             distribution(one, squared, color=colour, linestyle='dashed')
         one.plot([], [], color='black', label='analytic approximation')
         one.plot([], [], color='black', linestyle='dashed', label='exact numerical model')

@@ -15,7 +15,7 @@ from validation.bench import (
 from validation.order_tracking import fourier_lines, synchronous_average
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import (
-    agreement, chance, compare, Effort, Finding, one_law, Progress, Results, SIGNIFICANCE,
+    agreement, chance, compare, Effort, Finding, one_distribution, Progress, Results, SIGNIFICANCE,
     summary)
 
 Array = NDArray[Any]
@@ -141,7 +141,7 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
                 f'mean ratio of the near sensors {means}; KS of each near sensor and harmonic '
                 f'({near[0].sizes[0]} against {near[0].sizes[1]}): smallest p '
                 f'{min(item.p_value for item in near):.3f}',
-                agreement(gap < 0.005, one_law(near))),
+                agreement(gap < 0.005, one_distribution(near))),
         Finding('Fig. 16a,b', 'more dispersion than predicted, from noise: least at the sensors '
                 'close to the mesh',
                 'standard deviation for orders 19 and 38: predicted ' + listed(stds) + '; '

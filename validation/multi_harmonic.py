@@ -9,7 +9,8 @@ from sa_jitter_ros.prediction.distributions import Uniform
 from sa_jitter_ros.prediction.moments import cycle_moments, multi_harmonic_moments
 from validation.order_tracking import HarmonicCase
 from validation.plots import panel_titles, panels
-from validation.results import agreement, Effort, Finding, one_law, Progress, Results, stage
+from validation.results import (
+    agreement, Effort, Finding, one_distribution, Progress, Results, stage)
 from validation.single_harmonic import draw, report, sample, Samples
 
 TRIGGER_CYCLES, WIDTH, AMPLITUDE_RATIO = 100, 0.2, 20.0
@@ -81,7 +82,7 @@ def _findings(
                 f'smallest p {min(item.p_value for item in tests):.3f}; with the same pulse '
                 f'errors the amplitudes differ by at most {gap:.1e} beside a second harmonic of '
                 f'{AMPLITUDE_RATIO:g}',
-                agreement(one_law(tests), gap < 1e-3)),
+                agreement(one_distribution(tests), gap < 1e-3)),
         Finding('Fig. 7a', 'r = 2.286: the approximate model is not suitable',
                 f'KS distance of approximate and exact model for r_hf = 2, 3, 4: {listed(rough)}',
                 agreement(*(value > 0.1 for value in rough))),

@@ -135,14 +135,14 @@ def _findings(numbers: dict[str, Any]) -> tuple[Finding, ...]:
         Finding('Figs. 9-11', 'the first two cumulants of the squared amplitude (Eqs. 47 to 50)',
                 f'Monte Carlo at {len(checks)} points: mean within '
                 f'{max(abs(value) for value in z):.1f} standard errors of the exact moments, '
-                f'variance of the normal law off by {100.0 * min(off):.1f} to '
+                f'variance of the normal distribution off by {100.0 * min(off):.1f} to '
                 f'{100.0 * max(off):.1f} %; Eqs. 40-45 add up to {100.0 * error["mean"]:.2f} % '
                 f'(mean) and {100.0 * error["variance"]:.1f} % (variance) for D up to 0.4',
                 agreement(max(abs(value) for value in z) < 4.0,
                           max(abs(value) for value in off) < 0.1),
                 'With the errata: covariance of the average, trace of the power, noise 1/N_t. The '
-                'normal law misses the curvature of the arc, which the variance of |X|^2 feels '
-                'at few averages without noise.'),
+                'normal distribution misses the curvature of the arc, which the variance of '
+                '|X|^2 feels at few averages without noise.'),
         Finding('Eqs. 48, 50', 'the variance as printed',
                 'printed over simulated variance at the same points: '
                 + ', '.join(f'{value:.2f}' for value in printed),

@@ -65,7 +65,7 @@ class Results:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two-sample Kolmogorov-Smirnov test: distance of the laws, sample sizes, p value."""
+    """Two-sample Kolmogorov-Smirnov test: distance of the distributions, sample sizes, p value."""
 
     distance: float
     sizes: tuple[int, int]
@@ -73,12 +73,12 @@ class Comparison:
 
 
 def compare(sample: Array, reference: Array) -> Comparison:
-    """Test whether two samples come from one law, by their own sizes; exact for small ones."""
+    """Test whether two samples have one distribution, by their own sizes; exact for small ones."""
     test = ks_2samp(sample, reference)
     return Comparison(float(test.statistic), (len(sample), len(reference)), float(test.pvalue))
 
 
-def one_law(comparisons: list[Comparison]) -> bool:
+def one_distribution(comparisons: list[Comparison]) -> bool:
     """Return whether no comparison of a family is significant (Bonferroni, 1 %)."""
     return min(item.p_value for item in comparisons) * len(comparisons) > SIGNIFICANCE
 
@@ -91,7 +91,7 @@ def agreement(*conditions: bool) -> str:
 
 
 def chance(p_value: float) -> str:
-    """Return a p value as text; the far tail of a law is beyond what a test can tell."""
+    """Return a p value as text; the far tail of a distribution is beyond what a test can tell."""
     return 'p < 1e-12' if p_value < 1e-12 else f'p = {p_value:.2g}'
 
 

@@ -13,8 +13,8 @@ from scipy.stats import kstest
 from validation.order_tracking import as_in_table_1, HarmonicCase, simulate
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import (
-    agreement, compare, Comparison, Effort, Finding, one_law, Progress, Results, SIGNIFICANCE,
-    stage, summary)
+    agreement, compare, Comparison, Effort, Finding, one_distribution, Progress, Results,
+    SIGNIFICANCE, stage, summary)
 
 Array = NDArray[Any]
 
@@ -171,7 +171,7 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
     ratio_test = compare(ratios[2].exact, ratios[0].exact)
     ratio_means = [float(np.mean(item.exact)) for item in ratios]
     errors = [abs(float(np.mean(item.exact) - np.mean(item.approximate))) for item in ratios]
-    law = math.sqrt(100.0 / 40.0)
+    expected = math.sqrt(100.0 / 40.0)
 
     def listed(values: list[float], form: str = '.4f') -> str:
         return ', '.join(format(value, form) for value in values)
@@ -184,7 +184,7 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
                 f'{pooled["p_value"]:.3f}; with the same pulse errors the amplitudes differ by at '
                 f'most {gap:.1e} (waveform) and {order_gap:.1e} (`order_amplitude`, whole trigger '
                 'cycles)',
-                agreement(one_law(tests), pooled['p_value'] > SIGNIFICANCE,
+                agreement(one_distribution(tests), pooled['p_value'] > SIGNIFICANCE,
                           max(gap, order_gap) < _EXACT_ENOUGH)),
         Finding('Fig. 4a', 'for integer r the approximate model coincides with the exact one',
                 f'largest difference under the same errors {coincidence:.1e}',
@@ -192,9 +192,9 @@ def _findings(cases: dict[int, Samples], numbers: dict[str, Any]) -> tuple[Findi
         Finding('Fig. 4', 'more revolutions mainly reduce the dispersion',
                 f'N_t 40 to 100: standard deviation {spread[0]:.5f} to {spread[1]:.5f} (r = 1), '
                 f'{spread[2]:.5f} to {spread[3]:.5f} (r = 2.286), a factor of '
-                f'{spread[0] / spread[1]:.2f} (sqrt: {law:.2f}); mean {means[0]:.4f} to '
+                f'{spread[0] / spread[1]:.2f} (sqrt: {expected:.2f}); mean {means[0]:.4f} to '
                 f'{means[1]:.4f}',
-                agreement(abs(spread[0] / spread[1] / law - 1.0) < 0.1,
+                agreement(abs(spread[0] / spread[1] / expected - 1.0) < 0.1,
                           abs(means[0] - means[1]) < spread[1])),
         Finding('Fig. 4b', 'for r = 2.286 the approximate model deviates slightly',
                 'KS distance of approximate and exact model for N_t = 40, 60, 80, 100: '

@@ -32,10 +32,10 @@ class ExcessJitter(Effect):
         """Return the independent pulse errors."""
         if self.std == 0.0:
             return ()
-        law = Normal(self.std)
-        require_in_turn('the spread of excess_jitter.std', law.width, model)
+        distribution = Normal(self.std)
+        require_in_turn('the spread of excess_jitter.std', distribution.width, model)
         return (IndependentPulseJitter(
-            law, model.fundamental_frequency, model.weights),)
+            distribution, model.fundamental_frequency, model.weights),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return std^2 at lag 0."""

@@ -190,10 +190,10 @@ def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
     p_line = float(min(1.0, spectrum.size * stats.gamma.sf(peak * rows, rows)))
     if p_line < _GOOD:
         return f'the errors hold a line spectrum that it does not have: p = {p_line:.2g}'
-    p_law = min(_law_p_value(evidence, fit), _moments_p_value(evidence),
-                _shocks_p_value(white_left[:, :-1].ravel()))
-    if p_law < _GOOD:
-        return f'the law of the errors is not the one it has: p = {p_law:.2g}'
+    p_distribution = min(_distribution_p_value(evidence, fit), _moments_p_value(evidence),
+                         _shocks_p_value(white_left[:, :-1].ravel()))
+    if p_distribution < _GOOD:
+        return f'the distribution of the errors is not the one it has: p = {p_distribution:.2g}'
     power = np.mean(white_left**2, axis=1)
     if rows >= 4:
         kurtosis = float(np.mean(white_left**4) / np.mean(white_left**2) ** 2)
@@ -219,8 +219,8 @@ def _speed_p_value(evidence: Evidence, power: Array, spread: float) -> float:
     return float(2.0 * stats.norm.sf(abs(slope) / spread))
 
 
-def _law_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
-    """Compare the errors with the declared law plus a normal one of the fitted variance."""
+def _distribution_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
+    """Compare the errors with declared jitter plus normal jitter of the fitted variance."""
     errors = evidence.errors.ravel()
     declared, draws = 0.0, np.zeros(1)
     if not evidence.jitter_replaced:

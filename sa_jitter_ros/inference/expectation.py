@@ -17,7 +17,8 @@ from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
-from sa_jitter_ros.prediction.amplitude_law import AmplitudeLaw, normal_law
+from sa_jitter_ros.prediction.amplitude_distribution import (
+    AmplitudeDistribution, normal_distribution)
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, GaussianAngleError, IndependentPulseJitter, joint_characteristic,
     unit_nodes)
@@ -61,18 +62,18 @@ class Lines:
 @dataclass(frozen=True)
 class Expectation:
     """
-    Predicted laws of the lines, arrays (acquisition, line).
+    Predicted distributions of the lines, arrays (acquisition, line).
 
     `attenuation` and `attenuation_variance` are those of raw over corrected amplitude, without
     noise; `amplitude` and `amplitude_variance` those of the raw amplitude over its level, noise
-    and unsteadiness included, of which `law` (flattened) is the distribution.
+    and unsteadiness included, of which `distribution` (flattened) is the distribution.
     """
 
     attenuation: Array
     attenuation_variance: Array
     amplitude: Array
     amplitude_variance: Array
-    law: AmplitudeLaw
+    distribution: AmplitudeDistribution
 
 
 def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Effect],
@@ -107,8 +108,8 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
                                for name in ('mean', 'variance', 'pseudo_variance')))
     noise = np.array([noise for _, noise in rows]) / level**2
     own = 2.0 * (unsteadiness**2 + RESOLUTION**2)  # half of it along the radius
-    bare = normal_law(moments)
-    full = normal_law(moments.with_noise((noise + own).ravel()))
+    bare = normal_distribution(moments)
+    full = normal_distribution(moments.with_noise((noise + own).ravel()))
     shape = noise.shape
     return Expectation(bare.mean.reshape(shape), bare.variance.reshape(shape) + RESOLUTION**2,
                        full.mean.reshape(shape), full.variance.reshape(shape), full)
@@ -234,8 +235,8 @@ def _aligned(moments: AverageMoments, model: DeclaredModel,
     """
     Return the moments (..., order) of averages that are turned back by their mean angle error.
 
-    The amplitude does not know that angle, which slow errors turn a whole average by; the law of
-    the amplitude is near the normal one only without it. E|X|^2 stays as it is.
+    The amplitude does not know that angle, which slow errors turn a whole average by; the
+    distribution of the amplitude is near the normal one only without it. E|X|^2 stays as it is.
     """
     count, (u, w) = model.trigger_cycles, _nodes(_NODES)
     common = 0.0

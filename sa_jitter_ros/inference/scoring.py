@@ -120,7 +120,7 @@ class Bench:
         """Return the residual of the held-out acquisitions."""
         attenuation, variance, amplitude = self.observed(self.held_out)
         expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
-        probability = expected.law.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
+        probability = expected.distribution.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
         moved = []
         for others in _moved(effects, findings):
             other = self.expect(others, self.held_out, unsteadiness=unsteadiness)

@@ -48,8 +48,8 @@ PARAMETERS = (
               minimum=0, maximum=100000, **FIXED),
     Parameter('keyphasor_rate', 10000.0, 'declared rate at which the keyphasor is sampled',
               unit='Hz', above=0.0),
-    Parameter('jitter_distribution', 'uniform', 'declared pulse error: a law, or sampled for '
-              'pulse times that are rounded up to the clock of keyphasor_rate',
+    Parameter('jitter_distribution', 'uniform', 'declared pulse error: a distribution, or '
+              'sampled for pulse times that are rounded up to the clock of keyphasor_rate',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
     Parameter('jitter_std', 0.0, 'standard deviation of it, 0 for 1/(sqrt(12) keyphasor_rate)',
               unit='s', minimum=0.0),
@@ -95,12 +95,12 @@ def effects_of(values: Values) -> tuple[Effect, ...]:
             options[name] = {key: tuple(value) if isinstance(value, list) else value
                              for key, value in found.items()}
     declared: list[Effect] = [AdditiveNoise(values['noise_std'], 'declared_noise')]
-    law, rate = values['jitter_distribution'], values['keyphasor_rate']
-    if law == 'sampled' and 'keyphasor_quantisation' not in options:
+    distribution, rate = values['jitter_distribution'], values['keyphasor_rate']
+    if distribution == 'sampled' and 'keyphasor_quantisation' not in options:
         options['keyphasor_quantisation'] = {'clock_rate': rate}
-    elif law in JITTER_DISTRIBUTIONS and 'keyphasor_quantisation' not in options:
+    elif distribution in JITTER_DISTRIBUTIONS and 'keyphasor_quantisation' not in options:
         declared.append(DeclaredJitter(
-            law, values['jitter_std'] or 1.0 / (math.sqrt(12.0) * rate),
+            distribution, values['jitter_std'] or 1.0 / (math.sqrt(12.0) * rate),
             tuple(values['jitter_table'])))
     return (*declared, *make_effects(options))
 

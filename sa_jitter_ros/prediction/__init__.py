@@ -1,1 +1,1 @@
-"""What pulse jitter does to an average: exact moments, laws of the amplitude, design."""
+"""What pulse jitter does to an average: exact moments, distributions of the amplitude, design."""

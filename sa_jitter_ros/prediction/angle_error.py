@@ -12,7 +12,7 @@ moments of any combination are integrals of a product (`moments`). A random gain
 too: it contributes E prod_i a_{k_i}(u_i).
 
 A process that can be drawn has one of the methods `draw_pulses`, `draw_angle` and `draw_gain`;
-then the law of averages of few cycles is sampled (`sampled_law`).
+then the distribution of averages of few cycles is sampled (`sampled_distribution`).
 """
 
 from collections.abc import Callable, Sequence
@@ -55,7 +55,7 @@ class IndependentPulseJitter:
     Independent pulse errors seen through an angle law, by default the linear one.
 
     `frequency` is the fundamental frequency in Hz, which turns s into fundamental cycles (1 where
-    the law is given in cycles). Neighbouring cycles share pulses. Eq. 16 of Camerini et al. 2019.
+    errors are given in cycles). Neighbouring cycles share pulses. Eq. 16 of Camerini et al. 2019.
     """
 
     distribution: PulseErrorDistribution
@@ -71,7 +71,7 @@ class IndependentPulseJitter:
         self, coefficients: Sequence[ArrayLike], positions: Sequence[ArrayLike],
         cycles: Sequence[int],
     ) -> Array:
-        """Return the product, over the pulses touched, of the law's characteristic function."""
+        """Return the product of the characteristic functions of all pulses that are touched."""
         count = self.weights.pulses
         points = [(self.frequency * np.asarray(c), self.weights.at(np.asarray(u)), k)
                   for c, u, k in zip(coefficients, positions, cycles)]

@@ -1,4 +1,4 @@
-"""Third cumulants of the average: what its normal law lacks at order 1/sqrt(N_t)."""
+"""Third cumulants of the average: what its normal distribution lacks at order 1/sqrt(N_t)."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -128,7 +128,7 @@ def average_cumulants(
     Normal gains have no third cumulants; what their superposition makes of them is taken out. With
     both kinds of processes the superposition is corrected by its error for the short ones.
     Independent jitter seen through a law that reads many pulses counts as seen through its `near`
-    law, which moves the distribution function of |X| by less than 0.02.
+    distribution, which moves the distribution function of |X| by less than 0.02.
     """
     near = [_near(process) for process in processes]
     if all(one is other and one.correlation_length <= _REACH

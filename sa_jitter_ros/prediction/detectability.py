@@ -32,10 +32,10 @@ def detection_probability(
     if not np.all(np.isfinite(ratios) & (ratios >= 0.0)):
         raise ParameterError(f'change is {np.min(ratios) - 1.0:g}: give a finite relative change '
                              'of at least -1 (the component vanishes)')
-    unchanged = predict(model).law
+    unchanged = predict(model).distribution
     low, high = np.hsplit(unchanged.ppf([false_alarm_rate, 1.0 - false_alarm_rate]), 2)
     detected = []
     for ratio in ratios:
-        changed = predict(model, gain=ratio).law
+        changed = predict(model, gain=ratio).distribution
         detected.append(1.0 - changed.cdf(high) if ratio >= 1.0 else changed.cdf(low))
     return np.hstack(detected)

@@ -1,5 +1,5 @@
 """
-Laws of the error of one keyphasor pulse: one small interface, five laws, all of zero mean.
+Distributions of the error of one keyphasor pulse: one interface, five of zero mean.
 
 Errors are in seconds and a characteristic function takes a frequency in Hz, so that its value at
 ``g f`` is the mean phasor of order ``g`` of a shaft that turns at ``f``.
@@ -20,12 +20,12 @@ Shape = int | tuple[int, ...]
 
 _TAYLOR_TERMS = 8
 _TAYLOR_RADIUS = 0.08  # radians; 0.08^8 / 8! < 1e-13
-_NORMAL_WIDTH = 8.0  # standard deviations; 6e-5 of a normal law lies outside
+_NORMAL_WIDTH = 8.0  # standard deviations; 6e-5 of a normal distribution lies outside
 
 
 @runtime_checkable
 class PulseErrorDistribution(Protocol):
-    """The zero-mean law of the time error of one pulse."""
+    """The zero-mean distribution of the time error of one pulse."""
 
     @property
     def variance(self) -> float:
@@ -33,10 +33,10 @@ class PulseErrorDistribution(Protocol):
 
     @property
     def width(self) -> float:
-        """Full width of the support in s (8 standard deviations for an unbounded law)."""
+        """Full width of the support in s (8 standard deviations for an unbounded distribution)."""
 
     def characteristic_function(self, frequency: ArrayLike) -> Array:
-        """Return E exp(j 2 pi f eps), real for a symmetric law, for frequencies in Hz."""
+        """Return E exp(j 2 pi f eps), real for a symmetric distribution, for frequencies in Hz."""
 
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
@@ -148,7 +148,7 @@ class Empirical:
                              'pulse error in s')
         if not np.all(np.isfinite(table)):
             index = int(np.argmin(np.isfinite(table)))
-            raise ModelError(f'table[{index}] is {table[index]}: a law needs finite errors in s')
+            raise ModelError(f'table[{index}] is {table[index]}: give finite errors in s')
         table -= table.mean()
         table.setflags(write=False)
         object.__setattr__(self, 'table', table)
@@ -208,12 +208,12 @@ class Empirical:
 
 
 class Sum:
-    """The sum of independent errors, each with its own law."""
+    """The sum of independent errors, each with its own distribution."""
 
     def __init__(self, *terms: PulseErrorDistribution) -> None:
-        """Take the laws whose errors add; raise ModelError for none."""
+        """Take the distributions whose errors add; raise ModelError for none."""
         if not terms:
-            raise ModelError('a sum of 0 laws is no law: give at least one')
+            raise ModelError('a sum of 0 distributions is no distribution: give at least one')
         self.terms = terms
 
     def __repr__(self) -> str:

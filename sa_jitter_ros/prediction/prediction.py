@@ -9,12 +9,13 @@ arguments of `predict` and know nothing of this module.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.amplitude_law import curved_law, normal_law
+from sa_jitter_ros.prediction.amplitude_distribution import (
+    AmplitudeDistribution, curved_distribution, normal_distribution)
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants
 from sa_jitter_ros.prediction.distributions import (
@@ -35,7 +36,8 @@ from sa_jitter_ros.prediction.moments import (
     require_cycles,
     require_orders,
 )
-from sa_jitter_ros.prediction.sampled_law import can_be_sampled, sampled_law
+from sa_jitter_ros.prediction.sampled_distribution import (
+    can_be_sampled, sampled_distribution, SampledDistribution)
 from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, PulseWeights
 
 Array = NDArray[Any]
@@ -43,29 +45,11 @@ Array = NDArray[Any]
 QUANTILES = (0.05, 0.50, 0.95)
 DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
 
-# Up to here the law is sampled; with one more cycle the curved law is up to 0.015 off in its CDF,
-# and 0.04 off for jitter as skewed as an exponential law.
+# Up to here the distribution is sampled; with one more cycle the curved one is up to 0.015 off in
+# its CDF, and 0.04 off for jitter as skewed as an exponential distribution.
 _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
-
-
-class AmplitudeDistribution(Protocol):
-    """The law of |X|, one entry per order."""
-
-    @property
-    def mean(self) -> Array:
-        """E|X|."""
-
-    @property
-    def variance(self) -> Array:
-        """Var|X|."""
-
-    def cdf(self, amplitude: ArrayLike) -> Array:
-        """Return P(|X| <= amplitude), shape (orders, k)."""
-
-    def ppf(self, probability: ArrayLike) -> Array:
-        """Return quantiles, shape (orders, k)."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +121,7 @@ class DeclaredModel:
 
     @property
     def distribution(self) -> PulseErrorDistribution:
-        """Return the law of one pulse error in s."""
+        """Return the distribution of one pulse error in s."""
         if self.jitter_distribution == 'uniform':
             return Uniform(1.0 / self.keyphasor_rate)
         if self.jitter_distribution == 'table':
@@ -180,10 +164,10 @@ class DeclaredModel:
 @dataclass(frozen=True)
 class Prediction:
     """
-    The predicted law of the amplitude of a unit component, one entry per order.
+    The predicted distribution of the amplitude of a unit component, one entry per order.
 
     `mean_attenuation` = E|X| and `variance` = Var|X|, so mean^2 + variance = E|X|^2, which is
-    exact. `moments` hold the complex amplitude itself, `law` its distribution function.
+    exact. `moments` hold the complex amplitude itself, `distribution` its distribution function.
     """
 
     model: DeclaredModel
@@ -195,7 +179,7 @@ class Prediction:
     quantile_50: Array
     quantile_95: Array
     moments: AverageMoments = field(repr=False)
-    law: AmplitudeDistribution = field(repr=False)
+    distribution: AmplitudeDistribution | SampledDistribution = field(repr=False)
 
     @property
     def trigger_speed(self) -> float:
@@ -234,11 +218,11 @@ class Prediction:
 
     def cdf(self, amplitude: ArrayLike) -> Array:
         """Return P(|X| <= amplitude), (order, k) for amplitudes of shape (k,) or (order, k)."""
-        return self.law.cdf(amplitude)
+        return self.distribution.cdf(amplitude)
 
     def ppf(self, probability: ArrayLike) -> Array:
         """Return quantiles of |X|, (order, k) for k probabilities in (0, 1)."""
-        return self.law.ppf(probability)
+        return self.distribution.ppf(probability)
 
     @property
     def header(self) -> tuple[float, float, float, float, float, float]:
@@ -253,15 +237,15 @@ def predict(
     declared_jitter: bool = True,
 ) -> Prediction:
     """
-    Return the law of the amplitudes that an average shows of unit components.
+    Return the distribution of the amplitudes that an average shows of unit components.
 
     Effects beyond the declared jitter: random `processes` and a deterministic `offset` of the
     angle (fundamental cycles), a `gain` per order (complex or real) that acts on the component
     alone, and `line_variance`, E|n|^2 of what is added incoherently to each peak amplitude.
     Without `declared_jitter` they take the place of the declared one.
 
-    Mean square and complex moments are exact for any of them. The law itself is sampled (fixed
-    seed) for few trigger cycles, normal under an offset, curved otherwise.
+    Mean square and complex moments are exact for any of them. The distribution itself is sampled
+    (fixed seed) for few trigger cycles, normal under an offset, curved otherwise.
     """
     _require_effects(model, gain, line_variance)
     orders = np.asarray(model.orders)
@@ -272,7 +256,7 @@ def predict(
                if isinstance(process, IndependentPulseJitter)
                and (process.frequency, process.weights) == (frequency, model.weights)]
     plain = len(jitters) == len(everything) > 0
-    spread = float(orders.max()) * frequency * math.sqrt(sum(law.variance for law in jitters))
+    spread = float(orders.max()) * frequency * math.sqrt(sum(item.variance for item in jitters))
     nodes = int(np.clip(16.0 + 16.0 * spread, 16 if plain else 32, 160))
     noise = np.asarray(line_variance) + (
         noise_line_variance(model.noise_std, model.sample_rate, model.duration)
@@ -281,28 +265,28 @@ def predict(
     if offset is not None:
         moments = offset_moments(orders, everything, count, offset, nodes=nodes)
         moments = moments.scaled(gain).with_noise(noise)
-        return prediction_of_law(model, moments, normal_law(moments))
+        return prediction_of(model, moments, normal_distribution(moments))
     cycles = cycle_moments(orders, everything, nodes=nodes, lags=count)
     moments = cycles.averaged(count).scaled(gain).with_noise(noise)
     g = np.asarray(gain)
     equal, mixed = average_cumulants(orders, everything, count, cycles)
-    curved = curved_law(moments, equal * g**3, mixed * g * np.abs(g) ** 2)
+    curved = curved_distribution(moments, equal * g**3, mixed * g * np.abs(g) ** 2)
     if few_cycles(cycles, count, plain, curved.skew) and can_be_sampled(
             everything, count, orders.size):
-        return prediction_of_law(model, moments, sampled_law(
+        return prediction_of(model, moments, sampled_distribution(
             orders, everything, count, moments, gain=gain, line_variance=noise,
             weights=model.weights))
-    return prediction_of_law(model, moments, curved)
+    return prediction_of(model, moments, curved)
 
 
 def few_cycles(
     cycles: CycleMoments, trigger_cycles: int, plain: bool, skew: Array,
 ) -> bool:
     """
-    Tell whether an average holds too few cycles for a limit theorem, so that its law is sampled.
+    Tell whether an average holds too few cycles for a limit theorem, so that it is sampled.
 
     Cycles that remember each other count as fewer: as the variance of one over that of the average
-    says. `plain` are independent errors alone, `skew` the skewness of the curved law.
+    says. `plain` are independent errors alone, `skew` the skewness of the curved distribution.
     """
     lopsided = np.max(np.abs(skew)) > _LOPSIDED
     if trigger_cycles <= (_FEW_LOPSIDED_CYCLES if plain and lopsided else _FEW_CYCLES):
@@ -320,16 +304,18 @@ def few_cycles(
     return False
 
 
-def prediction_of_law(
-    model: DeclaredModel, moments: AverageMoments, law: AmplitudeDistribution,
+def prediction_of(
+    model: DeclaredModel, moments: AverageMoments,
+    distribution: AmplitudeDistribution | SampledDistribution,
 ) -> Prediction:
-    """Return the figures of a law that was found for a model."""
-    quantiles = law.ppf(QUANTILES)
-    variance = law.variance
+    """Return the figures of a distribution that was found for a model."""
+    quantiles = distribution.ppf(QUANTILES)
+    variance = distribution.variance
     return Prediction(
-        model=model, order=np.asarray(model.orders), mean_attenuation=law.mean,
+        model=model, order=np.asarray(model.orders), mean_attenuation=distribution.mean,
         variance=variance, standard_deviation=np.sqrt(variance), quantile_05=quantiles[:, 0],
-        quantile_50=quantiles[:, 1], quantile_95=quantiles[:, 2], moments=moments, law=law)
+        quantile_50=quantiles[:, 1], quantile_95=quantiles[:, 2], moments=moments,
+        distribution=distribution)
 
 
 def _require_effects(model: DeclaredModel, gain: ArrayLike, line_variance: ArrayLike) -> None:

@@ -1,11 +1,11 @@
 """
-The prediction with effects: declared jitter, noise and any combination of effects in one law.
+The prediction with effects: declared jitter, noise and any combination of effects at once.
 
 Random effects multiply characteristic functions. Effects whose pulse errors are known up to one
 number (the first mark of a target) are averaged over equally likely scenarios: their moments are
-exact, the law of each is the curved one, sampled for few cycles. Where no few scenarios hold all
-(lost pulses, the grid of a clock under a varying speed) averages are drawn, each with its own
-scenario; moments are then exact for lost pulses alone, and those of the draws elsewhere.
+exact, the distribution of each is the curved one, sampled for few cycles. Where no few scenarios
+hold all (lost pulses, the grid of a clock under a varying speed) averages are drawn, each with its
+own scenario; moments are then exact for lost pulses alone, and those of the draws elsewhere.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect, Pulses
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.amplitude_law import curved_law
+from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.cumulants import average_cumulants
 from sa_jitter_ros.prediction.moments import (
     AverageMoments, correlation_length, cycle_moments, noise_line_variance)
 from sa_jitter_ros.prediction.prediction import (
-    DeclaredModel, few_cycles, predict, Prediction, prediction_of_law)
-from sa_jitter_ros.prediction.sampled_law import (
-    can_be_sampled, drawn_averages, LONGEST, moments_of, MOST_PHASORS, sampled_law, SampledLaw)
+    DeclaredModel, few_cycles, predict, Prediction, prediction_of)
+from sa_jitter_ros.prediction.sampled_distribution import (
+    can_be_sampled, drawn_averages, LONGEST, moments_of, MOST_PHASORS, sampled_distribution,
+    SampledDistribution)
 
 Array = NDArray[Any]
 
@@ -52,7 +53,7 @@ class _Setting:
 
 def predict_with(model: DeclaredModel, effects: Sequence[Effect] = ()) -> Prediction:
     """
-    Return the law of the amplitudes of unit components with the declared model and effects.
+    Return the distribution of the amplitudes of unit components under declared model and effects.
 
     Raises ModelError for an effect that has no forward model with it.
     """
@@ -211,8 +212,8 @@ def _drawn(setting: _Setting, effects: Sequence[tuple[Effect, Array]]) -> Predic
     moments = effects[0][0].exact_moments(model, processes) if len(effects) == 1 else None
     moments = moments_of(draws) if moments is None else (
         moments.scaled(setting.gain).with_noise(setting.noise))
-    return prediction_of_law(model, moments, SampledLaw(np.sort(np.abs(draws), axis=1),
-                                                        moments.mean_square))
+    return prediction_of(model, moments, SampledDistribution(
+        np.sort(np.abs(draws), axis=1), moments.mean_square))
 
 
 def _mixture(setting: _Setting, errors: Array) -> Prediction:
@@ -230,21 +231,21 @@ def _mixture(setting: _Setting, errors: Array) -> Prediction:
     equal, mixed = average_cumulants(orders, processes, count, cycles)
     # A scenario turns the cycles' phasors apart and shortens their sum, skewness included.
     left = each.mean / np.where(np.abs(cycles.mean) > 0.0, cycles.mean, 1.0)
-    law = curved_law(_raveled(each), (equal * left**3).ravel(),
-                     (mixed * left * np.abs(left) ** 2).ravel())
+    distribution = curved_distribution(_raveled(each), (equal * left**3).ravel(),
+                                       (mixed * left * np.abs(left) ** 2).ravel())
     plain = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    few = count <= _FEW_CYCLES or few_cycles(cycles, count, plain, law.skew)
+    few = count <= _FEW_CYCLES or few_cycles(cycles, count, plain, distribution.skew)
     if few and can_be_sampled(processes, count, orders.size):
         known = errors * model.fundamental_frequency
-        return prediction_of_law(model, moments, sampled_law(
+        return prediction_of(model, moments, sampled_distribution(
             orders, processes, count, moments, gain=gain, line_variance=setting.noise,
             weights=model.weights, known=lambda n: known[np.arange(n) % len(known)]))
-    draws = law.spread(max(_FEWEST, _DRAWS // len(errors)))
+    draws = distribution.spread(max(_FEWEST, _DRAWS // len(errors)))
     draws = np.moveaxis(draws.reshape(*each.mean.shape, -1), 1, 0).reshape(orders.size, -1)
-    sampled = SampledLaw(np.sort(draws, axis=1), moments.mean_square)
-    amplitude = law.mean.reshape(each.mean.shape).mean(axis=0)
+    sampled = SampledDistribution(np.sort(draws, axis=1), moments.mean_square)
+    amplitude = distribution.mean.reshape(each.mean.shape).mean(axis=0)
     variance = np.maximum(moments.mean_square - amplitude**2, 0.0)
-    return replace(prediction_of_law(model, moments, sampled), mean_attenuation=amplitude,
+    return replace(prediction_of(model, moments, sampled), mean_attenuation=amplitude,
                    variance=variance, standard_deviation=np.sqrt(variance))
 
 

@@ -14,7 +14,7 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
-from sa_jitter_ros.prediction.amplitude_law import AmplitudeLaw
+from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
 
@@ -152,8 +152,8 @@ def _distribution_figure(trace: Trace) -> Figure:
             reach = 3.0 * np.sqrt(expected.amplitude_variance[held_out, line].mean())
             x = np.linspace(max(0.0, min(low, mean.min() - reach)), max(high, mean.max() + reach),
                             _POINTS)
-            law = _rows(expected.law, held_out * trace.lines.count + line)
-            one.plot(x, law.cdf(x).mean(axis=0), color=colour, label=label)
+            distribution = _rows(expected.distribution, held_out * trace.lines.count + line)
+            one.plot(x, distribution.cdf(x).mean(axis=0), color=colour, label=label)
         one.set(title=f'order {order:g}, {channel}', xlabel='amplitude over its mean level',
                 ylabel='share below')
         one.legend(fontsize='x-small')
@@ -164,7 +164,7 @@ def _distribution_figure(trace: Trace) -> Figure:
 def _probability_panel(trace: Trace, axes: Axes) -> None:
     """Draw the share of all amplitudes below each predicted probability."""
     for label, colour, expected, left in _versions(trace):
-        probability = expected.law.cdf(trace.amplitude.reshape(-1, 1)).reshape(
+        probability = expected.distribution.cdf(trace.amplitude.reshape(-1, 1)).reshape(
             trace.amplitude.shape)[list(trace.held_out)].ravel()
         _observed_share(axes, probability, color=colour, label=f'{label}: KS {left.ks:.3f}')
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
@@ -182,9 +182,10 @@ def _most_telling(trace: Trace) -> list[int]:
     return sorted(best, key=lambda line: int(trace.lines.order[line]))
 
 
-def _rows(law: AmplitudeLaw, index: Array) -> AmplitudeLaw:
-    """Return the law of some entries."""
-    return AmplitudeLaw(*(getattr(law, item.name)[index] for item in fields(law)))
+def _rows(distribution: AmplitudeDistribution, index: Array) -> AmplitudeDistribution:
+    """Return the distribution of some entries."""
+    return AmplitudeDistribution(*(getattr(distribution, item.name)[index]
+                                   for item in fields(distribution)))
 
 
 def _observed_share(axes: Axes, sample: Array, *, color: str = MEASURED,

@@ -1,12 +1,13 @@
 """
-The law of the amplitude |X| from the moments of the complex amplitude X, vectorised over orders.
+The distribution of the amplitude |X| from the moments of the complex amplitude X, for all orders.
 
-Two laws share one form. `normal_law` is the exact law of |X| for a normal X of any mean and 2x2
-covariance (singular ones too): the quadratic form of Eq. 34 of Camerini et al. 2019, integrated
-over one principal axis with the other one in closed form. `curved_law` adds what the central limit
-theorem leaves out at order 1/sqrt(N_t): timing errors that turn X also shorten it, so X lies along
-an arc, and its radial part is skewed. Both follow from the third cumulants. At N_t = 20 the normal
-law is up to 0.06 off in its distribution function, the curved one 0.006 (symmetric jitter).
+Two distributions share one form. `normal_distribution` is the exact one of |X| for a normal X of
+any mean and 2x2 covariance (singular ones too): the quadratic form of Eq. 34 of Camerini et al.
+2019, integrated over one principal axis with the other one in closed form. `curved_distribution`
+adds what the central limit theorem leaves out at order 1/sqrt(N_t): timing errors that turn X also
+shorten it, so X lies along an arc, and its radial part is skewed. Both follow from the third
+cumulants. At N_t = 20 the distribution function of the normal one is up to 0.06 off, that of the
+curved one 0.006 (symmetric jitter).
 """
 
 from collections.abc import Callable
@@ -18,12 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.prediction.angle_error import unit_nodes
 from sa_jitter_ros.prediction.moments import AverageMoments
-from sa_jitter_ros.prediction.sampled_law import require_probabilities
+from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
 
 Array = NDArray[Any]
 
-_REACH = 8.5  # standard deviations; 2e-17 of a normal law lies outside
+_REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
 _AXIS, _AXIS_WEIGHTS = np.polynomial.legendre.leggauss(48)
 _HERMITE, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(32)
 _HERMITE_PAIRS = (np.multiply.outer(_HERMITE_WEIGHTS, _HERMITE_WEIGHTS)
@@ -36,14 +37,14 @@ _ROOT_TOLERANCE = 1e-9  # of probability
 
 
 @dataclass(frozen=True)
-class AmplitudeLaw:
+class AmplitudeDistribution:
     """
-    The law of |X|, X = along + j across, one entry per order.
+    The distribution of |X|, X = along + j across, one entry per order.
 
     across = mean_across + std_across Z and along = mean_along + slope (across - mean_across) +
     bend ((across - mean_across)^2 - std_across^2) + std_along T, with Z normal and T of unit
     variance and skewness `skew`: Wilson and Hilferty's cube of a normal variable, a gamma variable
-    to 1e-3. slope, bend and skew are 0 in the normal law.
+    to 1e-3. slope, bend and skew are 0 in the normal distribution.
     """
 
     mean_along: Array
@@ -115,9 +116,9 @@ class AmplitudeLaw:
         along = self.std_along[:, None] * _lopsided(z[1], self.skew[:, None])
         return np.asarray(np.hypot(self._ridge(across) + along, across))
 
-    def _rows(self, mask: Array) -> 'AmplitudeLaw':
-        """Return the law of some of the orders."""
-        return AmplitudeLaw(*(getattr(self, item.name)[mask] for item in fields(self)))
+    def _rows(self, mask: Array) -> 'AmplitudeDistribution':
+        """Return the distribution of some of the orders."""
+        return AmplitudeDistribution(*(getattr(self, item.name)[mask] for item in fields(self)))
 
     def _ridge(self, across: Array) -> Array:
         """Return the mean of the part along for given parts across."""
@@ -147,22 +148,23 @@ class AmplitudeLaw:
         return np.asarray(ndtr(_straight(t, self.skew[:, None, None])))
 
 
-def normal_law(moments: AverageMoments) -> AmplitudeLaw:
-    """Return the exact law of |X| for a normal X with these moments, in its principal axes."""
+def normal_distribution(moments: AverageMoments) -> AmplitudeDistribution:
+    """Return the exact distribution of |X| for a normal X with these moments."""
     turn = np.exp(0.5j * np.angle(-moments.pseudo_variance))  # the axis of the smaller variance
     mean = moments.mean * turn.conj()
     gap = np.abs(moments.pseudo_variance)
     zero = np.zeros(mean.size)
     small = np.maximum(0.5 * (moments.variance - gap), 0.0)
-    return AmplitudeLaw(mean.real, mean.imag, np.sqrt(small),
-                        np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
+    return AmplitudeDistribution(mean.real, mean.imag, np.sqrt(small),
+                                 np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
 
 
-def curved_law(moments: AverageMoments, plain: Array, mixed: Array) -> AmplitudeLaw:
+def curved_distribution(moments: AverageMoments, plain: Array, mixed: Array
+                        ) -> AmplitudeDistribution:
     """
-    Return the law of |X| for an average with the third cumulants k(X,X,X) and k(X,X,conj X).
+    Return the distribution of |X| for an average with third cumulants, in the frame of its phase.
 
-    The frame is that of the mean phase.
+    `plain` is k(X, X, X), `mixed` is k(X, X, conj X).
     """
     size = np.abs(moments.mean)
     turn = np.where(size > 0.0, moments.mean / np.where(size > 0.0, size, 1.0), 1.0).conj()
@@ -181,8 +183,8 @@ def curved_law(moments: AverageMoments, plain: Array, mixed: Array) -> Amplitude
     rest = free - 2.0 * (bend * across) ** 2
     third = along_cubed - 6.0 * slope**2 * bend * across**2 - 8.0 * (bend * across) ** 3
     skew = np.clip(_ratio(third, rest**1.5), -_MAXIMAL_SKEW, _MAXIMAL_SKEW)
-    return AmplitudeLaw(size, np.zeros(size.size), np.sqrt(rest), np.sqrt(across), slope, bend,
-                        skew)
+    return AmplitudeDistribution(size, np.zeros(size.size), np.sqrt(rest), np.sqrt(across), slope,
+                                 bend, skew)
 
 
 def _ratio(value: Array, scale: Array) -> Array:

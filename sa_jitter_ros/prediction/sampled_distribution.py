@@ -1,5 +1,5 @@
 """
-The law of the amplitude for averages of a few cycles, where no limit theorem holds: by sampling.
+The distribution of the amplitude for averages of few cycles, for which no limit theorem holds.
 
 The draws are the same for every order and every call (fixed seed), so a prediction is a function
 of its model. The mean square is not sampled: it is exact.
@@ -22,7 +22,7 @@ Array = NDArray[Any]
 KnownErrors = Callable[[int], Array]
 
 _SEED = 20190215
-_BUDGET = 3_000_000  # phasors in one law
+_BUDGET = 3_000_000  # phasors in one distribution
 _FEWEST, _MOST = 4096, 65536
 _COARSEST = 512  # fewest draws of long averages
 LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
@@ -31,8 +31,8 @@ _LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
 
 
 @dataclass(frozen=True)
-class SampledLaw:
-    """The law of |X| by sorted draws of shape (orders, n) and an exact mean square."""
+class SampledDistribution:
+    """The distribution of |X| by sorted draws of shape (orders, n) and an exact mean square."""
 
     draws: Array = field(repr=False)
     mean_square: Array
@@ -80,19 +80,19 @@ def can_be_sampled(
         for process in processes)
 
 
-def sampled_law(
+def sampled_distribution(
     orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, moments: AverageMoments, *,
     gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
     known: KnownErrors | None = None,
-) -> SampledLaw:
+) -> SampledDistribution:
     """
-    Return the law of the average of `trigger_cycles` cycles; parameters as of `drawn_averages`.
+    Return the distribution of averages of `trigger_cycles` cycles; parameters of `drawn_averages`.
 
     `moments` are the exact ones with gain and noise.
     """
     draws = drawn_averages(orders, processes, trigger_cycles, gain=gain,
                            line_variance=line_variance, weights=weights, known=known)
-    return SampledLaw(np.sort(np.abs(draws), axis=1), moments.mean_square)
+    return SampledDistribution(np.sort(np.abs(draws), axis=1), moments.mean_square)
 
 
 def drawn_averages(

@@ -1,18 +1,19 @@
-"""The law of the amplitude: exact for normal X, close for averages, sampled for few cycles."""
+"""The distribution of |X|: exact for normal X, close for averages, sampled for few cycles."""
 
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.amplitude_law import curved_law, normal_law
+from sa_jitter_ros.prediction.amplitude_distribution import (
+    curved_distribution, normal_distribution)
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants, third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments, uniform_mean
 from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.prediction.sampled_law import sampled_law
+from sa_jitter_ros.prediction.sampled_distribution import sampled_distribution
 from scipy import stats
 from validation.analytic import (
-    approximate_cycle_moments, inversion_cdf, laguerre_law, squared_amplitude_cumulants)
+    approximate_cycle_moments, inversion_cdf, laguerre_distribution, squared_amplitude_cumulants)
 
 QUANTILES = np.array([0.001, 0.05, 0.5, 0.95, 0.999])
 
@@ -23,73 +24,74 @@ def moments_of(mean, real, imag, covariance=0.0):
                           np.array([real - imag + 2j * covariance]))
 
 
-def jittered(law, order, cycles):
-    """Moments and both laws of an average."""
-    jitter = [IndependentPulseJitter(law)]
+def jittered(distribution, order, cycles):
+    """Moments and both distributions of an average."""
+    jitter = [IndependentPulseJitter(distribution)]
     single = cycle_moments([order], jitter)
     moments = single.averaged(cycles)
-    return moments, curved_law(moments, *third_cumulants([order], jitter, cycles, single))
+    return moments, curved_distribution(moments, *third_cumulants([order], jitter, cycles, single))
 
 
 @pytest.mark.parametrize(('moments', 'tolerance'), [
     (moments_of(0.95, 6e-5, 3e-3), 1e-9), (moments_of(0.9, 1e-7, 1e-3), 1e-9),
     (moments_of(0.2 + 0.4j, 0.02, 0.05, -0.01), 1e-7), (moments_of(1.0, 0.05, 0.05), 1e-9),
     (moments_of(0.3, 0.02, 0.05), 1e-5), (moments_of(0.1, 0.3, 0.2), 1e-5)])
-def test_normal_law_agrees_with_inversion_of_the_quadratic_form(moments, tolerance):
-    law = normal_law(moments)
-    amplitudes = law.ppf(QUANTILES)
-    np.testing.assert_allclose(law.cdf(amplitudes)[0], QUANTILES, atol=1.1e-9)
-    np.testing.assert_allclose(inversion_cdf(moments, amplitudes), law.cdf(amplitudes),
+def test_normal_distribution_agrees_with_inversion_of_the_quadratic_form(moments, tolerance):
+    distribution = normal_distribution(moments)
+    amplitudes = distribution.ppf(QUANTILES)
+    np.testing.assert_allclose(distribution.cdf(amplitudes)[0], QUANTILES, atol=1.1e-9)
+    np.testing.assert_allclose(inversion_cdf(moments, amplitudes), distribution.cdf(amplitudes),
                                atol=tolerance)
 
 
-def test_circular_cases_are_the_laws_of_rice_and_rayleigh():
+def test_circular_cases_are_the_distributions_of_rice_and_rayleigh():
     for mean in (0.0, 0.05, 0.5, 3.0):
-        law = normal_law(moments_of(mean, 0.04, 0.04))
+        distribution = normal_distribution(moments_of(mean, 0.04, 0.04))
         rice = stats.rice(mean / 0.2, scale=0.2)
         amplitudes = rice.ppf(QUANTILES)
-        np.testing.assert_allclose(law.cdf(amplitudes)[0], QUANTILES, atol=1e-8)
-        assert law.mean[0] == pytest.approx(rice.mean(), rel=1e-6)
-        assert law.variance[0] == pytest.approx(rice.var(), rel=1e-5)
+        np.testing.assert_allclose(distribution.cdf(amplitudes)[0], QUANTILES, atol=1e-8)
+        assert distribution.mean[0] == pytest.approx(rice.mean(), rel=1e-6)
+        assert distribution.variance[0] == pytest.approx(rice.var(), rel=1e-5)
 
 
 @pytest.mark.parametrize(('real', 'imag'), [(0.0, 0.01), (0.01, 0.0), (1e-9, 0.01), (0.0, 0.0)])
 def test_singular_covariances(real, imag):
-    law = normal_law(moments_of(0.5, real, imag))
+    distribution = normal_distribution(moments_of(0.5, real, imag))
     amplitudes = np.array([0.4, 0.499, 0.51, 0.6])
     if imag > 0.0:  # |X|^2 = m^2 + z^2 to 1e-4
         half = np.sqrt(np.maximum(amplitudes**2 - 0.25, 0.0))
         expected = 2.0 * stats.norm.cdf(half / 0.1) - 1.0
     else:
         expected = stats.norm.cdf((amplitudes - 0.5) / np.sqrt(max(real, 1e-300)))
-    np.testing.assert_allclose(law.cdf(amplitudes)[0], expected, atol=2e-3 if 0 < real < 1e-6
-                               else 1e-6)
-    assert law.mean_square[0] == pytest.approx(0.25 + real + imag)
-    assert law.mean[0] ** 2 + law.variance[0] == pytest.approx(law.mean_square[0], rel=1e-12)
-    assert np.all(np.isfinite(law.ppf(QUANTILES)))
+    np.testing.assert_allclose(distribution.cdf(amplitudes)[0], expected,
+                               atol=2e-3 if 0 < real < 1e-6 else 1e-6)
+    assert distribution.mean_square[0] == pytest.approx(0.25 + real + imag)
+    assert distribution.mean[0] ** 2 + distribution.variance[0] == pytest.approx(
+        distribution.mean_square[0], rel=1e-12)
+    assert np.all(np.isfinite(distribution.ppf(QUANTILES)))
 
 
 def test_tiny_scatter_keeps_its_digits():
-    law = normal_law(moments_of(1.0, 1e-12, 1e-12))
-    assert law.variance[0] == pytest.approx(1e-12, rel=1e-6)
+    distribution = normal_distribution(moments_of(1.0, 1e-12, 1e-12))
+    assert distribution.variance[0] == pytest.approx(1e-12, rel=1e-6)
 
 
-# Kolmogorov-Smirnov: with n draws the 0.1 % point is 1.95 / sqrt(n); the law's own error is what
+# Kolmogorov-Smirnov: with n draws the 0.1 % point is 1.95 / sqrt(n); the own error is what
 # is added: none where it is exact enough for n.
-@pytest.mark.parametrize(('law', 'order', 'cycles', 'bias'), [
+@pytest.mark.parametrize(('distribution', 'order', 'cycles', 'bias'), [
     (Uniform(1.0), 0.3, 100, 0.0), (Uniform(1.0), 0.8, 60, 0.0), (Triangular(0.2), 0.9, 40, 0.0),
     (Normal(0.25), 0.4, 20, 0.0), (Uniform(1.0), 0.5, 10, 0.014), (Normal(0.25), 0.5, 10, 0.008),
     (Empirical(np.random.default_rng(4).exponential(0.2, 2000)), 0.8, 40, 0.008)],
     ids=['uniform-100', 'uniform-60', 'triangular-40', 'normal-20', 'uniform-10', 'normal-10',
          'exponential-40'])
-def test_curved_law_agrees_with_simulated_averages(law, order, cycles, bias):
-    moments, curved = jittered(law, order, cycles)
+def test_curved_distribution_agrees_with_simulated_averages(distribution, order, cycles, bias):
+    moments, curved = jittered(distribution, order, cycles)
     signal = AveragedSignal(cycles, 1.0, order)
     draws = np.sort(np.abs(monte_carlo(
-        signal.whole_trigger_cycles, law, cycles, 20_000, seed=cycles)))
+        signal.whole_trigger_cycles, distribution, cycles, 20_000, seed=cycles)))
     distance = stats.kstest(draws, lambda x: curved.cdf(x)[0]).statistic
     assert distance < bias + 1.95 / np.sqrt(draws.size)
-    normal = stats.kstest(draws, lambda x: normal_law(moments).cdf(x)[0]).statistic
+    normal = stats.kstest(draws, lambda x: normal_distribution(moments).cdf(x)[0]).statistic
     assert normal > distance
     assert curved.mean_square[0] == pytest.approx(moments.mean_square[0], rel=1e-12)
     assert np.sqrt(curved.variance[0]) == pytest.approx(draws.std(), rel=0.025)
@@ -110,19 +112,21 @@ def test_bent_averages_keep_their_mean_square_in_noise():
     moments, cumulants = single.averaged(30), third_cumulants([0.4], jitter, 30, single)
     for level in (0.0, 1e-3, 1.0):
         noisy = moments.with_noise(level)
-        law = curved_law(noisy, *cumulants)
-        assert law.mean_square[0] == pytest.approx(moments.mean_square[0] + level, rel=1e-12)
-    assert law.variance[0] == pytest.approx(normal_law(noisy).variance[0], rel=1e-3)
+        distribution = curved_distribution(noisy, *cumulants)
+        assert distribution.mean_square[0] == pytest.approx(
+            moments.mean_square[0] + level, rel=1e-12)
+    normal = normal_distribution(noisy)
+    assert distribution.variance[0] == pytest.approx(normal.variance[0], rel=1e-3)
 
 
 @pytest.mark.parametrize('cycles', [1, 3])
-def test_sampled_law_is_the_law_of_few_cycles(cycles):
-    law, order, noise = Triangular(0.25), 0.7, 0.02
-    moments, _ = jittered(law, order, cycles)
-    sampled = sampled_law([order], [IndependentPulseJitter(law)], cycles,
-                          moments.with_noise(noise), line_variance=noise)
+def test_sampled_distribution_is_that_of_few_cycles(cycles):
+    distribution, order, noise = Triangular(0.25), 0.7, 0.02
+    moments, _ = jittered(distribution, order, cycles)
+    sampled = sampled_distribution([order], [IndependentPulseJitter(distribution)], cycles,
+                                   moments.with_noise(noise), line_variance=noise)
     signal = AveragedSignal(cycles, 0.4137, order)
-    draws = np.abs(monte_carlo(signal.whole_trigger_cycles, law, cycles, 60_000, seed=5,
+    draws = np.abs(monte_carlo(signal.whole_trigger_cycles, distribution, cycles, 60_000, seed=5,
                                line_variance=noise))
     assert stats.ks_2samp(draws, sampled.draws[0]).pvalue > 1e-3
     np.testing.assert_array_equal(sampled.cdf(sampled.ppf([0.25, 0.75]))[0].round(4),
@@ -131,17 +135,17 @@ def test_sampled_law_is_the_law_of_few_cycles(cycles):
 
 
 def test_quantiles_need_probabilities():
-    law = normal_law(moments_of(1.0, 0.1, 0.1))
-    sampled = sampled_law([0.1], [IndependentPulseJitter(Uniform(1.0))], 2,
-                          moments_of(1.0, 0.1, 0.1))
+    distribution = normal_distribution(moments_of(1.0, 0.1, 0.1))
+    sampled = sampled_distribution([0.1], [IndependentPulseJitter(Uniform(1.0))], 2,
+                                   moments_of(1.0, 0.1, 0.1))
     for bad in (0.0, 1.0, -0.1, np.nan):
-        for either in (law, sampled):
+        for either in (distribution, sampled):
             with pytest.raises(ParameterError, match='between 0 and 1'):
                 either.ppf([0.5, bad])
     with pytest.raises(ParameterError, match='between 0 and 1'):
-        laguerre_law(moments_of(1.0, 0.1, 0.1)).amplitude_ppf(1.0)
+        laguerre_distribution(moments_of(1.0, 0.1, 0.1)).amplitude_ppf(1.0)
     with pytest.raises(ParameterError, match='degree is 1'):
-        laguerre_law(moments_of(1.0, 0.1, 0.1), degree=1)
+        laguerre_distribution(moments_of(1.0, 0.1, 0.1), degree=1)
 
 
 def test_the_paper_approximates_its_moments_this_well():
@@ -171,10 +175,10 @@ def test_cumulants_of_the_squared_amplitude(rng):
 
 @pytest.mark.parametrize(('spread', 'cycles', 'error'), [
     (0.1, 20, 5.5e-3), (0.1, 100, 2e-4), (0.4, 20, 2.4e-3), (0.4, 100, 1.1e-4), (0.8, 100, 5e-3)])
-def test_laguerre_expansion_is_this_close_to_the_exact_law(spread, cycles, error):
+def test_laguerre_expansion_is_this_close_to_the_exact_distribution(spread, cycles, error):
     jitter = [IndependentPulseJitter(Uniform(1.0))]
     moments = cycle_moments([spread], jitter).averaged(cycles)
-    expansion, exact = laguerre_law(moments), normal_law(moments)
+    expansion, exact = laguerre_distribution(moments), normal_distribution(moments)
     amplitudes = exact.ppf(np.linspace(0.01, 0.99, 33))
     assert np.max(np.abs(expansion.amplitude_cdf(amplitudes[0])
                          - exact.cdf(amplitudes))) < error
@@ -185,8 +189,8 @@ def test_laguerre_expansion_is_this_close_to_the_exact_law(spread, cycles, error
 
 def test_laguerre_density_is_the_derivative_of_its_cdf():
     moments = moments_of(0.8, 0.01, 0.04)
-    law = laguerre_law(moments, degree=8)
+    distribution = laguerre_distribution(moments, degree=8)
     x = np.linspace(0.1, 2.0, 20001)
-    slope = np.diff(law.cdf(x)[0]) / np.diff(x)
-    np.testing.assert_allclose(slope, law.pdf(0.5 * (x[1:] + x[:-1]))[0], atol=1e-6)
-    assert law.cdf([0.0, 50.0])[0] == pytest.approx([0.0, 1.0], abs=1e-9)
+    slope = np.diff(distribution.cdf(x)[0]) / np.diff(x)
+    np.testing.assert_allclose(slope, distribution.pdf(0.5 * (x[1:] + x[:-1]))[0], atol=1e-6)
+    assert distribution.cdf([0.0, 50.0])[0] == pytest.approx([0.0, 1.0], abs=1e-9)
