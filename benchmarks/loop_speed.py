@@ -23,8 +23,7 @@ from sa_jitter_ros.prediction.distributions import Uniform
 from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
 from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
 from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
+from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter
 from timing import interleaved, machine
 
 RATIO = 2.40789

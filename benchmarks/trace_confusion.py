@@ -21,12 +21,10 @@ from sa_jitter_ros.prediction.prediction import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect, IndexArray, Setting
-from sa_jitter_ros.simulation.effects import make_effects
+from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
 from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
 
 SAMPLE_RATE = 6000.0
 KEYPHASOR_RATE = 5000.0

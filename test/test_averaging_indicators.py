@@ -3,8 +3,8 @@
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
-from sa_jitter_ros.averaging.gear_signals import gear_lines, GearSettings, separate
-from sa_jitter_ros.averaging.indicators import condition_indicators, INDICATORS, RunningIndicators
+from sa_jitter_ros.averaging.indicators import (
+    condition_indicators, gear_lines, GearSettings, INDICATORS, RunningIndicators, separate)
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 

@@ -14,11 +14,9 @@ from sa_jitter_ros.report.html_report import html, verdict_sentence
 from sa_jitter_ros.report.report import report, summary
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
-from sa_jitter_ros.simulation.effects import make_effects
+from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
 from sa_jitter_ros.simulation.random_streams import RandomStream
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
 
 pytestmark = pytest.mark.machines
 RATE, SPEED, CYCLES, NOISE = 6000.0, 25.0, 20, 0.05

@@ -23,10 +23,8 @@ from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.report import report, summary
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
-from sa_jitter_ros.simulation.effects import make_effects
+from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
 from scipy import stats
 from worse_pulses import with_added_jitter, with_slower_clock
 

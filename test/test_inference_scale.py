@@ -17,9 +17,8 @@ from sa_jitter_ros.prediction.moments import normal_mean
 from sa_jitter_ros.prediction.prediction import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
+from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter
 from sa_jitter_ros.simulation.gearbox import Gearbox
-from sa_jitter_ros.simulation.pulse_effects import DeclaredJitter
-from sa_jitter_ros.simulation.vibration_effects import AdditiveNoise
 
 RATE, SPEED, CYCLES, NOISE, ACQUISITIONS = 5000.0, 25.0, 20, 0.05, 16
 JITTER = 1.0 / math.sqrt(12.0) / 5000.0

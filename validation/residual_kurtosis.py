@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import AverageSettings
-from sa_jitter_ros.averaging.gear_signals import GearSettings, separate
-from sa_jitter_ros.averaging.indicators import condition_indicators
+from sa_jitter_ros.averaging.indicators import condition_indicators, GearSettings, separate
 from scipy.signal import resample_poly
 from validation.bench import acquire, FAST, machine, PINION_SPEED, RATIO, TEETH, TRIGGER_CYCLES
 from validation.order_tracking import synchronous_average

@@ -14,8 +14,7 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.averaging.average import Average
-from sa_jitter_ros.averaging.parameters import KeyphasorParameters
+from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError

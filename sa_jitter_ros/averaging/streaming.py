@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
-from sa_jitter_ros.averaging.segment import Segment
-from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
-from sa_jitter_ros.averaging.parameters import KeyphasorParameters
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.pulses.detection import detect_pulses
 from sa_jitter_ros.recordings import Recording

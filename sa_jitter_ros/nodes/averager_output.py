@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rclpy.publisher import Publisher
 from sa_jitter_ros.averaging.average import Average
-from sa_jitter_ros.averaging.gear_signals import GearSettings
-from sa_jitter_ros.averaging.indicators import INDICATORS, RunningIndicators
+from sa_jitter_ros.averaging.indicators import GearSettings, INDICATORS, RunningIndicators
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import (AMPLITUDE_FIELDS, AverageHeader, AverageMessage,

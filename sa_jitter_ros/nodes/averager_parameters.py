@@ -3,9 +3,8 @@
 from dataclasses import fields, replace
 from math import prod
 
-from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
-from sa_jitter_ros.averaging.gear_signals import GearSettings
-from sa_jitter_ros.averaging.parameters import KeyphasorParameters
+from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING, KeyphasorParameters
+from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.parameters import Parameter, RATIO

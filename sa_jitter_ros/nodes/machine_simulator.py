@@ -17,8 +17,8 @@ from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,
     Keyphasor, make_effects, mesh, Torsion)
-from sa_jitter_ros.simulation.pulse_effects import JITTER_DISTRIBUTIONS
-from sa_jitter_ros.simulation.sinusoids import ZERO
+from sa_jitter_ros.simulation.effects import JITTER_DISTRIBUTIONS
+from sa_jitter_ros.simulation.random_streams import ZERO
 
 FIXED: dict[str, Any] = {'read_only': True}
 PARAMETERS = (

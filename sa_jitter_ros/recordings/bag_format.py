@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
-from sa_jitter_ros.recordings.bag_limits import check_inflation
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.limits import check_inflation
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, SampleDecoder, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (

@@ -3,11 +3,21 @@ Limits of what is taken in, live or from a file.
 
 No machine has times, rates or samples beyond them: their squares, products and periods would
 overflow. A file that unpacks to far more than it holds is no measurement either.
+
+How large a compressed bag becomes is found without unpacking it. Chunks of an MCAP file (its
+specification, "Records") and whole files may be compressed with zstd (RFC 8878, section 3.1.1),
+whose blocks hold at most 128 kB each, so that counting blocks bounds what they unpack to, whatever
+sizes are stated. (LZ4 cannot inflate more than 255-fold.)
 """
+
+from collections.abc import Iterator
+from pathlib import Path
+import struct
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.errors import RecordingError, SaJitterError
 
 FloatArray = NDArray[np.float64]
 
@@ -16,6 +26,10 @@ MAX_TIME = 1e15  # s, as 30 million years
 MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
 MAX_INFLATION = 200  # measured signals shrink a few fold; only a bomb shrinks more than this
+_BLOCK = 1 << 17
+_MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50
+_REPEATED, _COMPRESSED = 1, 2
+_FOOTER, _CHUNK, _CHUNK_INDEX = 0x02, 0x06, 0x08
 
 
 def check_rate(name: str, rate: float, error: type[SaJitterError]) -> None:
@@ -44,3 +58,80 @@ def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
     if wrong.size:
         raise error(f'sample of {wrong[0]}: must be within {MAX_SAMPLE:g} of 0; send it in the '
                     'unit of the sensor')
+
+
+def check_inflation(path: Path) -> None:
+    """Raise RecordingError if a bag's file or folder holds what unpacks to far more."""
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.suffix == '.mcap':
+            with open(file, 'rb') as stream:
+                for start, size in _zstd_chunks(stream):
+                    _check_zstd(stream, start, start + size)
+        elif file.suffix == '.zstd':
+            with open(file, 'rb') as stream:
+                _check_zstd(stream, 0, file.stat().st_size)
+
+
+def _unpack(stream: BinaryIO, layout: str) -> tuple[int, ...]:
+    return struct.unpack(layout, stream.read(struct.calcsize(layout)))
+
+
+def _zstd_chunks(stream: BinaryIO) -> Iterator[tuple[int, int]]:
+    """
+    Iterate over places and sizes of the data of an MCAP file's zstd chunks.
+
+    The summary must name these chunks and no others: a reader goes by the summary.
+    """
+    places, chunks, named, summary = set(), set(), set(), 0
+    stream.seek(8)
+    while len(head := stream.read(9)) == 9:
+        kind, size = struct.unpack('<BQ', head)
+        start = stream.tell()
+        places.add(start - 9)
+        if kind == _CHUNK:
+            stream.seek(start + 28)
+            compression = stream.read(*_unpack(stream, '<I'))
+            packed, = _unpack(stream, '<Q')
+            chunks.add((start - 9, compression, packed))
+            if compression == b'zstd':
+                yield stream.tell(), packed
+        elif kind == _CHUNK_INDEX:
+            stream.seek(start + 16)
+            place, _, offsets = _unpack(stream, '<QQI')
+            stream.seek(offsets + 8, 1)
+            compression = stream.read(*_unpack(stream, '<I'))
+            named.add((place, compression, *_unpack(stream, '<Q')))
+        elif kind == _FOOTER:
+            summary, = _unpack(stream, '<Q')
+        stream.seek(start + size)
+    if not named <= chunks or summary not in places | {0}:
+        raise RecordingError('the summary names chunks that are not there: it is broken')
+
+
+def _check_zstd(stream: BinaryIO, start: int, stop: int) -> None:
+    """Raise RecordingError if the zstd frames from `start` to `stop` may inflate too much."""
+    most = max(IN_MEMORY_BYTES, MAX_INFLATION * (stop - start))
+    total, at = 0, start
+    while at < stop:
+        stream.seek(at)
+        magic, = _unpack(stream, '<I')
+        if magic & 0xFFFFFFF0 == _SKIPPABLE:
+            at += 8 + _unpack(stream, '<I')[0]
+            continue
+        if magic != _MAGIC:
+            raise RecordingError(f'byte {at} begins no zstd frame: it is broken')
+        descriptor, = _unpack(stream, '<B')
+        single = descriptor >> 5 & 1
+        at += 6 - single + (0, 1, 2, 4)[descriptor & 3] + (single, 2, 4, 8)[descriptor >> 6]
+        last = 0
+        while not last:
+            stream.seek(at)
+            low, high = _unpack(stream, '<HB')
+            block = low | high << 16
+            last, kind, size = block & 1, block >> 1 & 3, block >> 3
+            total += _BLOCK if kind == _COMPRESSED else size
+            at += 3 + (1 if kind == _REPEATED else size)
+            if total > most:
+                raise RecordingError(f'{stop - start} bytes inflate to more than {most}: looks '
+                                     'like a bomb; record it without compression')
+        at += 4 * (descriptor >> 2 & 1)

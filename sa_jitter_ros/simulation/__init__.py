@@ -17,17 +17,14 @@ array([0.5])
 
 from sa_jitter_ros.simulation.components import ChippedTooth, Component, mesh
 from sa_jitter_ros.simulation.effect import Effect, Setting
-from sa_jitter_ros.simulation.effects import EFFECTS, make_effects
+from sa_jitter_ros.simulation.effects import (
+    AdditiveNoise, AmplitudeModulation, ClockSkew, CorrelatedJitter, DeclaredJitter, EFFECTS,
+    ExcessJitter, InterferingTone, InterpolationLoss, KeyphasorQuantisation, make_effects,
+    MissingPulses, PhaseWander, SpeedFluctuation, TargetGeometry)
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
-from sa_jitter_ros.simulation.pulse_effects import (
-    ClockSkew, CorrelatedJitter, DeclaredJitter, ExcessJitter, KeyphasorQuantisation,
-    MissingPulses, TargetGeometry)
-from sa_jitter_ros.simulation.sinusoids import band_limited, SinusoidSum
-from sa_jitter_ros.simulation.vibration_effects import (
-    AdditiveNoise, AmplitudeModulation, InterferingTone, InterpolationLoss, PhaseWander,
-    SpeedFluctuation)
+from sa_jitter_ros.simulation.random_streams import band_limited, SinusoidSum
 
 __all__ = ['EFFECTS', 'AdditiveNoise', 'AmplitudeModulation', 'ChippedTooth', 'ClockSkew',
            'Component', 'CorrelatedJitter', 'DeclaredJitter', 'Effect', 'ExcessJitter', 'Gearbox',

@@ -1,17 +1,340 @@
-"""The simulated effects under the names of the predictor's parameters."""
+"""
+The simulated effects, under the names of the predictor's parameters.
 
-from collections.abc import Mapping
-from dataclasses import fields
+First come the effects on the keyphasor's pulses: their times, the clock that measures them, lost
+pulses. Then come those on the vibration: motion of the shafts, path to the sensor, sampling. The
+interpolators here are not those of the averager, which the simulation serves to test.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.simulation.effect import Effect
-from sa_jitter_ros.simulation.pulse_effects import (
-    ClockSkew, CorrelatedJitter, ExcessJitter, KeyphasorQuantisation, MissingPulses,
-    TargetGeometry)
-from sa_jitter_ros.simulation.vibration_effects import (
-    AdditiveNoise, AmplitudeModulation, InterferingTone, InterpolationLoss, PhaseWander,
-    SpeedFluctuation)
+from sa_jitter_ros.simulation.effect import (
+    Effect, IndexArray, require_number, Setting, Signal, slow_process)
+from sa_jitter_ros.simulation.random_streams import (
+    band_limited, FloatArray, RandomStream, SinusoidSum)
+from scipy.interpolate import CubicSpline
+from scipy.special import ndtri
+
+MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones to draw
+JITTER_DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
+GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # of rates; irrational: fractions spread evenly
+_SPLINE_MARGIN = 32  # an end acts on the spline by 0.268^32 there: below rounding
+
+Interpolator = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+def _per_pulse(draw: Callable[[int, int], FloatArray], index: IndexArray) -> FloatArray:
+    """Return one item of a stream for each of consecutive pulses."""
+    return draw(int(index[0]), int(index[-1]) + 1)[0] if index.size else np.empty(0)
+
+
+@dataclass(frozen=True)
+class DeclaredJitter(Effect):
+    """
+    The declared pulse error: independent, of zero mean.
+
+    `std` in s; a `table` (s) lists equally likely errors and needs no `std`.
+    """
+
+    distribution: str
+    std: float = 0.0
+    table: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        if self.distribution not in JITTER_DISTRIBUTIONS:
+            raise ParameterError(f'jitter distribution {self.distribution!r}: must be one of '
+                                 f'{", ".join(JITTER_DISTRIBUTIONS)}')
+        require_number('jitter std', self.std, minimum=0)
+        if self.distribution == 'table' and not (
+                self.table and np.isfinite(self.table).all()):
+            raise ParameterError(f'jitter table {self.table}: needs finite errors in s')
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the error of each pulse."""
+        place = _per_pulse(RandomStream(setting.seed, 'declared_jitter').uniform, index)
+        if self.distribution == 'table':
+            errors = np.array(self.table) - np.mean(self.table)
+            return np.asarray(errors[np.floor(place * errors.size).astype(np.int64)])
+        if self.distribution == 'uniform':
+            return self.std * math.sqrt(12.0) * (place - 0.5)
+        if self.distribution == 'normal':
+            return self.std * np.asarray(ndtri(np.maximum(place, 1e-300)))
+        folded = np.sqrt(2.0 * np.minimum(place, 1.0 - place))
+        return self.std * math.sqrt(6.0) * np.sign(place - 0.5) * (1.0 - folded)
+
+
+@dataclass(frozen=True)
+class ExcessJitter(Effect):
+    """Independent normal errors of the pulse times, `std` s (electrical noise)."""
+
+    std: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('excess_jitter.std', self.std, minimum=0)
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the delay of each pulse."""
+        return self.std * _per_pulse(RandomStream(setting.seed, 'excess_jitter').normal, index)
+
+
+@dataclass(frozen=True)
+class CorrelatedJitter(Effect):
+    """Normal errors of `std` s, pulses k apart correlated by `correlation^k`."""
+
+    std: float
+    correlation: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('correlated_jitter.std', self.std, minimum=0)
+        require_number('correlated_jitter.correlation', self.correlation, above=-MAX_CORRELATION,
+                       below=MAX_CORRELATION)
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return the delay of each pulse."""
+        stream = RandomStream(setting.seed, 'correlated_jitter')
+        return self.std * _per_pulse(
+            lambda *places: stream.autoregressive(*places, correlation=self.correlation), index)
+
+
+@dataclass(frozen=True)
+class TargetGeometry(Effect):
+    """
+    Marks of the target that are not evenly spaced: pulse k is late by `pulse_angles[k mod n]` rad.
+
+    With one angle for each pulse of a revolution, an angle belongs to a mark of the target.
+    """
+
+    pulse_angles: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        if not self.pulse_angles or not np.isfinite(self.pulse_angles).all():
+            raise ParameterError(f'target_geometry.pulse_angles {self.pulse_angles}: needs at '
+                                 'least one finite angle in rad')
+
+    def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
+        """Return how much later each mark passes than an evenly spaced one."""
+        marks = np.array(self.pulse_angles)[index % len(self.pulse_angles)] / (2.0 * np.pi)
+        nominal = index / setting.pulses_per_revolution
+        return setting.motion.time_at(nominal + marks) - times
+
+
+@dataclass(frozen=True)
+class ClockSkew(Effect):
+    """The clock of the keyphasor runs fast by `skew`: it shows t (1 + skew) at time t."""
+
+    skew: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('clock_skew.skew', self.skew, above=-1, below=1)
+
+    def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
+        """Return the times on the fast clock."""
+        return times * (1.0 + self.skew)
+
+
+@dataclass(frozen=True)
+class KeyphasorQuantisation(Effect):
+    """
+    The keyphasor is sampled: pulse times are rounded up to a clock of `clock_rate` Hz.
+
+    `period_std` (s) is the standard deviation of the trigger period by a slow speed fluctuation,
+    which spreads the pulses evenly between the ticks of the clock.
+    """
+
+    clock_rate: float
+    period_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('keyphasor_quantisation.clock_rate', self.clock_rate, above=0)
+        require_number('keyphasor_quantisation.period_std', self.period_std, minimum=0)
+
+    def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
+        """Return a relative fluctuation below a tenth of the trigger rate."""
+        rate = setting.trigger_rate
+        return band_limited(std=self.period_std * rate, band=(0.005 * rate, 0.1 * rate),
+                            seed=setting.seed, name='keyphasor_quantisation')
+
+    def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
+        """Return the times of the next clock ticks."""
+        return np.ceil(times * self.clock_rate) / self.clock_rate
+
+
+@dataclass(frozen=True)
+class MissingPulses(Effect):
+    """Every pulse is lost with `probability`."""
+
+    probability: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('missing_pulses.probability', self.probability, minimum=0, below=1)
+
+    def kept(self, setting: Setting, index: IndexArray) -> NDArray[np.bool_]:
+        """Return which pulses are measured."""
+        draws = _per_pulse(RandomStream(setting.seed, 'missing_pulses').uniform, index)
+        return draws >= self.probability
+
+
+@dataclass(frozen=True)
+class SpeedFluctuation(Effect):
+    """
+    Random acceleration of `acceleration_std` rad/s^2 of the tach shaft.
+
+    Its frequencies lie below a fifth of the trigger rate: it is nearly constant within a trigger
+    cycle.
+    """
+
+    acceleration_std: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('speed_fluctuation.acceleration_std', self.acceleration_std, minimum=0)
+
+    def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
+        """Return the relative fluctuation whose derivative is the acceleration."""
+        rate = setting.trigger_rate
+        acceleration = band_limited(std=self.acceleration_std, band=(0.05 * rate, 0.2 * rate),
+                                    seed=setting.seed, name='speed_fluctuation')
+        return acceleration.integral().scaled(1 / (2 * np.pi * setting.motion.nominal_speed))
+
+
+@dataclass(frozen=True)
+class PhaseWander(Effect):
+    """
+    Slow random angle of `std` rad between a shaft and its vibration, independent for each shaft.
+
+    Its frequencies reach up to `bandwidth` times the trigger rate.
+    """
+
+    std: float
+    bandwidth: float = 0.4
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('phase_wander.std', self.std, minimum=0)
+        require_number('phase_wander.bandwidth', self.bandwidth, minimum=0.05, below=0.5)
+
+    def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
+        """Return the angle in rad of the shaft."""
+        return slow_process(setting, self.std, f'phase_wander {shaft}',
+                            bandwidth=self.bandwidth).value(times)
+
+
+@dataclass(frozen=True)
+class AmplitudeModulation(Effect):
+    """Slow random gain on the vibration of each shaft, of mean 1 and standard deviation `std`."""
+
+    std: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('amplitude_modulation.std', self.std, minimum=0)
+
+    def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
+        """Return the factor."""
+        return 1.0 + slow_process(setting, self.std, f'amplitude_modulation {shaft}').value(times)
+
+
+def linear(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate `channel` x `sample` linearly; mean gain sinc^2(f/fs)."""
+    at = np.floor(positions).astype(np.int64)
+    fraction = positions - at
+    return (1.0 - fraction) * samples[:, at] + fraction * samples[:, at + 1]
+
+
+def cubic(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate by cubic convolution with a = -1/2 (Keys 1981)."""
+    at = np.floor(positions).astype(np.int64)
+    s = positions - at
+    weights = (((2.0 - s) * s - 1.0) * s / 2.0, (3.0 * s - 5.0) * s * s / 2.0 + 1.0,
+               ((4.0 - 3.0 * s) * s + 1.0) * s / 2.0, (s - 1.0) * s * s / 2.0)
+    return np.asarray(sum(weight * samples[:, at + shift]
+                          for weight, shift in zip(weights, (-1, 0, 1, 2))))
+
+
+def spline(samples: FloatArray, positions: FloatArray) -> FloatArray:
+    """Interpolate by the cubic spline; mean gain 3 sinc^4(f/fs) / (2 + cos(2 pi f/fs))."""
+    return np.asarray(CubicSpline(np.arange(samples.shape[1]), samples, axis=1)(positions))
+
+
+# Name of the averager's method: function, and number of samples that it needs on either side.
+INTERPOLATORS: Mapping[str, tuple[Interpolator, int]] = {
+    'linear': (linear, 1), 'cubic': (cubic, 2), 'spline': (spline, _SPLINE_MARGIN)}
+
+
+@dataclass(frozen=True)
+class InterpolationLoss(Effect):
+    """
+    The vibration was sampled on another grid of nearly the same rate and interpolated by `method`.
+
+    Positions between two samples of the other grid run evenly through all fractions.
+    """
+
+    method: str
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        if self.method not in INTERPOLATORS:
+            raise ParameterError(f'interpolation_loss.method {self.method!r}: must be one of '
+                                 f'{", ".join(INTERPOLATORS)}')
+
+    def sampled(self, setting: Setting, signal: Signal, start: int, stop: int) -> FloatArray:
+        """Return the interpolated samples."""
+        interpolate, margin = INTERPOLATORS[self.method]
+        rate = setting.sample_rate * (1.0 + GRID_OFFSET)
+        positions = np.arange(start, stop) * (1.0 + GRID_OFFSET)
+        first = math.floor(positions[0]) - margin
+        grid = np.arange(first, math.floor(positions[-1]) + 1 + margin + 1)
+        return interpolate(signal(grid / rate), positions - first)
+
+
+@dataclass(frozen=True)
+class AdditiveNoise(Effect):
+    """White normal noise of `std` in units of the vibration, independent on every channel."""
+
+    std: float
+    name: str = 'additive_noise'
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number(f'{self.name}.std', self.std, minimum=0)
+
+    def added(self, setting: Setting, start: int, stop: int) -> FloatArray:
+        """Return the noise."""
+        stream = RandomStream(setting.seed, self.name, rows=setting.channels)
+        return self.std * stream.normal(start, stop)
+
+
+@dataclass(frozen=True)
+class InterferingTone(Effect):
+    """Tone of `frequency` Hz and `amplitude` on every channel, not locked to any shaft."""
+
+    frequency: float
+    amplitude: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('interfering_tone.frequency', self.frequency, above=0)
+        require_number('interfering_tone.amplitude', self.amplitude, minimum=0)
+
+    def added(self, setting: Setting, start: int, stop: int) -> FloatArray:
+        """Return the tone."""
+        cycles = np.arange(start, stop) * (self.frequency / setting.sample_rate)
+        phase = RandomStream(setting.seed, 'interfering_tone').uniform(0, 1)[0, 0]
+        return np.asarray(self.amplitude * np.cos(2.0 * np.pi * (cycles % 1.0 + phase)))
+
 
 # A clock's skew comes before its quantisation: effects are applied in this order.
 EFFECTS: Mapping[str, type[Effect]] = {

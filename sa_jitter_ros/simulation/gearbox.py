@@ -18,8 +18,7 @@ from sa_jitter_ros.simulation.components import ChippedTooth, ComplexArray, Comp
 from sa_jitter_ros.simulation.effect import Effect, require_number, Setting
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
-from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
-from sa_jitter_ros.simulation.sinusoids import SinusoidSum, ZERO
+from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream, SinusoidSum, ZERO
 
 CHUNK = 4096
 _PULSE_MARGIN = 3  # pulses beyond a window whose errors may carry them into it

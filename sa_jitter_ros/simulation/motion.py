@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.simulation.random_streams import FloatArray
-from sa_jitter_ros.simulation.sinusoids import SinusoidSum, ZERO
+from sa_jitter_ros.simulation.random_streams import FloatArray, SinusoidSum, ZERO
 
 MAX_FLUCTUATION = 0.9  # of the bound, about ten standard deviations, that is never reached
 MAX_TORSION = 0.5

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings import read
-from sa_jitter_ros.recordings.bag_limits import check_inflation
+from sa_jitter_ros.recordings.limits import check_inflation
 
 rosbag2, typesys = (pytest.importorskip(f'rosbags.{name}') for name in ('rosbag2', 'typesys'))
 Mode, Storage = rosbag2.CompressionMode, rosbag2.StoragePlugin
