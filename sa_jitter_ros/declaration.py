@@ -1,10 +1,9 @@
 """
-What is declared about a machine: the parameters of `jitter_predictor`, by name, and their models.
+The declared model of a machine, from the parameters of `jitter_predictor`.
 
-The node and the reader of its parameter files share this table, and so does what they make of it.
-With one shaft, the default, `ratio` and `orders` are its; with several, each shaft has
-`<shaft>.ratio` and `<shaft>.orders`. One shaft may have its name before them, too. Both forms in
-one declaration are an error.
+The node, the reader of its parameter files and the library share these parameters. With one shaft,
+which is the default, `ratio` and `orders` belong to it; with several, each has `<shaft>.ratio` and
+`<shaft>.orders`. The second form is allowed for one shaft, too, but not both forms at once.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -17,7 +16,9 @@ from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
 from sa_jitter_ros.parameter_file import one_line, read_parameters
-from sa_jitter_ros.parameters import Parameter, RATIO, require_shaft_names
+from sa_jitter_ros.parameters import (
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
+    TRIGGER_CYCLES)
 from sa_jitter_ros.prediction.prediction import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
@@ -26,7 +27,8 @@ SHAFTS = Parameter('shafts', ['shaft'], 'names of the shafts to predict for', re
 #: Parameters of each shaft.
 SHAFT_PARAMETERS = (
     RATIO,
-    Parameter('orders', [1.0, 2.0, 3.0], 'orders to predict, multiples of the shaft of interest',
+    Parameter('orders', [1.0, 2.0, 3.0], 'orders to predict: multiples of the speed of the '
+              'shaft of interest',
               above=0.0),
 )
 #: Parameters of keyphasor and average, the same for all shafts.
@@ -34,17 +36,14 @@ MODEL_PARAMETERS = (
     Parameter('keyphasor_rate', 10000.0, 'rate at which the keyphasor is sampled', unit='Hz',
               above=0.0),
     Parameter('trigger_speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0),
-    Parameter('pulses_per_revolution', 1, 'pulses per revolution of the tach shaft', minimum=1,
-              maximum=100000),
-    Parameter('pulses_per_trigger', 0, 'pulses per trigger cycle, 0 for all of a revolution',
-              minimum=0, maximum=100000),
-    Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
-              maximum=1000000),
+    PULSES_PER_REVOLUTION,
+    PULSES_PER_TRIGGER,
+    TRIGGER_CYCLES,
     Parameter('jitter_distribution', 'uniform', 'distribution of the pulse error',
               choices=DISTRIBUTIONS),
-    Parameter('jitter_std', 0.0, 'standard deviation of a normal or triangular pulse error, 0 '
-              'for that of the sampled keyphasor', unit='s', minimum=0.0),
-    Parameter('jitter_table', [], 'equally likely pulse errors, for the distribution table',
+    Parameter('jitter_std', 0.0, 'standard deviation of a normal or triangular pulse error; 0: '
+              '1/(sqrt(12) keyphasor_rate)', unit='s', minimum=0.0),
+    Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
               unit='s'),
     Parameter('noise_std', 0.0, 'standard deviation of white noise per vibration sample, in '
               "units of the component's amplitude", minimum=0.0),
@@ -53,22 +52,23 @@ MODEL_PARAMETERS = (
     Parameter('angle_law', 'linear', 'how the angle runs between pulses, as in the averager',
               choices=ANGLE_LAWS),
 )
-#: Parameters of the node that say nothing about the model.
+#: Parameters of the node that are not part of the model.
 FOLLOWING = (
-    Parameter('follow_shaft_speed', False, 'take the speed from shaft_speed'),
-    Parameter('speed_tolerance', 1e-3, 'relative change of the speed that makes a new '
+    Parameter('follow_shaft_speed', False, 'predict at the measured speed (topic '
+              'shaft_speed)'),
+    Parameter('speed_tolerance', 1e-3, 'relative change of the speed that starts a new '
               'prediction', minimum=0.0, maximum=1.0),
 )
-# What rcl takes for a number and YAML 1.1 for a text.
+# rcl reads these texts as numbers, YAML 1.1 does not.
 _FLOAT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
 
 
 @dataclass(frozen=True)
 class Declaration:
     """
-    What is declared: a model for each shaft by its name, and the effects of all of them.
+    A declared model for each shaft by its name, and the effects that all of them share.
 
-    `unknown` are names in a file that match no parameter.
+    `unknown` are the names in a parameter file that match no parameter.
     """
 
     models: Mapping[str, DeclaredModel]
@@ -80,7 +80,7 @@ class Declaration:
         """Return the model of the only shaft; raise ModelError where there are several."""
         if len(self.models) > 1:
             raise ModelError(f'shafts {", ".join(self.models)} are declared: one shaft is needed '
-                             'here, declare each in a file of its own')
+                             'here; use one parameter file for each shaft')
         return next(iter(self.models.values()))
 
 
@@ -90,31 +90,30 @@ def predictor_parameters(
     """
     Return the parameters of `jitter_predictor` for these shafts.
 
-    `given` are the names that are set, which decide in what form `ratio` and `orders` of one shaft
-    stand. Raises ParameterError for shaft names that topics cannot have and for both forms at
-    once.
+    `given` are the names that the user set: they decide whether one shaft has `ratio` and `orders`
+    or `<shaft>.ratio` and `<shaft>.orders`. Raises ParameterError for both forms at once and for
+    names that cannot be part of a topic's name.
     """
     require_shaft_names(SHAFTS.name, shafts)
-    own = [[replace(item, name=f'{shaft}.{item.name}') for item in SHAFT_PARAMETERS]
-           for shaft in shafts]
-    of_shafts = [item for items in own for item in items]
+    of_shafts = [replace(item, name=f'{shaft}.{item.name}')
+                 for shaft in shafts for item in SHAFT_PARAMETERS]
     common = [item for item in SHAFT_PARAMETERS if item.name in given]
     if len(shafts) == 1 and not any(item.name in given for item in of_shafts):
         of_shafts = list(SHAFT_PARAMETERS)
     elif common:
         name = common[0].name
         raise ParameterError(
-            f'{name} is given for shafts {", ".join(shafts)}, which have '
-            f'{", ".join(f"{shaft}.{name}" for shaft in shafts)}: leave out {name}')
+            f'{name} is given together with the shafts {", ".join(shafts)}: give '
+            f'{", ".join(f"{shaft}.{name}" for shaft in shafts)} and leave out {name}')
     return (*MODEL_PARAMETERS, SHAFTS, *of_shafts, *FOLLOWING, *effect_parameters())
 
 
 def declaration_of(values: Mapping[str, Any]) -> Declaration:
     """
-    Return what parameters of `jitter_predictor` declare.
+    Return the models and effects that parameters of `jitter_predictor` declare.
 
-    `values` are converted; what they lack has its default. Raises ModelError for values that make
-    no sense together.
+    `values` are converted values by name; a parameter that is not among them has its default.
+    Raises ModelError for values that contradict each other.
     """
     models = {}
     for shaft in values.get(SHAFTS.name, SHAFTS.default):
@@ -128,10 +127,10 @@ def declaration_of(values: Mapping[str, Any]) -> Declaration:
 
 def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     """
-    Read what a ROS parameter file of `jitter_predictor` declares, without ROS.
+    Read the models and effects that a ROS parameter file of `jitter_predictor` declares.
 
-    `sample_rate` (Hz) serves where the file has none. Raises ModelError, in one line, for a file
-    that is missing, no parameter file of the node, or holds values that make no sense.
+    ROS is not needed. `sample_rate` (Hz) is used if the file contains none. Raises ModelError, in
+    one line, for a file that is missing, is no parameter file of the node, or has unusable values.
     """
     try:
         values = read_parameters(path, NODE)
@@ -153,7 +152,7 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
 
 
 def _as_rcl_reads(value: Any, item: Parameter) -> Any:
-    """Return a value of a file with texts that rcl takes for floats as floats."""
+    """Return a value of a file; texts that rcl reads as floats become floats."""
     if isinstance(value, list):
         return [_as_rcl_reads(each, item) for each in value]
     if item.kind is float and isinstance(value, str) and _FLOAT.fullmatch(value):

@@ -1,8 +1,7 @@
 """
-Parameters: name, default, meaning, unit and range of each, the same for nodes, files and library.
+Parameters: name, default, meaning, unit and range, the same for nodes, files and library.
 
-A `Parameter` says what it takes and converts what it is given; `nodes/parameters.py` declares it
-to ROS.
+A `Parameter` converts and checks values; `nodes/parameters.py` declares it to ROS.
 """
 
 from collections.abc import Sequence
@@ -24,10 +23,10 @@ class Parameter:
     """
     Description of one parameter.
 
-    The default's type is the parameter's type; `[0.0]`-like defaults make lists, and `element`
-    gives the type of a list whose default is empty. `minimum` and `maximum` bound a number or
-    every element of a list, `above` is an open lower bound, `choices` are the values a text may
-    take. A `read_only` parameter of a node is fixed at its start.
+    The type of the default is the type of the parameter; `element` is the type of the elements
+    where the default is an empty list. `minimum` and `maximum` limit a number or every element of
+    a list; a value must be greater than `above`. `choices` are the values that a text may have. A
+    `read_only` parameter is fixed when the node starts.
     """
 
     name: str
@@ -54,7 +53,7 @@ class Parameter:
         return type(self.default)
 
     def convert(self, value: Any) -> Any:
-        """Return the value as this parameter's type; raise ParameterError where it has none."""
+        """Return the value as the type of this parameter; raises ParameterError."""
         if self.is_list:
             if isinstance(value, (str, bytes)) or not hasattr(value, '__len__'):
                 raise ParameterError(f'{self.name} is {value!r}: give a list of '
@@ -95,17 +94,25 @@ class Parameter:
 
 
 def _is_a(kind: Any, value: Any) -> bool:
-    """Return whether a value is a number of a kind; true and false are none."""
+    """Return whether a value is a number of a kind; true and false are not."""
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
-#: Beyond this range one shaft hardly turns while the other is averaged.
-RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest over that of the tach shaft',
+#: Beyond this range one shaft hardly turns during an average of the other.
+RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest / speed of the tach shaft',
                   minimum=1e-3, maximum=1e3)
+PULSES_PER_REVOLUTION = Parameter(
+    'pulses_per_revolution', 1, 'pulses per revolution of the tach shaft, including those of '
+    'missing teeth', minimum=1, maximum=100000)
+PULSES_PER_TRIGGER = Parameter(
+    'pulses_per_trigger', 0, 'pulses per trigger cycle; 0: all pulses of a revolution',
+    minimum=0, maximum=100000)
+TRIGGER_CYCLES = Parameter('trigger_cycles', 40, 'trigger cycles in an average, N_t', minimum=1,
+                           maximum=1000000)
 
 
 def require_shaft_names(parameter: str, names: Sequence[str]) -> None:
-    """Raise ParameterError unless there are names, different ones that topics can have."""
+    """Raise ParameterError unless the names differ and can be part of a topic's name."""
     wrong = [name for name in names if not re.fullmatch('[a-z][a-z0-9_]*', name)]
     if wrong or not names or len(set(names)) < len(names):
         raise ParameterError(f'{parameter} is {", ".join(map(repr, names))}: give different names '

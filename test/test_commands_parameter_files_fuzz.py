@@ -170,9 +170,11 @@ def test_one_shaft_may_have_its_name_before_its_parameters(tmp_path, lines):
 
 @pytest.mark.parametrize(('lines', 'says'), [
     ('{shafts: [a, b], ratio: 2.0}',
-     'ratio is given for shafts a, b, which have a.ratio, b.ratio: leave out ratio'),
-    ('{shafts: [a, b], a.ratio: 2.0, orders: [1.0]}', 'orders is given for shafts a, b'),
-    ('{shaft.ratio: 2.0, ratio: 2.0}', 'ratio is given for shafts shaft, which have shaft.ratio'),
+     'ratio is given together with the shafts a, b: give a.ratio, b.ratio and leave out ratio'),
+    ('{shafts: [a, b], a.ratio: 2.0, orders: [1.0]}',
+     'orders is given together with the shafts a, b'),
+    ('{shaft.ratio: 2.0, ratio: 2.0}',
+     'ratio is given together with the shafts shaft: give shaft.ratio'),
     ('{shafts: [a, a]}', "shafts is 'a', 'a': give different names"),
     ('{shafts: []}', 'shafts is : give different names'),
     ('{shafts: [A]}', "shafts is 'A'"),

@@ -147,6 +147,6 @@ def test_what_matches_nothing_is_named(node_with, capfd):
                                  'qos_overrides./a.subscription.depth': 5})
     parameters.watch(check=lambda values: None, apply=lambda values: None)
     errors = capfd.readouterr().err
-    assert 'parameter rat matches nothing that this node declares: ignored' in errors
+    assert 'parameter rat is ignored: this node has no parameter of that name' in errors
     assert 'qos_overrides' not in errors
     assert 'use_sim_time' not in errors

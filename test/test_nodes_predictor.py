@@ -204,8 +204,9 @@ def test_one_named_shaft_has_the_topic_of_one(bench, prefix):
 
 
 @pytest.mark.parametrize(('given', 'message'), [
-    ({'shafts': ['a', 'b'], 'ratio': 2.0}, 'ratio is given for shafts a, b, which have a.ratio'),
-    ({'shaft.orders': [1.0], 'orders': [1.0]}, 'orders is given for shafts shaft'),
+    ({'shafts': ['a', 'b'], 'ratio': 2.0},
+     'ratio is given together with the shafts a, b: give a.ratio'),
+    ({'shaft.orders': [1.0], 'orders': [1.0]}, 'orders is given together with the shafts shaft'),
     ({'shafts': ['a', 'a']}, "shafts is 'a', 'a': give different names"),
     ({'shafts': ['a', 'b'], 'b.ratio': 0.0}, 'b.ratio is 0.0: give at least 0.001'),
 ])

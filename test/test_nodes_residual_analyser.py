@@ -3,7 +3,7 @@
 from dataclasses import replace
 import json
 
-from bench import NodeBench
+from bench import NodeBench, SteadyClock
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
@@ -12,7 +12,7 @@ from sa_jitter_ros.errors import ModelError, ParameterError, SignalError
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
 from sa_jitter_ros.inference.online_trace import trace_averages
-from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes import messages, residual_analyser
 from sa_jitter_ros.nodes.base import LATCHED_QOS
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor, prediction_message
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
@@ -241,8 +241,13 @@ class AnalyserBench(NodeBench):
                     'pulse_error', messages.AverageMessage(header, item.pulses)))
         self.settle()
 
-    def told(self, text):
-        """Return whether a status has said so, up to the one that is asked for now."""
+    def give_up(self, clock):
+        """Let the analyser wait in vain for an answer of the predictor."""
+        assert self.spin(lambda: self.node._activity.startswith('waiting for'))
+        clock.now += 20.0
+
+    def reported(self, text):
+        """Return whether a status contains the text, up to the one that is published now."""
         self.node.publish_diagnostics()
         return any(text in item.status[0].message for item in self.received['/diagnostics'])
 
@@ -255,17 +260,26 @@ class AnalyserBench(NodeBench):
         return [json.loads(item.data) for item in self.received['missing_effect']]
 
 
+@pytest.fixture(autouse=True)
+def clock(monkeypatch):
+    """Return the clock by which analysers wait for the predictor; it stands still."""
+    found = SteadyClock()
+    monkeypatch.setattr(residual_analyser, 'time', found)
+    return found
+
+
 @pytest.fixture
 def bench(ros_graph):
     """Return a maker of benches."""
     return lambda **options: AnalyserBench(ros_graph, **options)
 
 
-def test_batch_is_judged_and_traced_without_a_predictor(bench):
+def test_batch_is_compared_and_traced_without_a_predictor(bench, clock):
     b = bench()
     b.predict()
     averages = synthetic(8, std=5e-5)
     b.average(averages)
+    b.give_up(clock)
     assert b.spin(b.reports)
     (residual,), (content,) = b.residuals(), b.reports()
     table, found = compare(averages, published())
@@ -281,23 +295,27 @@ def test_batch_is_judged_and_traced_without_a_predictor(bench):
     assert len(b.residuals()) == 1
 
 
-def test_missing_effect_is_latched(bench):
+def test_missing_effect_is_latched(bench, clock):
     b = bench()
     b.predict()
     b.average(synthetic(8))
+    b.give_up(clock)
     assert b.spin(b.reports)
     late = b.graph.capture('missing_effect', String, latched=True)
     assert b.spin(lambda: late)
     assert json.loads(late[0].data)['verdict'] == 'none'
 
 
-def test_absent_predictor_is_a_diagnostic(bench):
+def test_absent_predictor_is_a_diagnostic(bench, clock):
     b = bench(close_loop=True, predictor='elsewhere')
     b.predict()
     b.average(synthetic(8, std=5e-5))
-    assert b.spin(lambda: b.told('elsewhere does not answer: its prediction is taken'))
-    assert b.spin(lambda: b.told('elsewhere does not answer: its effects cannot be set'))
+    b.give_up(clock)
+    assert b.spin(lambda: b.reported('elsewhere does not answer: independent jitter'))
+    assert b.spin(b.reports)
     assert b.reports()[0]['verdict'] == 'traced'
+    b.give_up(clock)
+    assert b.spin(lambda: b.reported('elsewhere does not answer: its effects cannot be set'))
 
 
 @pytest.mark.parametrize(('change', 'reason'), [
@@ -306,7 +324,7 @@ def test_mismatch_is_said_and_cured(bench, change, reason):
     b = bench()
     b.predict(**change)
     b.average(synthetic(8))
-    assert b.spin(lambda: b.told(reason))
+    assert b.spin(lambda: b.reported(reason))
     assert not b.residuals()
     b.predict()
     assert b.spin(b.residuals)
@@ -324,7 +342,8 @@ def test_averages_without_correction_are_refused(bench):
     b = bench()
     b.predict()
     b.average(synthetic(8), corrected=False)
-    assert b.spin(lambda: b.told('set correct_jitter: true') and b.told('better keyphasor'))
+    assert b.spin(lambda: b.reported('set correct_jitter: true in the averager; if the averager '
+                                     'refuses') and b.reported('better keyphasor'))
     values = b.diagnostics()[2]
     assert values['uncorrected'] == '8'
     assert values['averages'] == '0'
@@ -362,7 +381,7 @@ def test_name_of_another_node_is_not_taken_for_the_predictor(bench):
     b = bench(predictor='test')  # the graph's node has parameter services, not the parameters
     b.predict()
     b.average(synthetic(8, std=5e-5))
-    assert b.spin(lambda: b.told('test does not answer: its prediction is taken'))
+    assert b.spin(lambda: b.reported('test does not answer: independent jitter'))
     assert b.spin(b.reports)
     assert b.reports()[0]['declared']['keyphasor_rate'] == CLOCK
 
@@ -380,7 +399,7 @@ def test_effects_reach_the_predictor_and_refusal_is_told(bench, ros_graph):
     predictor.add_on_set_parameters_callback(refuse)
     b = bench(close_loop=True, acquisitions=30)
     b.average(synthetic(30, std=5e-5))
-    assert b.spin(lambda: b.told('refuses the effects: not today'))
+    assert b.spin(lambda: b.reported('refuses the effects: not today'))
     b.average(synthetic(30, std=5e-5, seed=1))
     name = 'effects.excess_jitter'
     assert b.spin(lambda: predictor.get_parameter(f'{name}.enabled').value)
@@ -445,9 +464,15 @@ class Chain:
         return [json.loads(item.data) for item in self._reports]
 
     def play(self, until):
-        """Play the machine in blocks of a quarter of a second until something has happened."""
+        """
+        Play the machine in blocks of a quarter of a second until something has happened.
+
+        The machine stands still while the analyser traces or asks the predictor, so that the speed
+        of the computer changes nothing.
+        """
         size = int(self.rate) // 4
         for _ in range(600):
+            assert self.graph.spin(lambda: not self.analyser._activity, timeout=600.0)
             if until():
                 return
             start, stop = self.at / self.rate, (self.at + size) / self.rate

@@ -148,7 +148,7 @@ def test_several_channels_are_refused_with_a_reason(bench):
     b.send('tach_waveform', messages.encode_samples(SampleBlock(np.zeros((3, 9)), 0.0, RATE, 0)))
     level, text, _ = b.diagnostics()
     assert level == DiagnosticStatus.WARN
-    assert '3 channels: send the one channel of the keyphasor' in text
+    assert '3 channels: send only the channel of the keyphasor' in text
 
 
 def test_float32_waveform_with_header(bench):

@@ -1,4 +1,4 @@
-"""What the averager publishes about one shaft."""
+"""Results of the averager for one shaft, as messages."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 
 
 class ShaftOutput:
-    """Publishers of one shaft, and its condition indicators, which have a history."""
+    """Publishers of one shaft and its condition indicators, which depend on earlier averages."""
 
     def __init__(self, node: MonitoringNode, name: str) -> None:
         self._node, self._name = node, name
@@ -31,7 +31,7 @@ class ShaftOutput:
         self.refusal = ''
 
     def use(self, gear: GearSettings) -> None:
-        """Take other mesh orders; the indicators' history starts anew."""
+        """Use other mesh orders; the indicators forget earlier averages."""
         if gear != self._gear:
             self._gear, self._indicators = gear, RunningIndicators(gear)
 
@@ -58,10 +58,10 @@ class ShaftOutput:
             self._indicate(header, waveform)
 
     def _indicate(self, header: AverageHeader, waveform: FloatArray) -> None:
-        """Publish the condition indicators, of the corrected average where there is one."""
+        """Publish the condition indicators of a waveform."""
         try:
             self._indicators.update(waveform)
-        except SignalError:  # the source came back with other channels
+        except SignalError:  # the number of channels has changed
             self._indicators = RunningIndicators(self._gear)
             self._indicators.update(waveform)
         except ParameterError as error:
@@ -75,7 +75,7 @@ class ShaftOutput:
 
 
 def amplitude_table(average: Average) -> FloatArray:
-    """Channel x order x `AMPLITUDE_FIELDS`; NaN where there is no correction."""
+    """Return (channel, order, `AMPLITUDE_FIELDS`), NaN where there is no correction."""
     table = np.full((*average.amplitudes.shape, len(AMPLITUDE_FIELDS)), np.nan)
     table[..., 0] = average.orders
     table[..., 1] = np.abs(average.amplitudes)
@@ -87,5 +87,5 @@ def amplitude_table(average: Average) -> FloatArray:
         table[..., 4] = np.angle(correction.amplitudes)
         table[..., 5] = correction.attenuation
         table[..., 6] = correction.attenuation_standard_error
-        table[..., 7] = correction.noise  # jitter does not scatter it any more
+        table[..., 7] = correction.noise  # without the scatter that jitter causes
     return table

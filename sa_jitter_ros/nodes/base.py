@@ -27,7 +27,6 @@ from sa_jitter_ros.parameters import Parameter
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
                    'clock_deviation', 'messages_rejected')
-UNCOUNTED = 'samples without header are counted from start_time: a loss would not be seen'
 WARNING_PERIOD = 5.0  # s between log lines of the same kind
 
 
@@ -36,7 +35,7 @@ def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
                       reliability=ReliabilityPolicy.RELIABLE)
 
 
-def _misfit(subscription: Subscription, policy: str) -> str:
+def _incompatibility(subscription: Subscription, policy: str) -> str:
     name = subscription.topic_name
     return (f'a publisher of {name} offers an incompatible {policy}: match it with the parameter '
             f'qos_overrides.{name}.subscription.{policy}')
@@ -53,12 +52,12 @@ LATCHED_QOS = _reliable(1, DurabilityPolicy.TRANSIENT_LOCAL)
 
 class MonitoringNode(Node):
     """
-    A node of this package: described parameters, diagnostics, and no message that can kill it.
+    A node of this package: described parameters, diagnostics, and no message that can stop it.
 
-    `counts` are cumulative; a subclass updates them (in `update_counts`, called before they are
-    published) and says in `summary` what it is doing. A count that grew makes the status WARN. A
-    publisher of an input whose quality of service does not fit makes it ERROR, and so does each
-    text in `faults` for as long as it is there.
+    `counts` are cumulative. A subclass updates them in `update_counts`, which is called before
+    they are published, and describes its state in `summary`. The status is WARN after a count
+    increased or a warning was given. It is ERROR while a publisher of an input has an incompatible
+    quality of service, and while `faults` holds a text.
     """
 
     def __init__(self, name: str, parameters: Sequence[Parameter], **node_kwargs: Any) -> None:
@@ -66,7 +65,7 @@ class MonitoringNode(Node):
         self.parameters = ParameterSet(self, parameters)
         self.counts: dict[str, int] = dict.fromkeys(DIAGNOSTIC_KEYS, 0)
         self.faults: dict[str, str] = {}
-        self._unfit: dict[Subscription, str] = {}  # and the policy that does not fit
+        self._incompatible: dict[Subscription, str] = {}  # and the incompatible policy
         self._reported = dict(self.counts)
         self._last_warning = ''
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -82,10 +81,10 @@ class MonitoringNode(Node):
     def create_input(self, kind: type, topic: str, callback: Callable[[Any], None],
                      qos: QoSProfile = INPUT_QOS) -> Subscription:
         """
-        Subscribe; a bad message is reported, never raised.
+        Subscribe to a topic; an error in the callback becomes a warning.
 
-        Whatever of other packages' errors a message may cause is counted as its rejection, too; a
-        callback that raises a `SaJitterError` but `MessageError` has counted what is lost.
+        A `MessageError`, or an exception that is no `SaJitterError`, counts as a rejected message.
+        A callback that raises another `SaJitterError` has counted itself what it dropped.
         """
         def guarded(message: Any) -> None:
             try:
@@ -105,8 +104,8 @@ class MonitoringNode(Node):
 
         def incompatible(info: Any) -> None:
             policy = qos_policy_name_from_kind(info.last_policy_kind).lower()
-            self._unfit[subscription] = policy
-            self.get_logger().error(_misfit(subscription, policy),
+            self._incompatible[subscription] = policy
+            self.get_logger().error(_incompatibility(subscription, policy),
                                     throttle_duration_sec=WARNING_PERIOD)
 
         subscription = self.create_subscription(
@@ -119,31 +118,31 @@ class MonitoringNode(Node):
         """Return the publisher of a result."""
         return self.create_publisher(kind, topic, copy(qos), qos_overriding_options=_OVERRIDABLE)
 
-    # --- telling the user ---
+    # --- warnings and diagnostics ---
 
     def warn(self, text: str) -> None:
-        """Log a warning, throttled, and show it in the next diagnostics."""
+        """Log a warning, at most every `WARNING_PERIOD`, and show it in the next diagnostics."""
         self.show_warning(text)
         self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
 
     def show_warning(self, text: str) -> None:
-        """Show a warning in the next diagnostics, without a line in the log."""
+        """Show a warning in the next diagnostics, but not in the log."""
         self._last_warning = text
 
-    def _misfits(self) -> list[str]:
-        """Say which publishers that are there offer what an input cannot take."""
-        for subscription in list(self._unfit):
+    def _incompatibilities(self) -> list[str]:
+        """Return a line for each input with an incompatible publisher."""
+        for subscription in list(self._incompatible):
             offered = self.get_publishers_info_by_topic(subscription.topic_name)
             if all(qos_check_compatible(item.qos_profile, subscription.qos_profile)[0]
                    != QoSCompatibility.ERROR for item in offered):
-                del self._unfit[subscription]
-        return [_misfit(*item) for item in self._unfit.items()]
+                del self._incompatible[subscription]
+        return [_incompatibility(*item) for item in self._incompatible.items()]
 
     def update_counts(self) -> None:
         """Bring `counts` up to date before they are published."""
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """One line on what the node is doing, and values to show beside the counts."""
+        """Return the node's state in one line, and values to publish beside the counts."""
         return 'running', {}
 
     def publish_diagnostics(self) -> None:
@@ -153,12 +152,12 @@ class MonitoringNode(Node):
         status = DiagnosticStatus(level=DiagnosticStatus.OK, message=text, hardware_id='',
                                   name=self.get_fully_qualified_name().lstrip('/'))
         grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
-        faults = [*self.faults.values(), *self._misfits()]
+        faults = [*self.faults.values(), *self._incompatibilities()]
         if faults:
             status.level, status.message = DiagnosticStatus.ERROR, '; '.join(faults)
         elif grown or self._last_warning:
             status.level = DiagnosticStatus.WARN
-            status.message = self._last_warning or f'{", ".join(grown)} grew'
+            status.message = self._last_warning or f'{", ".join(grown)} increased'
         self._reported, self._last_warning = dict(self.counts), ''
         shown = {**{key: str(count) for key, count in self.counts.items()}, **values}
         status.values = [KeyValue(key=key, value=value) for key, value in shown.items()]
@@ -168,11 +167,11 @@ class MonitoringNode(Node):
 
 
 def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
-    """Spin one node until SIGINT or SIGTERM; 0, or 2 with one line on unusable arguments."""
+    """Run one node until SIGINT or SIGTERM; return 0, or 2 after one line on a bad argument."""
     use_one_thread()
     try:
         rclpy.init(args=args)
-    except RuntimeError as error:  # rcl could not read the command line or a parameter file
+    except RuntimeError as error:  # rcl cannot read the command line or a parameter file
         print(f'error: {error}', file=sys.stderr)
         return 2
     node = None
@@ -193,7 +192,7 @@ def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) 
         print(f'error: {error}', file=sys.stderr)
         return 2
     except Exception:
-        if rclpy.ok():  # else a callback met the shutdown
+        if rclpy.ok():  # else the shutdown interrupted a callback
             raise
     finally:
         if node is not None:

@@ -1,4 +1,4 @@
-"""Node `jitter_predictor`: what the declared keyphasor does to each order of the average."""
+"""Node `jitter_predictor`: predicts how jitter changes each order of a synchronous average."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,7 +17,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 
 def check(values: Values) -> None:
-    """Raise `SaJitterError` unless the parameters make models with effects."""
+    """Raise `SaJitterError` unless the parameters declare models that can be predicted."""
     declaration = declaration_of(values)
     for model in declaration.models.values():
         predict_with(replace(model, orders=(max(model.orders),)), declaration.effects)
@@ -25,7 +25,7 @@ def check(values: Values) -> None:
 
 class JitterPredictor(MonitoringNode):
     """
-    Publishes the prediction, and again whenever a parameter or the speed changes.
+    Publishes the prediction at its start and after each change of a parameter or of the speed.
 
     The topic is `prediction` for one shaft and `<shaft>/prediction` for each of several.
     """
@@ -56,7 +56,7 @@ class JitterPredictor(MonitoringNode):
                 self._predict(self._models_at(speed))
                 return
             except ModelError as error:
-                self.warn(f'at the measured {speed:.6g} Hz: {error}')
+                self.warn(f'at the measured speed of {speed:.6g} Hz: {error}')
         self._predict(self._declaration.models)
 
     def _on_speed(self, message: Float64) -> None:
@@ -64,13 +64,13 @@ class JitterPredictor(MonitoringNode):
             return
         speed = message.data
         if not (math.isfinite(speed) and speed > 0.0):
-            raise MessageError(f'speed is {speed} Hz: publish a positive number')
-        known = self._trigger_speed
-        if abs(speed - known) > self._values['speed_tolerance'] * known:
+            raise MessageError(f'shaft_speed is {speed} Hz: publish a positive number')
+        predicted = self._trigger_speed
+        if abs(speed - predicted) > self._values['speed_tolerance'] * predicted:
             self._predict(self._models_at(speed))
 
     def _models_at(self, trigger_speed: float) -> dict[str, DeclaredModel]:
-        """Return the declared models at a measured speed; raise ModelError where it fits none."""
+        """Return the declared models at a measured speed; raises ModelError."""
         return {shaft: replace(model, trigger_speed=trigger_speed)
                 for shaft, model in self._declaration.models.items()}
 
@@ -84,11 +84,11 @@ class JitterPredictor(MonitoringNode):
 
     @property
     def _trigger_speed(self) -> float:
-        """Return the speed of the tach shaft for which the last prediction holds, Hz."""
+        """Return the speed of the tach shaft in the last prediction, Hz."""
         return next(iter(self._models.values())).trigger_speed
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say what is predicted for which models."""
+        """Return what is predicted, the number of predictions and the declared effects."""
         orders = sum(len(model.orders) for model in self._models.values())
         model = next(iter(self._models.values()))
         shafts = f' of {len(self._models)} shafts' if len(self._models) > 1 else ''
@@ -99,7 +99,7 @@ class JitterPredictor(MonitoringNode):
 
 
 def prediction_message(prediction: Prediction) -> PredictionMessage:
-    """Message content of a prediction."""
+    """Return the content of the message of a prediction."""
     table = np.stack([getattr(prediction, name) for name in PREDICTION_FIELDS], axis=1)
     speed, rate, cycles, ratio, pulse_error, noise = prediction.header
     return PredictionMessage(table, speed, rate, int(cycles), ratio, pulse_error, noise)

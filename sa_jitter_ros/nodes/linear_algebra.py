@@ -1,12 +1,13 @@
 """
-One thread of linear algebra in the process of a node.
+Limit the linear algebra of a process to one thread.
 
-The matrices of this package are small. OpenBLAS splits them among threads that wait for each
-other in busy loops: on a busy machine a recovery of pulse errors takes ten times as long.
-`OMP_NUM_THREADS=1` does the same, but it must be set before Python starts.
+The matrices of this package are small. OpenBLAS splits them among threads that wait for each other
+in busy loops: on a busy machine a recovery of pulse errors takes ten times as long. The
+environment variable `OMP_NUM_THREADS=1` prevents it, too, but only if it is set before Python
+starts.
 
-threadpoolctl finds the same libraries, but rosdep has no key for it, so that `rosdep install`
-could not provide it to a workspace. These lines set what threadpoolctl sets for OpenBLAS.
+threadpoolctl does the same, but rosdep has no key for it: `rosdep install` could not provide it in
+a workspace. This module calls the same functions of OpenBLAS as threadpoolctl does.
 """
 
 import ctypes
@@ -15,17 +16,17 @@ from pathlib import Path
 
 _MAPS = Path('/proc/self/maps')
 _USER_LIMITS = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')
-# Names in the builds of distributions, and in those inside the wheels of numpy and scipy.
+# Names in the builds of distributions and in the wheels of numpy and scipy.
 _SETTERS = tuple(f'{prefix}openblas_set_num_threads{suffix}'
                  for prefix in ('', 'scipy_') for suffix in ('', '64_'))
 
 
 def use_one_thread() -> int:
     """
-    Limit every OpenBLAS of this process to one thread, unless the environment sets a number.
+    Limit every OpenBLAS of this process to one thread unless the environment sets a number.
 
-    Returns how many libraries were limited: 0 where the environment sets the number, with another
-    BLAS, and where the libraries of a process cannot be listed (not on Linux).
+    Returns the number of libraries that were limited. It is 0 if the environment sets the number
+    of threads, if there is another BLAS, and on other systems than Linux.
     """
     if any(os.environ.get(name) for name in _USER_LIMITS) or not _MAPS.exists():
         return 0

@@ -1,6 +1,7 @@
-"""Node `machine_simulator`: a gearbox whose truth is known, as the topics of its measurement."""
+"""Node `machine_simulator`: publishes the signals of a simulated gearbox."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import count
 import math
 from typing import Any
@@ -12,7 +13,8 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
-from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.parameters import (
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,
@@ -22,46 +24,52 @@ from sa_jitter_ros.simulation.random_streams import ZERO
 
 FIXED: dict[str, Any] = {'read_only': True}
 PARAMETERS = (
-    Parameter('seed', 0, 'of all random numbers', minimum=0, **FIXED),
+    Parameter('seed', 0, 'seed of all random numbers', minimum=0, **FIXED),
     Parameter('start_time', 0.0, 'time of the first sample', unit='s', **FIXED),
-    Parameter('duration', 0.0, 'machine time to simulate, 0 for no end', unit='s', minimum=0.0,
+    Parameter('duration', 0.0, 'machine time to simulate; 0: no end', unit='s', minimum=0.0,
               **FIXED),
-    Parameter('sample_rate', 20000.0, 'of the vibration', unit='Hz', above=0.0, **FIXED),
-    Parameter('channel_gains', [1.0], 'gain of each vibration channel; their number is that of '
-              'the channels', **FIXED),
+    Parameter('sample_rate', 20000.0, 'sampling rate of the vibration', unit='Hz', above=0.0,
+              **FIXED),
+    Parameter('channel_gains', [1.0], 'gain of each vibration channel', **FIXED),
     Parameter('shafts', ['shaft'], 'names of the shafts', **FIXED),
-    Parameter('speed', 25.0, 'of the tach shaft', unit='Hz', above=0.0, **FIXED),
-    Parameter('speed_profile', [], 'time (s), speed (Hz), time, speed, ... instead of a constant '
-              'speed, linear in between', minimum=0.0, **FIXED),
-    Parameter('speed_fluctuation_std', 0.0, 'relative random speed fluctuation, band-limited',
+    Parameter('speed', 25.0, 'speed of the tach shaft', unit='Hz', above=0.0, **FIXED),
+    Parameter('speed_profile', [], 'speed that changes: time (s), speed (Hz), time, speed, ...; '
+              'linear between these times; instead of speed', minimum=0.0, **FIXED),
+    Parameter('speed_fluctuation_std', 0.0, 'standard deviation of a random speed fluctuation, '
+              'relative to the speed',
               minimum=0.0, maximum=0.1, **FIXED),
-    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of it',
+    Parameter('speed_fluctuation_band', [0.1, 2.0], 'lowest and highest frequency of the speed '
+              'fluctuation',
               unit='Hz', above=0.0, **FIXED),
-    Parameter('torsion_order', 2.0, 'twists a revolution of the tach shaft', minimum=0.0, **FIXED),
-    Parameter('torsion_amplitude', 0.0, 'of the twist', unit='rad', minimum=0.0, **FIXED),
+    Parameter('torsion_order', 2.0, 'torsional oscillations per revolution of the tach shaft',
+              minimum=0.0, **FIXED),
+    Parameter('torsion_amplitude', 0.0, 'amplitude of the torsional oscillation', unit='rad',
+              minimum=0.0, **FIXED),
     Parameter('noise_std', 0.1, 'declared white noise per vibration sample, in units of the '
               'vibration', minimum=0.0),
-    Parameter('tach', 'pulses', 'what the keyphasor gives',
+    Parameter('tach', 'pulses', 'output of the keyphasor',
               choices=('pulses', 'waveform', 'both', 'none'), **FIXED),
-    Parameter('pulses_per_revolution', 1, 'of the tach shaft', minimum=1, maximum=100000, **FIXED),
-    Parameter('pulses_per_trigger', 0, 'pulses of a trigger cycle, 0 for all of a revolution',
-              minimum=0, maximum=100000, **FIXED),
+    replace(PULSES_PER_REVOLUTION, **FIXED),
+    replace(PULSES_PER_TRIGGER, **FIXED),
     Parameter('keyphasor_rate', 10000.0, 'declared rate at which the keyphasor is sampled',
               unit='Hz', above=0.0),
-    Parameter('jitter_distribution', 'uniform', 'declared pulse error: a distribution, or '
-              'sampled for pulse times that are rounded up to the clock of keyphasor_rate',
+    Parameter('jitter_distribution', 'uniform', 'distribution of the declared pulse error; '
+              'sampled: pulse times are rounded up to a clock of keyphasor_rate; none: no errors',
               choices=(*JITTER_DISTRIBUTIONS, 'sampled', 'none')),
-    Parameter('jitter_std', 0.0, 'standard deviation of it, 0 for 1/(sqrt(12) keyphasor_rate)',
+    Parameter('jitter_std', 0.0, 'standard deviation of the declared pulse error; 0: '
+              '1/(sqrt(12) keyphasor_rate)',
               unit='s', minimum=0.0),
-    Parameter('jitter_table', [], 'equally likely errors, for the distribution table', unit='s'),
-    Parameter('waveform', 'ttl', 'of the keyphasor', choices=('ttl', 'sine'), **FIXED),
-    Parameter('waveform_rate', 50000.0, 'sampling rate of the waveform', unit='Hz', above=0.0,
+    Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
+              unit='s'),
+    Parameter('waveform', 'ttl', 'shape of the tach waveform', choices=('ttl', 'sine'), **FIXED),
+    Parameter('waveform_rate', 50000.0, 'sampling rate of the tach waveform', unit='Hz',
+              above=0.0, **FIXED),
+    Parameter('waveform_rise_time', 0.0, 'rise time of a ttl edge', unit='s', minimum=0.0,
               **FIXED),
-    Parameter('waveform_rise_time', 0.0, 'of a ttl edge', unit='s', minimum=0.0, **FIXED),
-    Parameter('waveform_noise_std', 0.0, 'white noise on the waveform of 0 to 5 V', unit='V',
-              minimum=0.0, **FIXED),
+    Parameter('waveform_noise_std', 0.0, 'standard deviation of white noise on the tach '
+              'waveform, which is 0 to 5 V', unit='V', minimum=0.0, **FIXED),
 )
-# Sizes at which an effect shows as soon as it is switched on.
+# Sizes at which an effect is significant as soon as it is enabled.
 EFFECT_DEFAULTS = {
     'excess_jitter.std': 2e-5, 'correlated_jitter.std': 2e-5, 'correlated_jitter.correlation': 0.8,
     'target_geometry.pulse_angles': (0.0, 0.005), 'clock_skew.skew': 1e-5,
@@ -73,16 +81,18 @@ EFFECT_DEFAULTS = {
 
 
 def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
-    """Parameters of one shaft."""
+    """Return the parameters of one shaft."""
     return (
-        Parameter(f'{shaft}.ratio', 1.0, 'speed over that of the tach shaft', above=0.0, **FIXED),
-        Parameter(f'{shaft}.teeth', 23, 'of its gear: the mesh order', minimum=1, **FIXED),
+        Parameter(f'{shaft}.ratio', 1.0, 'speed of this shaft / speed of the tach shaft',
+                  above=0.0, **FIXED),
+        Parameter(f'{shaft}.teeth', 23, 'number of teeth of its gear: the mesh order', minimum=1,
+                  **FIXED),
         Parameter(f'{shaft}.harmonics', [1.0, 0.5, 0.25], 'peak amplitudes of the mesh order and '
                   'its multiples', minimum=0.0, **FIXED),
-        Parameter(f'{shaft}.sidebands', 0.2, 'relative amplitude one order beside each',
-                  minimum=0.0, **FIXED),
-        Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst of a chipped tooth, '
-                  'once a revolution'),
+        Parameter(f'{shaft}.sidebands', 0.2, 'amplitude of the sidebands one order beside each '
+                  'multiple, relative to it', minimum=0.0, **FIXED),
+        Parameter(f'{shaft}.chipped_tooth', 0.0, 'amplitude of the burst that a chipped tooth '
+                  'causes once per revolution'),
     )
 
 
@@ -106,7 +116,7 @@ def effects_of(values: Values) -> tuple[Effect, ...]:
 
 
 def machine_of(values: Values) -> Gearbox:
-    """Gearbox that the parameters describe; raises `ParameterError`."""
+    """Return the gearbox that the parameters describe; raises `ParameterError`."""
     gains, seed, profile = values['channel_gains'], values['seed'], values['speed_profile']
     if len(profile) % 2:
         raise ParameterError(f'speed_profile has {len(profile)} numbers: give pairs of time and '
@@ -142,7 +152,7 @@ def machine_of(values: Values) -> Gearbox:
 
 
 class MachineSimulator(PlaybackNode):
-    """Publishes a simulated gearbox's vibration and keyphasor; `machine` is its truth."""
+    """Publishes vibration and keyphasor of the simulated gearbox `machine`."""
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('machine_simulator', PARAMETERS, **node_kwargs)
@@ -163,19 +173,19 @@ class MachineSimulator(PlaybackNode):
                    pulses=self._pulses, waveform=self._with_waveform)
 
     def check(self, values: Values) -> None:
-        """Raise ParameterError if no machine can be like that."""
+        """Raise ParameterError for parameters that no machine can have."""
         machine_of(values)
 
     def apply(self, values: Values) -> None:
-        """Go on with a machine that has changed."""
-        idle = ('playing', 'rate')
-        if any(values[key] != self._values[key] for key in values if key not in idle):
+        """Apply changed values; the signals of the changed machine continue those before."""
+        if any(values[key] != self._values[key] for key in values
+               if key not in ('playing', 'rate')):
             self.machine = machine_of(values)
         self._values = values
         super().apply(values)
 
     def portions(self) -> Iterator[Portion]:
-        """Return the machine's signals from where they were left, for `duration` if it is set."""
+        """Return signals that continue those sent before, for `duration` if it is set."""
         first = self._done
         blocks = (range(first, first + self._samples, self._block) if self._samples
                   else count(first, self._block))
@@ -201,7 +211,7 @@ class MachineSimulator(PlaybackNode):
         return Portion((stop - start) / rate, (vibration,), waveform, origin + pulses)
 
     def progress(self, sent: float) -> str:
-        """Say how much machine time was simulated."""
+        """Return how much machine time was simulated."""
         total = f' of {self._samples / self.machine.sample_rate:.1f}' if self._samples else ''
         return f'{sent:.1f}{total} s sent'
 

@@ -1,10 +1,10 @@
 """
 The parameters of a node: declared to ROS, read, and checked when they change.
 
-A node lists its parameters as `Parameter`. `ParameterSet` declares them (a float takes an integer,
-a float list an integer list, from `-p`, YAML and services) and warns of overrides that match none.
-It gives the whole new configuration to `check` before a change, which raises a `SaJitterError` to
-refuse it with a reason, and to `apply` after it.
+A node lists its parameters as `Parameter`. `ParameterSet` declares them (a float accepts an
+integer, a list of floats a list of integers, from `-p`, YAML and services) and warns of overrides
+that match none. Before a change it calls `check` with all new values, which raises a
+`SaJitterError` to refuse the change; after the change it calls `apply`.
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ def descriptor_of(item: Parameter) -> ParameterDescriptor:
         limits.append(f'one of {", ".join(item.choices)}')
     if item.above is not None:
         limits.append(f'more than {item.above}')
-    # Typing is dynamic so that an integer can reach a float and be converted.
+    # With dynamic typing ROS passes an integer on to `_convert`, which makes it a float.
     descriptor = ParameterDescriptor(
         description=text, read_only=item.read_only, dynamic_typing=True,
         additional_constraints='; '.join(limits))
@@ -47,7 +47,7 @@ def descriptor_of(item: Parameter) -> ParameterDescriptor:
 
 
 def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.parameter.Parameter:
-    """ROS parameter of a value; an empty list becomes a list of `element`."""
+    """Return the ROS parameter of a value; an empty list becomes a list of `element`."""
     if isinstance(value, list) and not value:
         kinds = {float: rclpy.Parameter.Type.DOUBLE_ARRAY, int: rclpy.Parameter.Type.INTEGER_ARRAY,
                  str: rclpy.Parameter.Type.STRING_ARRAY}
@@ -58,11 +58,12 @@ def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.para
 def require_node_name(parameter: str, name: str) -> None:
     """Raise `ParameterError` unless a node can have the name, with or without namespace."""
     if not re.fullmatch(r'/?([A-Za-z_]\w*/)*[A-Za-z_]\w*', name, re.ASCII) or '__' in name:
-        raise ParameterError(f'{parameter} is {name!r}: give the name of a node')
+        raise ParameterError(f'{parameter} is {name!r}: give the name of a node, with or without '
+                             'its namespace')
 
 
 class ParameterSet:
-    """The declared parameters of one node, as a dictionary of converted values."""
+    """The parameters of one node, with converted values."""
 
     def __init__(self, node: Node, specifications: Sequence[Parameter]) -> None:
         self._node = node
@@ -72,34 +73,34 @@ class ParameterSet:
         self.declare(specifications)
 
     def declare(self, specifications: Sequence[Parameter]) -> None:
-        """Declare; raises `ParameterError` for an override of wrong type or range."""
+        """Declare parameters; raises `ParameterError` for a value of wrong type or range."""
         for item in specifications:
             value = item.convert(self._node._parameter_overrides[item.name].value
                                  if item.name in self.given else item.default)
             self._node.declare_parameter(
                 item.name, value, descriptor_of(item), ignore_override=True)
-            if value == [] and not item.read_only:  # rclpy takes an empty list for bytes
+            if value == [] and not item.read_only:  # rclpy declares an empty list as bytes
                 self._node.set_parameters([as_ros_parameter(item.name, value, item.kind)])
             self._specifications[item.name] = item
 
     @property
     def given(self) -> frozenset[str]:
-        """Names that the user gave at the start, even those of defaults and of no parameter."""
+        """Names that the user gave at the start, also those that match no parameter."""
         return frozenset(name for name, override in self._node._parameter_overrides.items()
                          if override.value is not None)
 
     def values(self) -> Values:
-        """Every parameter's converted value."""
+        """Return the converted values of all parameters by name."""
         return {name: item.convert(self._node.get_parameter(name).value)
                 for name, item in self._specifications.items()}
 
     def watch(self, *, check: Callable[[Values], object],
               apply: Callable[[Values], None]) -> None:
         """
-        Start handling changes; call once all parameters are declared.
+        Handle changes from now on; call it when all parameters are declared.
 
-        `check` gets all values with the change and may raise `SaJitterError`; `apply` gets them
-        after the change.
+        Both functions get all values. `check` is called before a change and refuses it by a
+        `SaJitterError`; `apply` is called after the change.
         """
         self._check, self._apply = check, apply
         self._node.add_pre_set_parameters_callback(self._convert)
@@ -108,11 +109,11 @@ class ParameterSet:
         for name in sorted(set(self._node._parameter_overrides) - set(self._specifications)):
             if not name.startswith(('qos_overrides.', 'use_sim_time', 'start_type_')):
                 self._node.get_logger().warning(
-                    f'parameter {name} matches nothing that this node declares: ignored')
+                    f'parameter {name} is ignored: this node has no parameter of that name')
 
     def _convert(self, parameters: list[rclpy.parameter.Parameter]
                  ) -> list[rclpy.parameter.Parameter]:
-        """Turn integers into the floats they stand for; leave what is wrong to `_validate`."""
+        """Convert integers to floats; `_validate` refuses what cannot be converted."""
         converted = []
         for parameter in parameters:
             item = self._specifications.get(parameter.name)

@@ -1,4 +1,4 @@
-"""What the player and the simulator share: sending a stream at a steady pace, start and stop."""
+"""Common base of player and simulator: sends a stream at a given rate, starts and stops."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_samples, encode_samples_float32, known_type, SAMPLE_TYPES)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, Values
-from sa_jitter_ros.nodes.pulse_output import PulseOutput, TACH_TYPE
+from sa_jitter_ros.nodes.signals import PulseOutput, TACH_TYPE
 from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.samples import SampleBlock
 from std_msgs.msg import Float64MultiArray
@@ -22,22 +22,22 @@ FloatArray = NDArray[np.float64]
 
 MAX_MESSAGE_BYTES = 300_000
 TRANSPORT_BYTES_PER_SECOND = 100e6
-PATIENCE = 0.5  # s of lag after which the pace is no longer made up for
+MAX_LAG = 0.5  # s; a stream that lags more continues from now instead of catching up
 PROGRESS_PERIOD = 5.0  # s between log lines on progress
 
 PLAYBACK_PARAMETERS = (
-    Parameter('rate', 1.0, 'speed of playing as a multiple of real time', above=0.0,
+    Parameter('rate', 1.0, 'rate of playing, as a multiple of real time', above=0.0,
               maximum=1000.0),
-    Parameter('playing', True, 'set false to stop, true to go on'),
-    Parameter('block_seconds', 0.05, 'machine time in a message; messages stay below 300 kB',
-              unit='s', minimum=0.001, maximum=1.0, read_only=True),
-    Parameter('wait_seconds', 3.0, 'how long to wait for subscribers before starting', unit='s',
-              minimum=0.0, maximum=60.0, read_only=True),
+    Parameter('playing', True, 'set false to pause, true to continue'),
+    Parameter('block_seconds', 0.05, 'machine time in a message; less if the message would exceed '
+              '300 kB', unit='s', minimum=0.001, maximum=1.0, read_only=True),
+    Parameter('wait_seconds', 3.0, 'longest time to wait for subscribers before the start',
+              unit='s', minimum=0.0, maximum=60.0, read_only=True),
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
               'tach_waveform: std_msgs/Float64MultiArray or std_msgs/Float32MultiArray',
               read_only=True),
     TACH_TYPE,
-    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses',
+    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the published pulses',
               read_only=True),
 )
 _WRITTEN_TYPES = {name: SAMPLE_TYPES[name] for name in SAMPLE_TYPES if 'MultiArray' in name}
@@ -45,7 +45,7 @@ _WRITTEN_TYPES = {name: SAMPLE_TYPES[name] for name in SAMPLE_TYPES if 'MultiArr
 
 @dataclass(frozen=True)
 class Portion:
-    """A stretch of a stream: what is to be published, and how much machine time (s) it is."""
+    """Part of a stream: what to publish, and how much machine time (s) it contains."""
 
     seconds: float
     vibration: tuple[SampleBlock, ...]
@@ -54,7 +54,7 @@ class Portion:
 
 
 class Pacer:
-    """Machine time that is due by the steady clock, at a rate that can change, with pauses."""
+    """Calculates how much machine time should have been sent, with pauses and changing rates."""
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
@@ -66,17 +66,17 @@ class Pacer:
         return self._due + (0.0 if self._since is None else (now - self._since) * self.rate)
 
     def run(self, now: float, *, rate: float, running: bool) -> None:
-        """Go on at a rate from `now`, or pause."""
+        """Continue at a rate from `now`, or pause."""
         self._due = self.due(now)
         self.rate, self._since = rate, now if running else None
 
-    def forgive(self, lag: float) -> None:
-        """Give up on `lag` seconds of machine time that were not sent in time."""
+    def skip(self, lag: float) -> None:
+        """Reduce the machine time that is due by `lag` seconds."""
         self._due -= lag
 
 
 class PlaybackNode(MonitoringNode):
-    """Publishes the portions of a stream at a pace; a subclass gives them by `portions`."""
+    """Publishes a stream at a given rate; a subclass yields its parts in `portions`."""
 
     def __init__(self, name: str, parameters: tuple[Parameter, ...], **node_kwargs: Any) -> None:
         super().__init__(name, PLAYBACK_PARAMETERS + parameters, **node_kwargs)
@@ -91,16 +91,16 @@ class PlaybackNode(MonitoringNode):
         self._waveform: Any = None
         self._pacer = Pacer(values['rate'])
         self._playing, self._started = values['playing'], False
-        self._born, self._rest = time.monotonic(), 0.0
+        self._created, self._idle_until = time.monotonic(), 0.0
         self._wait = values['wait_seconds']
         self._sent = 0.0
         self._progress_time = -math.inf
         self._stream: Iterator[Portion] | None = None
 
-    # --- what a subclass does ---
+    # --- methods of a subclass ---
 
     def portions(self) -> Iterator[Portion]:
-        """Return the next pass through the stream, its times and indices going on."""
+        """Return the next pass through the stream; times and indices continue."""
         raise NotImplementedError
 
     def again(self) -> bool:
@@ -108,7 +108,7 @@ class PlaybackNode(MonitoringNode):
         return False
 
     def progress(self, sent: float) -> str:
-        """Say how far `sent` seconds of machine time are."""
+        """Return the progress after `sent` seconds of machine time, as a text."""
         return f'{sent:.1f} s sent'
 
     # --- starting ---
@@ -121,7 +121,7 @@ class PlaybackNode(MonitoringNode):
 
     def begin(self, *, portion_seconds: float, portion_bytes: int, pulses: bool,
               waveform: bool) -> None:
-        """Make the keyphasor's publishers and start the timer; call last in `__init__`."""
+        """Create the publishers of the keyphasor and start; call it at the end of `__init__`."""
         if pulses:
             self._tach_pulse = PulseOutput(self, self._tach_type)
         if waveform:
@@ -132,12 +132,12 @@ class PlaybackNode(MonitoringNode):
         self.parameters.watch(check=self.check, apply=self.apply)
 
     def check(self, values: Values) -> None:
-        """Raise SaJitterError if the node could not run with these values."""
+        """Raise SaJitterError for values with which the node cannot run."""
 
     def apply(self, values: Values) -> None:
-        """Take over values that changed."""
+        """Apply changed values."""
         if values['playing'] and not self._playing and self._stream is None:
-            self._stream = self.portions()  # it had ended: play it again
+            self._stream = self.portions()  # the stream has ended: play it again
             self.faults.pop('stream', None)
         self._playing = values['playing']
         self._timer.timer_period_ns = round(self._period(values['rate']) * 1e9)
@@ -151,7 +151,7 @@ class PlaybackNode(MonitoringNode):
 
     def _tick(self) -> None:
         now = time.monotonic()
-        if not self._playing or now < self._rest or not (self._started or self._may_start()):
+        if not self._playing or now < self._idle_until or not (self._started or self._may_start()):
             return
         due = self._pacer.due(now)
         period = self._period(self._pacer.rate)
@@ -167,21 +167,22 @@ class PlaybackNode(MonitoringNode):
             self._end()
             return
         lag = due - self._sent
-        if self._playing and lag > PATIENCE * self._pacer.rate + 2 * self._portion_seconds:
-            self._pacer.forgive(lag)
-            self.warn(f'cannot send at {self._pacer.rate:g} x real time: slower than asked')
-        # Who shares the executor gets as much of its time.
+        if self._playing and lag > MAX_LAG * self._pacer.rate + 2 * self._portion_seconds:
+            self._pacer.skip(lag)
+            self.warn(f'this computer cannot send at {self._pacer.rate:g} x real time: the '
+                      'signals are sent more slowly')
+        # Other nodes in this executor get at least half of its time.
         ended = time.monotonic()
-        self._rest = ended + (ended - now)
+        self._idle_until = ended + (ended - now)
         self._log_progress()
 
     def _may_start(self) -> bool:
-        """Start once the outputs that matter have subscribers, or after the waiting time."""
+        """Start when vibration and keyphasor have subscribers, or after `wait_seconds`."""
         tach = [] if self._tach_pulse is None else [self._tach_pulse.subscribers]
         tach += [] if self._waveform is None else [self._waveform.get_subscription_count()]
-        heard = self._vibration.get_subscription_count() > 0 and (not tach or any(tach))
+        subscribed = self._vibration.get_subscription_count() > 0 and (not tach or any(tach))
         now = time.monotonic()
-        self._started = heard or now - self._born >= self._wait
+        self._started = subscribed or now - self._created >= self._wait
         if self._started:
             self._pacer.run(now, rate=self._pacer.rate, running=True)
         return self._started
@@ -222,8 +223,8 @@ class PlaybackNode(MonitoringNode):
             self.get_logger().info(self.progress(self._sent))
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say what is going on and how far it is."""
-        state = ('ended' if self._stream is None else 'stopped' if not self._playing
+        """Return state and progress, and how much was sent."""
+        state = ('ended' if self._stream is None else 'paused' if not self._playing
                  else 'playing' if self._started else 'waiting for subscribers')
         return f'{state}, {self.progress(self._sent)}', {
             'seconds_sent': f'{self._sent:.3f}', 'pulses_sent': str(self._pulses_sent())}

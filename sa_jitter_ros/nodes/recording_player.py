@@ -1,4 +1,4 @@
-"""Node `recording_player`: a recording as the topics it was measured on."""
+"""Node `recording_player`: publishes a recording as if it were measured now."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,37 +16,39 @@ FloatArray = NDArray[np.float64]
 
 PARAMETERS = (
     Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
-    Parameter('loop', False, 'start again at the end, times and indices going on'),
-    Parameter('tach', 'auto', 'keyphasor to play: the first of pulses, waveform and reference '
-              'pulses that there is (auto), or one of them, or pulses and waveform both',
+    Parameter('loop', False, 'start again at the end; times and indices continue'),
+    Parameter('tach', 'auto', 'keyphasor to play: pulses, waveform, reference (pulses of the '
+              'reference keyphasor), both (pulses and waveform), none, or auto: the first of '
+              'pulses, waveform and reference in the file',
               choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'),
               read_only=True),
-    Parameter('keyphasor_rate', 0.0, 'clock to which pulse times are rounded up, as if the '
-              'keyphasor had been sampled; 0 for times as recorded', unit='Hz', minimum=0.0,
+    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate, as if the '
+              'keyphasor had been sampled with it; 0: times as recorded', unit='Hz', minimum=0.0,
               read_only=True),
-    Parameter('recorded_keyphasor', '', 'which keyphasor to play, of a bag that holds several; '
-              'empty for the first', read_only=True),
-    Parameter('acquisition', 0, 'which acquisition, of a file that holds several', minimum=0,
-              read_only=True),
-    Parameter('sample_rate', 0.0, 'sampling rate where the file does not say it, else 0',
+    Parameter('recorded_keyphasor', '', 'keyphasor to play, of a bag that contains several; '
+              'empty: the first', read_only=True),
+    Parameter('acquisition', 0, 'number of the acquisition to play, of a file that contains '
+              'several', minimum=0, read_only=True),
+    Parameter('sample_rate', 0.0, 'sampling rate of the vibration if the file does not contain it',
               unit='Hz', minimum=0.0, read_only=True),
-    Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic; '
-              'empty for all but the tach', element=str, read_only=True),
-    Parameter('tach_channel', '', 'name or number of the channel that is the tach waveform',
+    Parameter('vibration_channels', [], 'names or numbers of the vibration channels, or /topic of '
+              'a bag; empty: all channels except the tach waveform', element=str, read_only=True),
+    Parameter('tach_channel', '', 'name or number of the channel with the tach waveform',
               read_only=True),
-    Parameter('time_column', '', 'column of a .csv with the times', read_only=True),
+    Parameter('time_column', '', 'name or number of the column of a .csv with the times',
+              read_only=True),
 )
 
 
 class RecordingPlayer(PlaybackNode):
-    """Publishes a recording's vibration and keyphasor."""
+    """Publishes the vibration and the keyphasor of a recording."""
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('recording_player', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
         if not values['recording']:
-            raise ParameterError("recording is '': give a file, as in --ros-args -p "
-                                 'recording:=rig.npz')
+            raise ParameterError('no recording is given: set the parameter recording to a file, '
+                                 'as in --ros-args -p recording:=rig.npz')
         self._recording = recording = read(
             values['recording'], keyphasor=values['recorded_keyphasor'],
             sample_rate=values['sample_rate'] or None, **{name: values[name] for name in (
@@ -58,7 +60,8 @@ class RecordingPlayer(PlaybackNode):
             self._pulse_times = (np.ceil(self._pulse_times * values['keyphasor_rate'])
                                  / values['keyphasor_rate'])
         if self._pulse_times is None and not self._with_waveform:
-            self.get_logger().warning('plays vibration only: no keyphasor')
+            self.get_logger().warning('only vibration is played: the recording has no keyphasor, '
+                                      'or tach is none')
         self._passes = 0
         self._block = self.block_samples(recording.sample_rate, recording.channels)
         self.begin(portion_seconds=self._block / recording.sample_rate,
@@ -69,7 +72,7 @@ class RecordingPlayer(PlaybackNode):
             f'Hz, {recording.duration:.3f} s')
 
     def portions(self) -> Iterator[Portion]:
-        """Return one pass through the recording, times and indices going on from the last."""
+        """Return one pass through the recording; times and indices continue those of the last."""
         number, self._passes = self._passes, self._passes + 1
         return passage(self._recording, self._pulse_times, self._with_waveform, self._block,
                        number, self.counts)
@@ -79,7 +82,7 @@ class RecordingPlayer(PlaybackNode):
         return bool(self.parameters.values()['loop'])
 
     def progress(self, sent: float) -> str:
-        """Say how far the recording is."""
+        """Return how much of the recording was sent."""
         total = self._recording.duration
         passed = sent - (self._passes - 1) * total
         loops = f', pass {self._passes}' if self._passes > 1 else ''
@@ -95,7 +98,8 @@ def keyphasor_of(recording: Recording, tach: str) -> tuple[FloatArray | None, bo
     for name in wanted:
         if not offers[name]:
             found = ', '.join(item for item in offers if offers[item]) or 'no keyphasor'
-            raise ParameterError(f'tach is {tach!r}, but the recording has {found}: choose auto')
+            raise ParameterError(f'tach is {tach!r}, but the recording contains {found}: set '
+                                 'tach to auto')
     pulses = (recording.reference_pulse_times if 'reference' in wanted
               else recording.pulse_times if 'pulses' in wanted else None)
     return pulses, 'waveform' in wanted
@@ -106,7 +110,7 @@ def passage(recording: Recording, pulse_times: FloatArray | None, with_waveform:
     """
     Iterate over pass `number` of a recording.
 
-    Samples that are NaN are left out and counted in `counts`; so are pulses beyond the vibration.
+    `counts` counts what is not played: samples that are NaN, and pulses after the last sample.
     """
     rate, origin = recording.sample_rate, recording.start_time
     first = number * recording.samples
@@ -115,7 +119,7 @@ def passage(recording: Recording, pulse_times: FloatArray | None, with_waveform:
     # The first pass also sends the pulses before the first sample.
     start_time = -np.inf if number == 0 else origin
     tach_rate = (recording.tach_rate or rate) if with_waveform else rate
-    waveform = _Taken(recording.tach_blocks() if with_waveform else iter(()))
+    waveform = _SampleQueue(recording.tach_blocks() if with_waveform else iter(()))
     tach_first = round(shift * tach_rate)
     done = 0
     for block in recording.blocks(block_samples):
@@ -135,8 +139,8 @@ def passage(recording: Recording, pulse_times: FloatArray | None, with_waveform:
     counts['pulses_dropped'] += int(np.count_nonzero(pulses >= start_time))
 
 
-class _Taken:
-    """Takes stretches of any length from a row of blocks."""
+class _SampleQueue:
+    """Samples of successive blocks, taken in parts of any length."""
 
     def __init__(self, blocks: Iterator[FloatArray]) -> None:
         self._blocks = blocks

@@ -1,4 +1,4 @@
-"""Node `residual_analyser`: measured against predicted attenuation, and what the model lacks."""
+"""Node `residual_analyser`: compares measured with predicted attenuation and finds its cause."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -32,23 +32,23 @@ from std_msgs.msg import Float64MultiArray, String
 
 PARAMETERS = (
     Parameter('shaft', 'shaft', 'shaft whose averages are compared', read_only=True),
-    Parameter('predictor', 'jitter_predictor', 'node that predicts, and whose effects are set',
-              read_only=True),
-    Parameter('acquisitions', 20, 'averages in a batch; at least 4 to find a missing effect',
-              minimum=2, maximum=10000),
-    Parameter('close_loop', False, "set the predictor's effect parameters to what was found"),
+    Parameter('predictor', 'jitter_predictor', 'node whose predictions are compared, and whose '
+              'effects are set', read_only=True),
+    Parameter('acquisitions', 20, 'averages that are compared at once; at least 4 to find a '
+              'missing effect', minimum=2, maximum=10000),
+    Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
 )
-_TICK = 0.1  # s between looks at what has come
-_PATIENCE = 3.0  # s to look for the predictor
-_ANSWER = 15.0  # s to wait for its answer: it predicts anew first
+_PERIOD = 0.1  # s between the steps of the loop
+_FIND_TIMEOUT = 3.0  # s to find the predictor
+_ANSWER_TIMEOUT = 15.0  # s for its answer, which comes after a new prediction
 
 
 class ResidualAnalyser(MonitoringNode):
     """
-    Publishes `residual` for every batch of averages and `missing_effect` once it is traced.
+    Publishes `residual` for every batch of averages, and `missing_effect` after its trace.
 
-    The trace runs beside the executor. With `close_loop` the effects that it finds become the
-    predictor's, and the next batch waits for the prediction that holds them.
+    The trace runs in a thread beside the executor. With `close_loop` the effects that it finds are
+    set in the predictor; the next batch waits for the prediction with these effects.
     """
 
     def __init__(self, **node_kwargs: Any) -> None:
@@ -60,9 +60,9 @@ class ResidualAnalyser(MonitoringNode):
         self._pulses: dict[float, NDArray[np.float64]] = {}
         self._prediction: Published | None = None
         self._significant = self._waited = False
-        self._step: Callable[[], None] = self._judge
-        self._added: set[str] = set()
-        self._verdict = self._doing = ''
+        self._step: Callable[[], None] = self._compare
+        self._added: set[str] = set()  # names of the effects that were set in the predictor
+        self._verdict = self._activity = ''
         self._batches = self._uncorrected = 0
         self._predictor_name = self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
@@ -74,7 +74,7 @@ class ResidualAnalyser(MonitoringNode):
         # A predictor of several shafts publishes one prediction for each.
         for topic in ('prediction', f'{shaft}/prediction'):
             self.create_input(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
-        self.create_steady_timer(_TICK, lambda: self._step())
+        self.create_steady_timer(_PERIOD, lambda: self._step())
         self.parameters.watch(check=lambda values: None, apply=self._apply)
 
     def _apply(self, values: Values) -> None:
@@ -90,16 +90,16 @@ class ResidualAnalyser(MonitoringNode):
         else:
             self._uncorrected += 1
             self.warn(
-                'order_amplitude without corrected amplitudes: set correct_jitter: true of the '
-                'averager, and see in its diagnostics whether it refuses; or give it a better '
-                'keyphasor')
+                'order_amplitude has no corrected amplitudes, so that nothing is compared: set '
+                'correct_jitter: true in the averager; if the averager refuses the correction '
+                '(see its diagnostics), use a better keyphasor')
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)
         count, cycles = len(received.values), received.header.trigger_cycles
         if count != cycles + 1 or not np.isfinite(received.values).all():
-            raise MessageError(f'{count} pulses of {cycles} trigger cycles: send one more than '
-                               'there are cycles, of finite numbers')
+            raise MessageError(f'{count} pulses for {cycles} trigger cycles: send finite numbers, '
+                               'for one pulse more than cycles')
         self._pulses[received.header.start_time] = received.values
         while len(self._pulses) > 2 * self._batch.size + 10:
             del self._pulses[next(iter(self._pulses))]
@@ -116,17 +116,17 @@ class ResidualAnalyser(MonitoringNode):
             received.keyphasor_rate, received.trigger_cycles, received.ratio,
             received.pulse_error_standard_deviation)
 
-    # --- the loop: `_step` is what comes next, looked at in every tick ---
+    # --- the loop: the timer calls `_step`, the next step to try ---
 
-    def _judge(self) -> None:
-        """Compare a full batch with the prediction, then ask the predictor what it declares."""
-        self._doing = ''
+    def _compare(self) -> None:
+        """Compare a full batch with the prediction, then ask the predictor for its parameters."""
+        self._activity = ''
         if not self._batch.full or self._prediction is None:
             return
         averages = [replace(item, pulses=self._pulses.get(item.start_time))
                     for item in self._batch.averages]
         if averages[-1].pulses is None and not self._waited:
-            self._waited = True  # its pulse errors are published after it
+            self._waited = True  # the pulse errors of an average are published after it
             return
         self._waited = False
         try:
@@ -143,10 +143,11 @@ class ResidualAnalyser(MonitoringNode):
         self._ask(averages, self._prediction)
 
     def _ask(self, averages: Sequence[ReceivedAverage], prediction: Published) -> None:
-        """Get what the predictor declares; without an answer, what its prediction tells of it."""
+        """Trace with the predictor's declared model, or with one made of its prediction."""
         def without() -> None:
-            self.warn(f'{self._predictor_name} does not answer: its prediction is taken for that '
-                      'of independent jitter without effects; start it, or set predictor')
+            self.warn(f'{self._predictor_name} does not answer: independent jitter without '
+                      'effects is assumed; start the node, or set the parameter predictor to its '
+                      'name')
             self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
 
         def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
@@ -156,7 +157,7 @@ class ResidualAnalyser(MonitoringNode):
                     if others:
                         ask(*others)
                     else:
-                        without()  # it is the name of another node
+                        without()  # the node is no predictor
                     return
                 model, effects = self._declared(parameters, response)
                 self._trace(lambda: trace_averages(averages, model, declared=effects))
@@ -168,11 +169,11 @@ class ResidualAnalyser(MonitoringNode):
 
     def _declared(self, parameters: Sequence[Parameter], response: Any
                   ) -> tuple[DeclaredModel, tuple[Effect, ...]]:
-        """Return the predictor's model and its effects, less those that were set here."""
+        """Return the predictor's model and its effects, except those that were set here."""
         values: Values = {}
         for item, value in zip(parameters, response.values):
-            known = parameter_value_to_python(value)
-            values[item.name] = list(known) if item.is_list else known
+            converted = parameter_value_to_python(value)
+            values[item.name] = list(converted) if item.is_list else converted
         values[SHAFTS.name] = [self._values['shaft']]
         self._added = {name for name in self._added if values[f'effects.{name}.enabled']}
         values.update({f'effects.{name}.enabled': False for name in self._added})
@@ -180,76 +181,78 @@ class ResidualAnalyser(MonitoringNode):
         return declaration.model, declaration.effects
 
     def _trace(self, work: Callable[[], Trace]) -> None:
-        """Trace in a thread, so that the executor goes on."""
+        """Trace in a thread, so that the executor is not blocked."""
         job = _Job(work)
+        self._activity = 'tracing'
 
         def look() -> None:
             if job.thread.is_alive():
-                self._doing = 'tracing'
                 return
-            self._step = self._judge
+            self._step = self._compare
             if job.result is not None:
-                self._tell(job.result)
+                self._publish_trace(job.result)
             else:
-                self.warn(f'not traced: {job.error}')
+                self.warn(f'the cause of the residual could not be searched: {job.error}')
         self._step = look
 
-    def _tell(self, trace: Trace) -> None:
-        """Publish what was found and, where asked for, hand it to the predictor."""
+    def _publish_trace(self, trace: Trace) -> None:
+        """Publish the trace; with `close_loop`, set its effects in the predictor."""
         content = report(trace)
         self._verdict = content['verdict']
         self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
         found = {item.name: item.effect.values for item in trace.findings
                  if item.effect is not None}
-        news = (found or self._added) if self._significant else (found and not self._added)
-        if self._values['close_loop'] and news:
-            self._close(found)
+        changed = (found or self._added) if self._significant else (found and not self._added)
+        if self._values['close_loop'] and changed:
+            self._set_effects(found)
 
-    def _close(self, found: Mapping[str, Mapping[str, Any]]) -> None:
-        """Set the predictor's effects and wait for the prediction that holds them."""
+    def _set_effects(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Set the predictor's effects and wait for the prediction with them."""
         wanted: dict[str, Any] = {
             f'effects.{name}.enabled': False for name in self._added - found.keys()}
         for name, parameters in found.items():
             wanted[f'effects.{name}.enabled'] = True
             wanted.update({f'effects.{name}.{key}': list(value) if isinstance(value, tuple)
                            else value for key, value in parameters.items()})
-        judged = self._prediction
+        before = self._prediction
 
         def wait() -> None:
-            self._doing = 'waiting for the prediction that holds the effects'
-            if self._prediction is not judged:
-                self._step = self._judge
+            self._activity = 'waiting for the prediction with the effects'
+            if self._prediction is not before:
+                self._step = self._compare
 
         def answered(response: Any) -> None:
             if response.result.successful:
                 self._added, self._step = set(found), wait
             else:
                 self.warn(f'{self._predictor_name} refuses the effects: {response.result.reason}')
-                self._step = self._judge
+                self._step = self._compare
 
         def without() -> None:
-            self.warn(f'{self._predictor_name} does not answer: its effects cannot be set')
-            self._step = self._judge
+            self.warn(f'{self._predictor_name} does not answer: its effects cannot be set; start '
+                      'the node, or set the parameter predictor to its name')
+            self._step = self._compare
         changes = [as_ros_parameter(name, value) for name, value in wanted.items()]
         self._request(lambda: self._predictor.set_parameters_atomically(changes),
                       answered, without)
 
     def _request(self, call: Callable[[], Future], answered: Callable[[Any], None],
                  without: Callable[[], None]) -> None:
-        """Ask the predictor and go on with its answer, or without one when patience ends."""
-        end = time.monotonic() + _PATIENCE
+        """Call a service of the predictor, then `answered`, or `without` after a timeout."""
+        end = time.monotonic() + _FIND_TIMEOUT
         future: Future | None = None
+        self._activity = f'waiting for {self._predictor_name}'
 
         def look() -> None:
             nonlocal future, end
             if future is None and self._predictor.services_are_ready():
-                future, end = call(), time.monotonic() + _ANSWER
+                future, end = call(), time.monotonic() + _ANSWER_TIMEOUT
             elif future is not None and future.done():
                 try:
                     answered(future.result())
                 except SaJitterError as error:
                     self.warn(f'{self._predictor_name}: {error}')
-                    self._step = self._judge
+                    self._step = self._compare
             elif time.monotonic() > end:
                 if future is not None:
                     future.cancel()
@@ -259,11 +262,11 @@ class ResidualAnalyser(MonitoringNode):
     # --- diagnostics ---
 
     def update_counts(self) -> None:
-        """Gather the counts of the batches."""
+        """Count the averages that were not used because they overlap."""
         self.counts.update(averages_overlapping=self._batch.overlapping)
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say how far the batch is and what was found last."""
+        """Return the number of averages in the batch and the last verdict."""
         count, size = len(self._batch.averages), self._batch.size
         values = {'averages': str(count), 'batches': str(self._batches), 'verdict': self._verdict,
                   'uncorrected': str(self._uncorrected), 'effects_set': ', '.join(sorted(
@@ -272,13 +275,14 @@ class ResidualAnalyser(MonitoringNode):
             return 'no prediction received yet', values
         if not (count or self._batches or self._uncorrected):
             topic = self.resolve_topic_name(f"{self._values['shaft']}/order_amplitude")
-            return f'nothing received on {topic} yet: shaft must be one of the averager', values
-        doing = self._doing or self._verdict or 'nothing judged yet'
-        return f'{count} of {size} averages; {doing}', values
+            return (f'nothing received on {topic} yet: is the parameter shaft one of the '
+                    'averager?', values)
+        activity = self._activity or self._verdict or 'nothing compared yet'
+        return f'{count} of {size} averages; {activity}', values
 
 
 class _Job:
-    """Work in a daemon thread; there is a `result` or an `error` once it is no longer alive."""
+    """Work in a daemon thread; when it has ended there is a `result` or an `error`."""
 
     def __init__(self, work: Callable[[], Trace]) -> None:
         self.result: Trace | None = None
@@ -292,17 +296,19 @@ class _Job:
             self.result = self._work()
         except SaJitterError as error:
             self.error = str(error)
-        except Exception as error:  # a node outlives what nobody expected
+        except Exception as error:  # a bug in the trace must not stop the node
             self.error = repr(error)
 
 
 def average_of(message: AverageMessage) -> ReceivedAverage:
-    """Return the average that a message of order amplitudes tells; raises MessageError."""
+    """Return the average in a message of order amplitudes; raises MessageError."""
     header, table = message.header, message.values
     if len(table) == 0 or not (
             header.end_time > header.start_time and header.trigger_cycles > 0):
-        raise MessageError(f'{len(table)} channels from {header.start_time} to {header.end_time} '
-                           's: send at least one of an average of some trigger cycles')
+        raise MessageError(
+            f'{len(table)} channels, from {header.start_time} s to {header.end_time} s, '
+            f'{header.trigger_cycles} trigger cycles: send at least one channel and one trigger '
+            'cycle, and an end after the start')
     raw, corrected = (table[..., k] * np.exp(1j * table[..., k + 1]) for k in (1, 3))
     return ReceivedAverage(
         header.start_time, header.end_time, header.trigger_cycles, header.fundamental_cycles,

@@ -13,10 +13,11 @@ from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.averager_parameters import (gear_settings, keyphasor_parameters,
                                                      one_ratio, PARAMETERS, shaft_parameters,
                                                      shaft_settings)
-from sa_jitter_ros.nodes.base import MonitoringNode, run_node, UNCOUNTED
+from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
-                                          PULSE_TYPES, SAMPLE_TYPES, SampleDecoder)
+                                          PULSE_TYPES)
 from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names
 from std_msgs.msg import Float64, Float64MultiArray
 
@@ -41,15 +42,12 @@ class SynchronousAverager(MonitoringNode):
         self._values = values
         self._keyphasor: str | None = values['keyphasor'] or None
         self._other_keyphasors = 0
-        vibration_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
-        tach_type = known_type('tach_type', values['tach_type'], PULSE_TYPES)
-        self._decoder = SampleDecoder(vibration_type, sample_rate=values['sample_rate'],
-                                      start_time=values['start_time'],
-                                      imu_axis=values['imu_axis'])
+        self._samples = SampleInput(self, values)
+        pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
-        self.create_input(SAMPLE_TYPES[vibration_type], 'vibration', self._on_vibration)
-        self.create_input(PULSE_TYPES[tach_type], 'tach_pulse',
-                          self._on_pulse_array if PULSE_TYPES[tach_type] is Float64MultiArray
+        self.create_input(self._samples.message_type, 'vibration', self._on_vibration)
+        self.create_input(pulse_type, 'tach_pulse',
+                          self._on_pulse_array if pulse_type is Float64MultiArray
                           else self._on_pulse_reference)
         self.parameters.watch(check=self._check, apply=self._apply)
 
@@ -85,9 +83,7 @@ class SynchronousAverager(MonitoringNode):
     # --- messages ---
 
     def _on_vibration(self, message: Any) -> None:
-        block = self._decoder.decode(message)
-        if self._decoder.counted and not self._averager.timeline.layout:
-            self.warn(UNCOUNTED)
+        block = self._samples.decode(message)
         try:
             averages = self._averager.add_samples(block)
         except SignalError:
@@ -101,8 +97,8 @@ class SynchronousAverager(MonitoringNode):
             self._keyphasor = source
         if source != self._keyphasor:
             self._other_keyphasors += 1
-            self.warn(f'tach_pulse: pulse of keyphasor {source!r} while {self._keyphasor!r} is '
-                      'used: set the parameter keyphasor')
+            self.warn(f'tach_pulse: pulses of keyphasor {source!r} are ignored, those of '
+                      f'{self._keyphasor!r} are used: set the parameter keyphasor to choose')
             return
         self._publish(self._averager.add_pulses(times))
 
@@ -110,10 +106,10 @@ class SynchronousAverager(MonitoringNode):
         self._publish(self._averager.add_pulses(decode_pulse_array(message)))
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
-        share = keyphasor_parameters(self._values).revolutions_per_trigger
+        revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
         for name, average in averages:
             self._shafts[name].publish(average)
-        speed = self._averager.take_speed() * share
+        speed = self._averager.take_speed() * revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
         for line in self._averager.take_messages():
@@ -122,15 +118,14 @@ class SynchronousAverager(MonitoringNode):
     # --- diagnostics ---
 
     def update_counts(self) -> None:
-        """Gather the counts of the core."""
+        """Collect the counts of the averager."""
         averager = self._averager
-        if self._decoder.counted:
-            self.show_warning(UNCOUNTED)
+        self._samples.show_warning()
         self.counts.update(averager.totals)
         self.counts['pulses_dropped'] += self._other_keyphasors
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say how far the averages are and what the pulses look like."""
+        """Return the number of averages and the counts of the pulse validation."""
         averager = self._averager
         layout = averager.timeline.layout
         published = sum(shaft.published for shaft in self._shafts.values())

@@ -9,53 +9,46 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.nodes.base import MonitoringNode, run_node, UNCOUNTED
-from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES, SampleDecoder
+from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.nodes.pulse_output import PulseOutput, TACH_TYPE
+from sa_jitter_ros.nodes.signals import PulseOutput, sample_parameters, SampleInput, TACH_TYPE
 from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
 
 FloatArray = NDArray[np.float64]
 
-# A window of pulses comes at once when the levels have been learnt. A subscriber queues 200,
-# and it may be busy with an average for a while: they go out little by little.
+# Once the state levels are learnt, the detector finds all pulses of the window. Subscribers
+# queue 200 messages and may be busy with an average: the pulses are published in portions.
 BURST = 10
 BURST_PERIOD = 0.01  # s
 
 PARAMETERS = (
-    Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of tach_waveform',
-              read_only=True),
+    *sample_parameters('tach_waveform'),
     TACH_TYPE,
-    Parameter('sample_rate', 0.0, 'sampling rate where messages carry none, 0 if they do',
-              unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
-    Parameter('start_time', 0.0, 'time of sample 0 where messages carry none', unit='s',
-              read_only=True),
-    Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
-              unit='s', above=0.0, read_only=True),
-    Parameter('imu_axis', 'z', 'axis of linear acceleration taken as the waveform',
+    Parameter('imu_axis', 'z', 'axis of linear acceleration that is the waveform',
               choices=('x', 'y', 'z'), read_only=True),
-    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor, the source of the pulses'),
-    Parameter('automatic_threshold', True, 'learn the threshold from the state levels'),
-    Parameter('threshold', 0.0, 'threshold where it is not automatic [unit of the waveform]'),
+    Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the published pulses'),
+    Parameter('automatic_threshold', True, 'learn the threshold from the state levels (low and '
+              'high) of the waveform'),
+    Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
     Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
-              'difference of the state levels', minimum=0.0, maximum=0.99),
-    Parameter('polarity', 'positive', 'negative where the pulse goes down',
+              'difference between the state levels', minimum=0.0, maximum=0.99),
+    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below',
               choices=('positive', 'negative')),
     Parameter('edge', 'rising', 'edge of the pulse that gives its time',
               choices=('rising', 'falling', 'centre')),
-    Parameter('interpolate', True, 'time between samples; false gives the first sample past the '
-              'threshold'),
-    Parameter('minimum_interval', 0.0, 'pulses closer than this are double', unit='s',
-              minimum=0.0),
-    Parameter('learning_time', 0.5, 'length of the windows in which the state levels are learnt',
+    Parameter('interpolate', True, 'interpolate the time between samples; false: time of the '
+              'first sample past the threshold'),
+    Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
+              unit='s', minimum=0.0),
+    Parameter('learning_time', 0.5, 'length of the windows from which the state levels are learnt',
               unit='s', above=0.0, maximum=60.0),
-    Parameter('minimum_difference', 0.0, 'state levels closer than this are noise [unit of the '
-              'waveform]', minimum=0.0),
+    Parameter('minimum_difference', 0.0, 'state levels closer than this are taken for noise [unit '
+              'of the waveform]', minimum=0.0),
 )
 
 
-# Parameters that are options of the detector as they are, and all that decide what it finds.
+# Parameters that are options of the detector, and all that decide which pulses it finds.
 OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
            'minimum_difference')
 DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
@@ -74,20 +67,17 @@ class TachDetector(MonitoringNode):
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('tach_detector', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
-        waveform_type = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
         self._values, self._keyphasor = values, values['keyphasor']
-        self._decoder = SampleDecoder(waveform_type, sample_rate=values['sample_rate'],
-                                      start_time=values['start_time'],
-                                      imu_axis=values['imu_axis'])
+        self._samples = SampleInput(self, values)
         self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
         self._detector = detector_of(values)
         self._rate = 0.0  # of the run that the detector follows
         self._epoch = 0
-        self._pulses = self._refused = 0
-        self._too_close = self._unused = 0  # of detectors before
+        self._pulses = self._unsendable = 0
+        self._too_close = self._unused = 0  # of earlier detectors
         self._waiting: deque[float] = deque()
         self._output = PulseOutput(self, values['tach_type'])
-        self.create_input(SAMPLE_TYPES[waveform_type], 'tach_waveform', self._on_waveform)
+        self.create_input(self._samples.message_type, 'tach_waveform', self._on_waveform)
         self.create_steady_timer(BURST_PERIOD, self._send_waiting)
         self.parameters.watch(check=detector_of, apply=self._apply)
 
@@ -98,19 +88,17 @@ class TachDetector(MonitoringNode):
         self._values = values
 
     def _begin(self, values: Values) -> None:
-        """Go on with another detector, to which what was learnt does not apply."""
+        """Start another detector, which learns the state levels again."""
         state = self._detector.state
         self._too_close += state.too_close
         self._unused += state.waiting
         self._detector = detector_of(values)
 
     def _on_waveform(self, message: Any) -> None:
-        block = self._decoder.decode(message)
-        if self._decoder.counted and not self._timeline.layout:
-            self.warn(UNCOUNTED)
+        block = self._samples.decode(message)
         try:
             if block.samples.shape[0] != 1:
-                raise SignalError(f'{block.samples.shape[0]} channels: send the one channel of '
+                raise SignalError(f'{block.samples.shape[0]} channels: send only the channel of '
                                   'the keyphasor')
             self._timeline.add(block)
         except SignalError:
@@ -118,7 +106,7 @@ class TachDetector(MonitoringNode):
             raise
         for epoch, samples in self._timeline.take():
             same = math.isclose(samples.sample_rate, self._rate, rel_tol=SAME_RATE)
-            if epoch != self._epoch or not same:  # what was learnt is of another run
+            if epoch != self._epoch or not same:  # the learnt levels are those of another run
                 self._begin(self._values)
                 self._epoch, self._rate = epoch, samples.sample_rate
             self._publish(self._detector.update(
@@ -140,22 +128,21 @@ class TachDetector(MonitoringNode):
         self._send(np.array([self._waiting.popleft() for _ in range(count)]))
 
     def _send(self, times: FloatArray) -> None:
-        self._refused += self._output.publish(times, self._keyphasor)
+        self._unsendable += self._output.publish(times, self._keyphasor)
 
     def update_counts(self) -> None:
-        """Gather the counts of the core."""
-        if self._decoder.counted:
-            self.show_warning(UNCOUNTED)
+        """Collect the counts of timeline and detector."""
+        self._samples.show_warning()
         samples, state = self._timeline.counts, self._detector.state
         self.counts.update(
             samples_dropped=samples.samples_dropped + self._unused,
-            pulses_dropped=self._too_close + state.too_close + self._refused,
+            pulses_dropped=self._too_close + state.too_close + self._unsendable,
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
             samples_lost=samples.samples_lost)
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say how many pulses were found and at which threshold."""
+        """Return the number of pulses found, the state levels and the threshold."""
         state = self._detector.state
         values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
         values['pulses'] = str(self._pulses)

@@ -1,0 +1,101 @@
+"""Sampled signals in and tach pulses out, in the message types that the user chose."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
+from sa_jitter_ros.nodes.messages import (
+    encode_pulse_array, encode_pulse_reference, known_type, PULSE_TYPES, SAMPLE_TYPES,
+    SampleDecoder)
+from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.samples import SampleBlock
+from sensor_msgs.msg import TimeReference
+
+NO_HEADER = ('messages have no header: sample times are counted from start_time, and lost samples '
+             'are not detected; send time, sampling rate and index of the first sample')
+TACH_TYPE = Parameter(
+    'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse: '
+    'sensor_msgs/TimeReference, or std_msgs/Float64MultiArray for more than a few hundred pulses '
+    'per second', read_only=True)
+
+
+def sample_parameters(topic: str) -> tuple[Parameter, ...]:
+    """Return the parameters of the node whose input of samples is `topic`."""
+    return (
+        Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
+                  read_only=True),
+        Parameter('sample_rate', 0.0, f'sampling rate of {topic}; 0 if the messages contain it',
+                  unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
+        Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
+                  unit='s', read_only=True),
+        Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
+                  unit='s', above=0.0, read_only=True),
+    )
+
+
+class SampleInput:
+    """Decodes the samples of one topic and warns while they come without a header."""
+
+    def __init__(self, node: MonitoringNode, values: Values) -> None:
+        self._node = node
+        key = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
+        self.message_type = SAMPLE_TYPES[key]
+        self._decoder = SampleDecoder(key, sample_rate=values['sample_rate'],
+                                      start_time=values['start_time'],
+                                      imu_axis=values['imu_axis'])
+        self._warned = False
+
+    def decode(self, message: Any) -> SampleBlock:
+        """Return the samples of a message; raises `MessageError`."""
+        block = self._decoder.decode(message)
+        if self._decoder.counted and not self._warned:
+            self._warned = True
+            self._node.warn(NO_HEADER)
+        return block
+
+    def show_warning(self) -> None:
+        """Repeat the warning in the next diagnostics."""
+        if self._decoder.counted:
+            self._node.show_warning(NO_HEADER)
+
+
+class PulseOutput:
+    """
+    Publisher of pulse times (s) on `tach_pulse`.
+
+    `single` says that each pulse is one message; `published` counts pulses.
+    """
+
+    def __init__(self, node: MonitoringNode, tach_type: str) -> None:
+        kind = PULSE_TYPES[known_type('tach_type', tach_type, PULSE_TYPES)]
+        self._node = node
+        self._publisher = node.create_output(kind, 'tach_pulse', INPUT_QOS)
+        self.single = kind is TimeReference
+        self.published = 0
+
+    @property
+    def subscribers(self) -> int:
+        """Number of subscribers."""
+        return int(self._publisher.get_subscription_count())
+
+    def publish(self, times: NDArray[np.float64], keyphasor: str) -> int:
+        """Publish pulses; warn of those whose time the message cannot hold, and count them."""
+        dropped = 0
+        if not self.single:
+            if times.size:
+                self._publisher.publish(encode_pulse_array(times))
+            self.published += times.size
+            return dropped
+        for time in times.tolist():
+            try:
+                message = encode_pulse_reference(time, keyphasor)
+            except MessageError as error:
+                dropped += 1
+                self._node.warn(f'tach_pulse: {error}')
+            else:
+                self._publisher.publish(message)
+                self.published += 1
+        return dropped
