@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.inference.record_pulses import keyphasor_pulses
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -16,7 +15,7 @@ def with_added_jitter(recording: Recording, distribution: PulseErrorDistribution
 
     Section 5.2 of Camerini et al. 2019.
     """
-    times = keyphasor_pulses(recording)
+    times = recording.keyphasor_pulses(interpolate=False)
     errors = distribution.draw(np.random.default_rng(seed), times.size)
     return replace(recording, pulse_times=np.sort(times + errors), tach=None,
                    reference_pulse_times=times)
@@ -31,6 +30,6 @@ def with_slower_clock(recording: Recording, clock_rate: float) -> Recording:
     if not clock_rate > 0.0:
         raise ModelError(f'clock_rate is {clock_rate} Hz: give a positive rate')
     better = recording.reference_pulse_times
-    times = keyphasor_pulses(recording) if better is None else better
+    times = recording.keyphasor_pulses(interpolate=False) if better is None else better
     return replace(recording, pulse_times=np.ceil(times * clock_rate) / clock_rate, tach=None,
                    tach_rate=clock_rate, reference_pulse_times=times)

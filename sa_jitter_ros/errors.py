@@ -1,7 +1,7 @@
 """
-The errors this package raises on bad input.
+Errors that the package raises for bad input.
 
-Every message says the offending value, the limit it broke and what to do about it.
+Every message states the value, the limit and the remedy.
 """
 
 
@@ -18,7 +18,7 @@ class SignalError(SaJitterError):
 
 
 class MessageError(SaJitterError):
-    """A ROS message whose layout or content does not follow the contract."""
+    """A ROS message whose layout or content is not that of the interface."""
 
 
 class RecordingError(SaJitterError):
@@ -26,7 +26,7 @@ class RecordingError(SaJitterError):
 
 
 class ModelError(SaJitterError):
-    """A declared model, or data offered to it, that does not make sense."""
+    """A declared model that cannot be used, or that the data contradict."""
 
 
 class DataWarning(UserWarning):

@@ -1,4 +1,4 @@
-"""Consecutive samples of one source: what recordings, messages and the averager hand on."""
+"""Blocks of consecutive samples, as recordings, messages and the averager exchange them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,12 @@ from numpy.typing import NDArray
 
 
 def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
-    """Return first and end index of each span of `samples` (channel, sample) that is finite."""
+    """
+    Return first and end index of each span of `samples` (channel, sample) that is finite.
+
+    >>> finite_spans(np.array([[0.0, np.nan, 2.0, 3.0]]))
+    [(0, 1), (2, 4)]
+    """
     every = np.isfinite(samples)
     if every.all():
         return [(0, samples.shape[1])] if samples.size else []
@@ -22,7 +27,11 @@ class SampleBlock:
     Consecutive samples of one source.
 
     `samples` (channel, sample); `start_time` of the first sample in s, `sample_rate` in Hz,
-    `index` of the first sample, which counts on from block to block.
+    `index` of the first sample, counted from block to block.
+
+    >>> block = SampleBlock(np.array([[0.0, np.nan, 2.0, 3.0]]), 5.0, 100.0, 70)
+    >>> [(part.index, part.start_time, part.samples.tolist()) for part in block.finite_parts()]
+    [(70, 5.0, [[0.0]]), (72, 5.02, [[2.0, 3.0]])]
     """
 
     samples: NDArray[np.float64]
@@ -36,7 +45,7 @@ class SampleBlock:
         return self.index + int(self.samples.shape[1])
 
     def finite_parts(self) -> 'tuple[SampleBlock, ...]':
-        """Return the parts without NaN or infinity; between them is a gap of the index."""
+        """Return the parts without NaN and infinity; the index has a gap between them."""
         return tuple(SampleBlock(
             self.samples[:, begin:end], self.start_time + begin / self.sample_rate,
             self.sample_rate, self.index + begin) for begin, end in finite_spans(self.samples))

@@ -1,11 +1,8 @@
 """Running means against numpy, merging, and what noise they leave."""
 
-import doctest
-
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
-from sa_jitter_ros.averaging import running_mean
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import BlockMean, ExponentialMean, SlidingMean
 
@@ -17,10 +14,6 @@ def filled(mean, values):
     for value in values:
         mean.update(np.array([value]))
     return mean
-
-
-def test_examples_in_the_docstring():
-    assert doctest.testmod(running_mean).failed == 0
 
 
 @given(VALUES)

@@ -108,7 +108,7 @@ def test_demo_plays_a_wav_whose_tach_channel_it_is_told(machine, process_environ
     assert re.search(r'^ +23 ', done.stdout, re.MULTILINE), done.stdout
     without = run_demo(process_environment, str(tmp_path / 'rig.wav'))
     assert without.returncode == 2
-    assert 'give --tach-channel' in without.stderr
+    assert '--tach-channel' in without.stderr
 
 
 @pytest.mark.processes

@@ -294,7 +294,7 @@ def test_too_few_acquisitions_and_no_pulses_are_refused():
     with pytest.raises(ModelError, match='at least 4'):
         trace([observe(recording, MODEL)], [recording])
     bare = Recording(recording.vibration, RATE)
-    with pytest.raises(RecordingError, match='needs a keyphasor'):
+    with pytest.raises(RecordingError, match='no keyphasor'):
         record_pulses(bare, MODEL)
 
 

@@ -90,7 +90,7 @@ def test_a_parabola_that_turns_round_is_replaced_by_a_line():
 @pytest.mark.parametrize('name', ANGLE_LAWS)
 @pytest.mark.parametrize('pulses', [[0.0, 0.0], [1.0, 0.5], [0.0, np.nan]])
 def test_pulses_out_of_order_are_refused(name, pulses):
-    with pytest.raises(SignalError, match='do not increase: validate pulses first'):
+    with pytest.raises(SignalError, match='do not increase: remove repeated'):
         cycle_times(angle_law(name), np.array(pulses), 0, U)
 
 

@@ -103,7 +103,7 @@ def test_ends_are_continued_by_point_reflection():
 
 @pytest.mark.parametrize('positions', [[-0.1], [29.01], [np.nan], [3.0, np.inf]])
 def test_positions_outside_are_refused(positions):
-    with pytest.raises(SignalError, match='stay within the samples'):
+    with pytest.raises(SignalError, match='give positions within the samples'):
         interpolate(np.zeros((30, 1)), np.array(positions))
 
 

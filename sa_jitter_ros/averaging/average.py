@@ -1,4 +1,4 @@
-"""The synchronous average: how it is made, and what it is."""
+"""The synchronous average: its parameters, its settings and its result."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -22,14 +22,14 @@ AVERAGING = ('block', 'sliding', 'exponential')
 @dataclass(frozen=True)
 class AverageSettings:
     """
-    How the trigger cycles of one shaft are averaged.
+    Settings of the average of one shaft.
 
     `cycle_length` is r, the fundamental cycles in a trigger cycle, `revolutions_per_trigger` the
     revolutions of the tach shaft in it; `trigger_cycles` is N_t; `orders` are multiples of the
-    shaft; `samples_per_revolution` 0 chooses the waveform's grid. With
-    `correct_jitter` the pulse errors are recovered from the vibration (block averages only);
-    `keyphasor_rate` (Hz) declares how large they may be, 0 for a keyphasor sampled with the
-    vibration. Raises `ParameterError` for values that cannot be used.
+    shaft speed; `samples_per_revolution` 0 chooses the number of points of the waveform. With
+    `correct_jitter` the pulse errors are recovered from the vibration (block averages only). They
+    are expected to be of the size that a keyphasor sampled at `keyphasor_rate` (Hz) causes; 0 is
+    the sampling rate of the vibration. Raises `ParameterError` for values that cannot be used.
     """
 
     cycle_length: float = 1.0
@@ -62,8 +62,8 @@ class AverageSettings:
             raise ParameterError(f'keyphasor_rate is {self.keyphasor_rate} Hz: give a positive '
                                  "rate, or 0 for the vibration's")
         if self.correct_jitter and self.trigger_cycles < 2:
-            raise ParameterError('correct_jitter with trigger_cycles 1: one cycle cannot be '
-                                 'compared with itself; give at least 2')
+            raise ParameterError('correct_jitter with trigger_cycles 1: pulse errors follow from '
+                                 'the difference between cycles; give at least 2')
         for name, value, known in (('averaging', self.averaging, AVERAGING),
                                    ('angle_law', self.angle_law, ANGLE_LAWS),
                                    ('interpolation', self.interpolation, METHODS)):
@@ -74,11 +74,15 @@ class AverageSettings:
 @dataclass(frozen=True, kw_only=True)
 class KeyphasorParameters:
     """
-    What is known of the keyphasor, by the names of the node's parameters.
+    Parameters of the keyphasor, under the names that the nodes use.
 
-    `pulses_per_trigger` None or 0 makes all pulses of a revolution a trigger cycle; the others are
-    those of `PulseValidator`. Raises `ParameterError` where a trigger cycle is more than a
+    With `pulses_per_trigger` None or 0 a trigger cycle is a revolution. The other parameters are
+    those of `PulseValidator`. Raises `ParameterError` if a trigger cycle is longer than a
     revolution.
+
+    >>> keyphasor = KeyphasorParameters(pulses_per_revolution=60, pulses_per_trigger=30)
+    >>> keyphasor.revolutions_per_trigger, keyphasor.average(ratio=3.0).cycle_length
+    (0.5, 1.5)
     """
 
     pulses_per_revolution: int = 1
@@ -91,11 +95,12 @@ class KeyphasorParameters:
     time_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
-        """Check what a validator does not."""
+        """Check what `PulseValidator` does not check."""
         if (self.pulses_per_trigger or 0) > self.pulses_per_revolution:
             raise ParameterError(
-                f'pulses_per_trigger is {self.pulses_per_trigger} of {self.pulses_per_revolution} '
-                'pulses_per_revolution: give at most that many')
+                f'pulses_per_trigger is {self.pulses_per_trigger}, more than the '
+                f'{self.pulses_per_revolution} pulses_per_revolution: give at most '
+                f'{self.pulses_per_revolution}')
 
     @property
     def revolutions_per_trigger(self) -> float:
@@ -104,7 +109,7 @@ class KeyphasorParameters:
                      / self.pulses_per_revolution)
 
     def validator(self) -> PulseValidator:
-        """Return a validator of this keyphasor's pulses; raises `ParameterError`."""
+        """Return a validator for the pulses of this keyphasor; raises `ParameterError`."""
         options = {**asdict(self), 'pulses_per_trigger': self.pulses_per_trigger or None}
         return PulseValidator(**options)
 
@@ -126,15 +131,34 @@ class KeyphasorParameters:
 @dataclass(frozen=True)
 class Correction:
     """
-    What the vibration tells about the errors of an average's pulses, and the average without them.
+    The pulse errors of an average, recovered from the vibration, and the corrected average.
 
-    `waveform` (channel, angle) and `amplitudes` (channel, order) with their standard deviation
-    `noise` are those between corrected pulses, the raw ones where the correction is not `accepted`
-    (`reason` says why). `pulse_errors` and `standard_errors` (N_t + 1,) in s, measured minus true
-    with mean 0. `attenuation` (channel, order) is raw over corrected amplitude; the noise of the
-    two is the same noise, so that its `attenuation_standard_error` is that of a ratio of
-    correlated amplitudes. `cycle_amplitudes` (cycle, channel, order) are those of the single
-    trigger cycles between corrected pulses.
+    `waveform` (channel, angle) and `amplitudes` (channel, order), with their standard deviation
+    `noise`, are those between corrected pulses. Where the correction is not `accepted` they are
+    the raw ones, and `reason` says why. `pulse_errors` and `standard_errors` (N_t + 1,) in s are
+    measured minus true times with mean 0. `attenuation` (channel, order) is the raw over the
+    corrected amplitude. Both contain the same noise, and `attenuation_standard_error` accounts for
+    this correlation. `cycle_amplitudes` (cycle, channel, order) are those of the single trigger
+    cycles between corrected pulses.
+
+    A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
+    20.3 Hz. The correction recovers these errors except for their mean:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> true = np.arange(31) / 20.3
+    >>> vibration = np.cos(2.0 * np.pi * 19.0 * 20.3 * np.arange(30_000) / 20e3)
+    >>> pulses = np.ceil(true * 1e3) / 1e3
+    >>> average, = sa.average(vibration, 20e3, pulses, orders=[19.0], correct_jitter=True,
+    ...                       keyphasor_rate=1e3)
+    >>> correction = average.correction
+    >>> correction.accepted, correction.attenuation.round(2)
+    (True, array([[0.86]]))
+    >>> abs(correction.amplitudes).round(3)
+    array([[1.]])
+    >>> errors = pulses - true
+    >>> bool(abs(correction.pulse_errors - (errors - errors.mean())[:31]).max() < 1e-6)
+    True
     """
 
     waveform: FloatArray
@@ -155,15 +179,27 @@ class Average:
     A synchronous average over consecutive trigger cycles.
 
     Times in s; `trigger_speed` is the mean speed of the tach shaft in Hz. `waveform` and its
-    `standard_error` are (channel, angle) over whole fundamental cycles, NaN where none is whole,
-    at the `angle` (angle,) in revolutions of the shaft; `amplitudes` (channel, order) are complex
-    peak amplitudes over whole trigger cycles, cos having phase 0 where the angle is 0 (NaN from
-    the Nyquist frequency on), `noise` (channel, order) their standard deviation along the radius.
-    `first_angle` is the angle of the first pulse in revolutions of the shaft since the start,
-    `pulses` (N_t + 1,) in s; `discarded_cycles` trigger cycles between the first and the last
-    pulse are not in the average. `cycle_amplitudes` (cycle, channel, order) are the amplitudes of
-    the single trigger cycles, read-only, with phases at the same angle as their mean.
-    `correction` is there where it was asked for.
+    `standard_error` (channel, angle) are means over whole fundamental cycles at the `angle`
+    (angle,) in revolutions of the shaft, NaN if no cycle is whole. `amplitudes` (channel, order)
+    are complex peak amplitudes over whole trigger cycles, NaN from the Nyquist frequency on; a
+    cosine whose maximum is at angle 0 has phase 0. `noise` (channel, order) is their standard
+    deviation along the radius. `first_angle` is the angle of the first pulse in revolutions of the
+    shaft since the start, `pulses` (N_t + 1,) are in s. `discarded_cycles` trigger cycles between
+    the first and the last pulse are not in the average. `cycle_amplitudes` (cycle, channel, order)
+    are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
+    angle as those of their mean. `correction` is None unless `correct_jitter` was set.
+
+    A shaft at 25 Hz with an order 3 of amplitude 2 and phase 1 rad, in a single channel:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> time = np.arange(10_000) / 5e3
+    >>> vibration = 2.0 * np.cos(2.0 * np.pi * 3.0 * 25.0 * time + 1.0)
+    >>> average, = sa.average(vibration, 5e3, np.arange(50) / 25.0, orders=[3.0])
+    >>> average.trigger_cycles, round(average.trigger_speed, 6), average.waveform.shape
+    (49, 25.0, (1, 216))
+    >>> abs(average.amplitudes).round(3), np.angle(average.amplitudes).round(3)
+    (array([[2.]]), array([[1.]]))
     """
 
     start_time: float

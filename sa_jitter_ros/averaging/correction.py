@@ -7,10 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
-from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
+from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
-from sa_jitter_ros.averaging.shaft import ShaftAverager
-from sa_jitter_ros.pulses.angle_law import angle_law
+from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 
 FloatArray = NDArray[np.float64]
 
@@ -76,10 +75,8 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     """
     if len(cycles) < 2:
         return _uncorrected(raw, 'one trigger cycle cannot be compared with itself: average more')
-    law = angle_law('linear')  # whose error inside a cycle the recovery knows
-    points = grid_points(max(cycle.period for cycle in cycles), cycles[0].rate)
-    u = np.arange(points) / points
-    grid = np.stack([cycle.at(law, u, method=settings.interpolation) for cycle in cycles])
+    # By the linear law, whatever the settings: the recovery knows its error inside a cycle.
+    grid = cycle_grid(cycles, method=settings.interpolation)
     clock = settings.keyphasor_rate or cycles[0].rate
     recovery = recover_pulse_errors(
         grid, periods=np.diff(raw.pulses), cycle_length=settings.cycle_length,
@@ -123,8 +120,7 @@ def _average_again(raw: Average, cycles: Sequence[CycleSamples],
     """Average the same cycles between corrected pulses."""
     again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
                     trigger_cycles=raw.trigger_cycles)
-    shaft = ShaftAverager(again, first_cycle=round(raw.first_angle / settings.cycle_length))
-    for index, cycle in enumerate(cycles):
-        average = shaft.update(replace(cycle, pulses=pulses, first=index))
-    assert average is not None
+    average = average_cycles(
+        (replace(cycle, pulses=pulses, first=index) for index, cycle in enumerate(cycles)),
+        again, first_cycle=round(raw.first_angle / settings.cycle_length))
     return replace(average, sequence=raw.sequence)

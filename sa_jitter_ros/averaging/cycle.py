@@ -7,6 +7,7 @@ that is never coarser than the samples. The waveform has points at k/n of a fund
 wherever those fall between the pulses: a fundamental cycle that straddles a pulse is exact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -14,7 +15,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.pulses.angle_law import AngleLaw, cycle_times
+from sa_jitter_ros.pulses.angle_law import AngleLaw, cycle_times, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import interpolate, margin
 from scipy.fft import next_fast_len
 
@@ -45,6 +46,21 @@ class CycleSamples:
     lead: float = 0.0
     ripple: float = 0.0
 
+    @classmethod
+    def cut(cls, samples: FloatArray, *, start_time: float, rate: float, pulses: FloatArray,
+            first: int, margin: int, offset: int = 0, ripple: float = 0.0) -> 'CycleSamples':
+        """
+        Cut the cycle that begins at `pulses[first]` out of `samples` (sample, channel).
+
+        The first sample is `offset` samples after `start_time` (s); `margin` samples are kept on
+        either side of the cycle.
+        """
+        low, high = ((float(pulse) - start_time) * rate - offset
+                     for pulse in pulses[first:first + 2])
+        begin = max(math.floor(low) - margin, 0)
+        return cls(samples[begin:math.ceil(high) + margin + 1], start_time, rate, pulses, first,
+                   lead=(offset + begin) / rate, ripple=ripple)
+
     @property
     def period(self) -> float:
         """Length of the trigger cycle in s."""
@@ -60,6 +76,19 @@ class CycleSamples:
         # a pulse on the first or last sample may round to just outside it
         np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
         return interpolate(self.samples, positions, method=method, cutoff=cutoff)
+
+
+def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = LINEAR_LAW,
+               period: float | None = None) -> FloatArray:
+    """
+    Return samples (cycle, point, channel) of cycles at equal steps of angle, without their ends.
+
+    There are as many points as a cycle of `period` (s) needs, the longest of the cycles if None.
+    """
+    longest = max(cycle.period for cycle in cycles) if period is None else period
+    points = grid_points(longest, cycles[0].rate)
+    u = np.arange(points) / points
+    return np.stack([cycle.at(law, u, method=method) for cycle in cycles])
 
 
 def grid_points(period: float, rate: float) -> int:

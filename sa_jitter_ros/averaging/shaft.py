@@ -6,6 +6,7 @@ it holds is bounded by the settings, and its result depends on the cycles alone.
 """
 
 from collections import deque
+from collections.abc import Iterable
 from fractions import Fraction
 import math
 
@@ -255,3 +256,18 @@ class ShaftAverager:
             self._noise = radial_noise(without_leakage(amplitudes, orders, cycle_length, angles))
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise
+
+
+def average_cycles(cycles: Iterable[CycleSamples], settings: AverageSettings, *,
+                   first_cycle: int = 0) -> Average:
+    """
+    Return the block average of all of these trigger cycles, the first of which has a number.
+
+    The angle is 0 where cycle 0 begins. `settings` with as many `trigger_cycles` as are given.
+    """
+    shaft = ShaftAverager(settings, first_cycle=first_cycle)
+    average = None
+    for cycle in cycles:
+        average = shaft.update(cycle)
+    assert average is not None
+    return average

@@ -284,11 +284,9 @@ class StreamingAverager:
         for name, shaft in self.shafts.items():
             margin = shaft.margin(float(pulses[first + 1] - pulses[first]), clock.rate)
             self._lead = max(self._lead, 1.5 * margin / clock.rate)
-            offset = max(int(np.floor(low)) - margin, 0)
-            index = segment.index + offset
-            cycle = CycleSamples(
-                segment.samples[offset:int(np.ceil(high)) + margin + 1], clock.time, clock.rate,
-                pulses, first, lead=(index - clock.index) / clock.rate)
+            cycle = CycleSamples.cut(
+                segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses,
+                first=first, margin=margin, offset=segment.index - clock.index)
             try:
                 average = shaft.update(cycle)
             except SignalError as error:  # of this shaft: the others go on

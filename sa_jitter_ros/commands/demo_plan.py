@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-import math
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.pulses.detection import detect_pulses
 from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
@@ -70,7 +68,7 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
     here. With `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if
     the keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
     """
-    first, pulses = _pulses(recording)
+    first, pulses = _first_seconds(recording)
     triggers = _keyphasor(recording).validator().update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
     if len(cycles) < 4:
@@ -104,22 +102,10 @@ def _keyphasor(recording: Recording) -> KeyphasorParameters:
                                pulses_per_trigger=recording.pulses_per_trigger)
 
 
-def _pulses(recording: Recording) -> tuple[FloatArray, FloatArray]:
+def _first_seconds(recording: Recording) -> tuple[FloatArray, FloatArray]:
     """Vibration and pulse times of the first seconds."""
-    count = round(LOOK * recording.sample_rate)
-    samples = next(recording.blocks(count))
-    end = recording.start_time + samples.shape[1] / recording.sample_rate
-    times = recording.pulse_times
-    if times is None:
-        times = recording.reference_pulse_times
-    if times is not None:
-        return samples, times[times <= end]
-    if recording.tach is None or recording.tach_rate is None:
-        raise RecordingError('no keyphasor: neither pulse times nor a tach waveform; averaging '
-                             'needs one (of a .wav or .csv give --tach-channel)')
-    waveform = next(recording.tach_blocks(math.ceil(LOOK * recording.tach_rate)))
-    return samples, detect_pulses(
-        waveform[0], recording.tach_rate, start_time=recording.start_time)
+    samples = next(recording.blocks(round(LOOK * recording.sample_rate)))
+    return samples, recording.keyphasor_pulses(duration=samples.shape[1] / recording.sample_rate)
 
 
 def _strongest_orders(recording: Recording, samples: FloatArray, pulses: FloatArray,

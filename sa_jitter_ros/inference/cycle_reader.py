@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
-from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
+from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
-from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.averaging.shaft import average_cycles
 from sa_jitter_ros.prediction.prediction import DeclaredModel
-from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw
+from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import margin
 
 FloatArray = NDArray[np.float64]
@@ -23,7 +23,6 @@ _WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
 _LEAST = 1e-9
 _WHOLE = 1e-9
 _MARGIN = 40  # samples beside a cycle: more than interpolation reads, and corrected pulses move
-_LINEAR = angle_law('linear')
 _COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
 #: Of a fitted ripple, in parts of that of noise of unit power over a cycle.
 RIPPLE_VARIANCE = float(np.mean(1.0 / (1.0 / 30.0 - (1.0 + _COSINE) / (24.0 * (2.0 + _COSINE)))))
@@ -44,7 +43,7 @@ class CycleReader:
         position = (times[[0, -1]] - self.start_time) * self.rate
         return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
 
-    def cycles(self, pulses: FloatArray, *, law: AngleLaw = _LINEAR,
+    def cycles(self, pulses: FloatArray, *, law: AngleLaw = LINEAR_LAW,
                ripple: FloatArray | None = None) -> list[CycleSamples]:
         """
         Return the trigger cycles between pulses.
@@ -52,32 +51,19 @@ class CycleReader:
         `pulses` are those of the cycles and all that the `law` reads beside them; `ripple` is that
         of the speed in each cycle (s).
         """
-        position = (pulses - self.start_time) * self.rate
-        found = []
-        for k, first in enumerate(range(law.before, len(pulses) - 1 - law.after)):
-            low = max(int(position[first]) - _MARGIN, 0)
-            part = self.samples[low:int(position[first + 1]) + _MARGIN + 2]
-            found.append(CycleSamples(
-                part, self.start_time, self.rate, pulses, first, lead=low / self.rate,
-                ripple=0.0 if ripple is None else float(ripple[k])))
-        return found
-
-    def grid(self, cycles: Sequence[CycleSamples], points: int, law: AngleLaw = _LINEAR
-             ) -> FloatArray:
-        """Return the samples (cycle, point, channel) of cycles at even steps of angle."""
-        u = np.arange(points) / points
-        return np.stack([cycle.at(law, u, method=self.method) for cycle in cycles])
+        return [
+            CycleSamples.cut(
+                self.samples, start_time=self.start_time, rate=self.rate, pulses=pulses,
+                first=first, margin=_MARGIN, ripple=0.0 if ripple is None else float(ripple[k]))
+            for k, first in enumerate(range(law.before, len(pulses) - 1 - law.after))]
 
     def average(self, cycles: Sequence[CycleSamples], model: DeclaredModel, orders: FloatArray,
-                law: AngleLaw = _LINEAR) -> Average:
+                law: AngleLaw = LINEAR_LAW) -> Average:
         """Return the synchronous average of cycles, begun at angle 0."""
-        shaft = ShaftAverager(AverageSettings(
+        return average_cycles(cycles, AverageSettings(
             cycle_length=model.cycle_length, trigger_cycles=len(cycles),
             orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
             revolutions_per_trigger=model.trigger_revolutions))
-        averages = [shaft.update(cycle) for cycle in cycles]
-        assert averages[-1] is not None
-        return averages[-1]
 
 
 def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...],
@@ -88,8 +74,7 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
     Of declared and integer orders, and those in `also`.
     """
     periods = np.diff(pulses)
-    points = grid_points(float(periods.max()), reader.rate)
-    grid = reader.grid(reader.cycles(pulses), points)[:, :, list(rows)]
+    grid = cycle_grid(reader.cycles(pulses), method=reader.method)[:, :, list(rows)]
     declared = max(float(np.sqrt(model.distribution.variance)), _LEAST)
 
     def attempt(expected: float) -> PulseErrorRecovery:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.cycle import grid_points
+from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import noise_floor, without_leakage
 from sa_jitter_ros.effects.effect import mean_period
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
@@ -315,9 +315,9 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
     clean = without_leakage(
         corrected.cycle_amplitudes, tuple(sources.tolist()), model.cycle_length,
         model.cycle_length * np.arange(len(cycles)))
-    points = grid_points(float(np.diff(fixed).max()), reader.rate)
-    floor = noise_floor(reader.grid(cycles, points, clean_law), model.cycle_length,
-                        sources[:len(model.orders)],
+    floor = noise_floor(cycle_grid(cycles, method=reader.method, law=clean_law,
+                                   period=float(np.diff(fixed).max())),
+                        model.cycle_length, sources[:len(model.orders)],
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, fixed, errors, standard_errors, raw.cycle_amplitudes, clean,

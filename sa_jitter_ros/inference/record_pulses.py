@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.prediction.prediction import DeclaredModel
-from sa_jitter_ros.pulses.detection import KeyphasorDetector
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -80,7 +79,8 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
                          f'the recording says {recording.pulses_per_revolution}')
     step = model.pulses_per_trigger or model.pulses_per_revolution
-    measured = keyphasor_pulses(recording)
+    # As the keyphasor was sampled: the jitter of its sampling is part of the declared model.
+    measured = recording.keyphasor_pulses(interpolate=False)
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'look at the tach, its level may never cross the threshold')
@@ -106,23 +106,6 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     remarks = [*_remarks(counts, measured.size), *_tach_rate_remark(recording, model)]
     return RecordPulses(found.times, found.missing, found.starts_run, found.doubtful,
                         found.bridged, reference, tuple(remarks))
-
-
-def keyphasor_pulses(recording: Recording) -> FloatArray:
-    """Return the pulses of the tested keyphasor: those of the file, else of its waveform."""
-    if recording.pulse_times is not None:
-        return recording.pulse_times
-    if recording.tach is None or recording.tach_rate is None:
-        if recording.reference_pulse_times is not None:
-            return recording.reference_pulse_times
-        raise RecordingError('no pulse_times and no tach: the loop needs a keyphasor')
-    detector = KeyphasorDetector(interpolate=False)
-    found, index = [], 0
-    for block in recording.tach_blocks():
-        found.append(detector.update(
-            block[0], recording.start_time + index / recording.tach_rate, recording.tach_rate))
-        index += block.shape[1]
-    return np.concatenate(found)
 
 
 @dataclass(frozen=True)

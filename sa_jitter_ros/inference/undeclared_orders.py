@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.cycle import grid_points
+from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.inference.cycle_reader import CycleReader, recover
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.prediction import DeclaredModel
@@ -44,8 +44,8 @@ def undeclared_orders(reader: CycleReader, pulses: RecordPulses, model: Declared
         recovery = recover(reader, times, model, rows, with_ripple=True)
         if recovery.accepted:
             better = times - recovery.errors
-            points = grid_points(1.02 * model.trigger_period, reader.rate)
-            cycles = reader.grid(reader.cycles(better), points)
+            cycles = cycle_grid(reader.cycles(better), method=reader.method,
+                                period=1.02 * model.trigger_period)
             flat = cycles.reshape(-1, cycles.shape[2])
             window = np.hanning(len(flat) + 1)[:-1, None]
             spectra.append(np.fft.rfft(flat * window, _PADDED * len(flat), axis=0)

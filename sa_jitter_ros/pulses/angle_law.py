@@ -1,22 +1,21 @@
 """
-Angle laws: when, inside a trigger cycle, the shaft stands at a given angle.
+Angle laws: the time at which the shaft has a given angle, from the pulse times.
 
-A law reads the pulse times around a trigger cycle and returns times for fractions `u` of the
-cycle. The piecewise-linear law (Camerini et al. 2019, Eq. 5) needs the two pulses of the cycle
-only, so a cycle is usable as soon as it ends, and attenuates least under pulse jitter. The
+An angle law takes the pulse times around a trigger cycle and returns the times at fractions `u` of
+the cycle. The linear law (Camerini et al. 2019, Eq. 5) needs only the two pulses of the cycle, so
+that a cycle can be averaged as soon as it ends, and it attenuates least under pulse jitter. The
 quadratic law follows a constant acceleration (Potter 1990; Fyfe and Munck 1997), the spline a
-smooth speed (Villa 2008); both pay for it by passing on more of the pulse jitter.
+smooth speed (Villa 2008). Both transfer more of the pulse jitter to the angle.
 
-Each law has its `PulseWeights`, which say how it passes the errors of its pulses on to the angle.
-A law that reads pulses with the errors eps_k (fundamental cycles) reads cycle ``k`` at an angle
-that is wrong by
+The `PulseWeights` of a law say how errors of the pulses act on the angle. With pulse errors eps_k
+(fundamental cycles) the angle in cycle ``k`` is wrong by
 
-    e_k(u) = sum_j h_j(u) eps_{k+j},    j = -before ... 1 + after,
+    e_k(u) = sum_j h_j(u) eps_{k+j},    j = -before ... 1 + after.
 
-``h_j`` being its cardinal functions: what it makes of one late pulse among even ones. The linear
-law and the spline are linear in the pulse times, so for them this is exact; the quadratic law is
-up to terms of the size eps/(trigger cycle) times eps. Eq. 16 of Camerini et al. 2019 for the
-linear law.
+``h_j`` is the response of the law to one late pulse among evenly spaced ones. The linear law and
+the spline are linear in the pulse times, so that this is exact. For the quadratic law it holds up
+to terms of the order eps^2 per trigger cycle. For the linear law it is Eq. 16 of Camerini et al.
+2019.
 """
 
 from collections.abc import Callable
@@ -37,11 +36,15 @@ Covariance = Callable[[Array, Array, int], Array]
 @dataclass(frozen=True)
 class PulseWeights:
     """
-    The weights of an angle law, which reads `before` and `after` pulses beside a cycle's own two.
+    The weights of the pulses that an angle law uses: the two of a cycle and some around it.
 
-    ``at(u)`` returns the weights of its pulses at the positions `u` in the trigger cycle, shape
-    ``(before + 2 + after, *u.shape)``, first pulse first. `near` is a similar law that reads fewer
-    pulses.
+    There are `before` pulses in front of the two and `after` behind them. ``at(u)`` returns the
+    weights at the positions `u` in the trigger cycle, shape ``(before + 2 + after, *u.shape)``,
+    first pulse first. `near` is a similar law that uses fewer pulses.
+
+    >>> weights = angle_law('quadratic').weights
+    >>> weights.before, weights.pulses, weights.at(np.array([0.5])).ravel().tolist()
+    (1, 3, [-0.125, 0.75, 0.375])
     """
 
     before: int
@@ -51,29 +54,30 @@ class PulseWeights:
 
     @property
     def pulses(self) -> int:
-        """Return how many pulses a cycle depends on."""
+        """Return the number of pulses that act on a cycle."""
         return self.before + 2 + self.after
 
     def path(self, errors: Array, u: Array, cycles: int) -> Array:
         """
-        Return the angle errors (..., cycles, u) of averages with known pulse errors.
+        Return the angle errors (..., cycles, u) that pulse errors cause in averages.
 
-        `errors` (..., n) are those of all pulses that the law reads, n = cycles - 1 + pulses, or
-        of the average's own, n = cycles + 1: then those beside err as the first and the last one.
+        `errors` (..., n) are those of all pulses that the law uses, n = cycles - 1 + pulses, or
+        those of the cycles only, n = cycles + 1. In the latter case the pulses in front and behind
+        have the errors of the first and of the last one.
         """
         windows = np.lib.stride_tricks.sliding_window_view(
             self.padded(errors, cycles), self.pulses, axis=-1)
         return np.asarray(windows @ self.at(u))
 
     def padded(self, errors: Array, cycles: int) -> Array:
-        """Return the errors (..., n) of all pulses that the law reads, see `path`."""
+        """Return the errors (..., n) of all pulses that the law uses, see `path`."""
         if errors.shape[-1] != cycles + 1:
             return errors
         beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
         return np.pad(errors, beside, mode='edge')
 
     def covariance(self, autocovariance: Callable[[Array], Array]) -> Covariance:
-        """Return the covariance of the angle for pulses with Cov[eps_k, eps_{k+i}] at lag i."""
+        """Return the covariance of the angle error, from Cov[eps_k, eps_{k+i}] at lags i."""
         index = np.arange(self.pulses)
 
         def covariance(u: Array, v: Array, lag: int) -> Array:
@@ -87,12 +91,13 @@ class PulseWeights:
 @dataclass(frozen=True)
 class AngleLaw:
     """
-    An angle law and the pulses that it reads.
+    An angle law and the pulses that it uses.
 
-    `weights` say which pulses it reads and how it passes on their errors; it reads those that a
-    run of consecutive pulses has, and `after_first` after a run's first cycle, which has none
-    before. `fraction_times(pulses, cycle, u)` returns the times (s) at the fractions `u` of the
-    cycle between `pulses[cycle]` and `pulses[cycle + 1]`.
+    `weights` say which pulses these are and how their errors act on the angle. Of a run of
+    consecutive pulses the law uses those that exist. The first cycle of a run has no pulses in
+    front; there the law uses `after_first` pulses behind it. `fraction_times(pulses, cycle, u)`
+    returns the times (s) at the fractions `u` of the cycle between `pulses[cycle]` and
+    `pulses[cycle + 1]`.
     """
 
     name: str
@@ -102,12 +107,12 @@ class AngleLaw:
 
     @property
     def before(self) -> int:
-        """Return how many pulses the law reads in front of a cycle's own two."""
+        """Return the number of pulses used in front of those of the cycle."""
         return self.weights.before
 
     @property
     def after(self) -> int:
-        """Return how many pulses the law reads behind a cycle's own two."""
+        """Return the number of pulses used behind those of the cycle."""
         return self.weights.after
 
 
@@ -117,7 +122,7 @@ def _linear(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
 
 
 def _quadratic(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
-    """Constant acceleration over the cycle and the one before; a first cycle, the one after."""
+    """Constant acceleration over the cycle and the one before it (a first cycle: after it)."""
     if len(pulses) < 3:
         return _linear(pulses, cycle, u)
     first = cycle - 1 if cycle > 0 else cycle
@@ -128,13 +133,13 @@ def _quadratic(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     theta = u + (cycle - first)
     # the root that stays finite as the curvature vanishes
     root = speed * speed + 4.0 * curve * theta
-    if np.any(root <= 0.0):  # the parabola turns round: the intervals differ too much for it
+    if np.any(root <= 0.0):  # the parabola has its vertex in the cycle
         return _linear(pulses, cycle, u)
     return np.asarray(pulses[first] + 2.0 * theta / (speed + np.sqrt(root)))
 
 
 def _spline(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
-    """Cubic spline through the pulses at hand: time as a smooth function of angle."""
+    """Cubic spline through the given pulses: time as a smooth function of angle."""
     if len(pulses) < 4:
         return _quadratic(pulses, cycle, u)
     times = CubicSpline(np.arange(len(pulses)), pulses - pulses[cycle])(cycle + u)
@@ -148,11 +153,11 @@ def _linear_weights(u: Array) -> Array:
 
 
 def _quadratic_weights(u: Array) -> Array:
-    """Lagrange's polynomials: the law's inverse has the same slopes at even pulses."""
+    """Lagrange polynomials: at evenly spaced pulses the inverse of the law has their slopes."""
     return np.stack((0.5 * u * (u - 1.0), 1.0 - u * u, 0.5 * u * (u + 1.0)))
 
 
-_SIDE = 8  # pulses that the spline reads on either side
+_SIDE = 8  # pulses that the spline uses on either side
 _UNIT_SPLINES = CubicSpline(np.arange(2 * _SIDE + 2), np.eye(2 * _SIDE + 2))
 
 
@@ -165,14 +170,21 @@ _QUADRATIC = PulseWeights(1, 0, _quadratic_weights)
 _LAWS = {law.name: law for law in (
     AngleLaw('linear', LINEAR, 0, _linear),
     AngleLaw('quadratic', _QUADRATIC, 1, _quadratic),
-    # A pulse j cycles away moves the spline by 0.27^j: eight leave 3e-5 of its error.
+    # A pulse j cycles away acts on the spline by 0.27^j: beyond eight pulses 3e-5 remain.
     AngleLaw('spline', PulseWeights(_SIDE, _SIDE, _spline_weights, near=_QUADRATIC), _SIDE,
              _spline))}
 ANGLE_LAWS = tuple(_LAWS)
+LINEAR_LAW = _LAWS['linear']
 
 
 def angle_law(name: str) -> AngleLaw:
-    """Law of that name; raises `ParameterError` for an unknown one."""
+    """
+    Return the angle law of a name in `ANGLE_LAWS`; raises `ParameterError` for an unknown one.
+
+    >>> law = angle_law('linear')
+    >>> law.name, law.before, law.after
+    ('linear', 0, 0)
+    """
     if name not in _LAWS:
         raise ParameterError(f'angle_law is {name!r}: give one of {", ".join(ANGLE_LAWS)}')
     return _LAWS[name]
@@ -182,11 +194,19 @@ def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) ->
     """
     Return the times (s) at fractions `u` of one trigger cycle in a run of pulses.
 
-    Reads no more pulses around the cycle than the law says, so that the result does not depend on
-    how much of the run is at hand. Raises `SignalError` unless the pulse times increase.
+    Uses only as many pulses around the cycle as the law says, so that the result does not depend
+    on the number of pulses given. Raises `SignalError` unless the pulse times increase.
+
+    A shaft that slows down passes the middle of a revolution before half of its time:
+
+    >>> pulses = np.array([0.0, 1.0, 2.1, 3.3])
+    >>> [float(cycle_times(angle_law(name), pulses, 1, np.array([0.5])).round(4)[0])
+    ...  for name in ANGLE_LAWS]
+    [1.55, 1.5356, 1.5375]
     """
     first = max(cycle - law.before, 0)
     near = pulses[first:cycle + 2 + (law.after if cycle else law.after_first)]
     if not np.all(np.diff(near) > 0.0):
-        raise SignalError(f'pulse times {near.tolist()} do not increase: validate pulses first')
+        raise SignalError(f'pulse times {near.tolist()} s do not increase: remove repeated and '
+                          'misplaced pulses first, as PulseValidator does')
     return law.fraction_times(near, cycle - first, u)

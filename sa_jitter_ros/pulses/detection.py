@@ -1,11 +1,13 @@
 """
 From the sampled waveform of a keyphasor to the times of its pulses.
 
-A Schmitt trigger decides that there is a pulse; the threshold crossing in front of that decision
-says when. With interpolation the crossing lies between two samples; without, it is the first
-sample past the threshold, which is the sampled keyphasor of Camerini et al. 2019 (Fig. 2).
+A Schmitt trigger decides whether there is a pulse. The pulse time is that of the last threshold
+crossing before the decision. With interpolation it lies between two samples; without, it is the
+time of the first sample past the threshold, as Camerini et al. 2019 (Fig. 2) model a sampled
+keyphasor.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 import warnings
@@ -16,27 +18,29 @@ from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
 from sa_jitter_ros.samples import SampleBlock
 
-__all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_pulses']
+__all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_pulses',
+           'pulses_in_blocks']
 
 FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative']
 Edge = Literal['rising', 'falling', 'centre']
 _NONE: FloatArray = np.empty(0)
-# Parts of the known level difference. While the middle of the levels strays by less, the threshold
-# stays as it is: every change of it would shift the pulses against each other.
+# Fraction of the level difference. Smaller changes of the middle level leave the threshold as it
+# is, because every change of it shifts the later pulses against the earlier ones.
 _DEAD_BAND = 0.1
-# Less than this is the noise of a stopped machine, once two windows have agreed on the levels.
+# Fraction of the level difference. After two windows with levels that agree, a smaller difference
+# is the noise of a stopped machine.
 _STOPPED = 0.1
 
 
 @dataclass(frozen=True)
 class KeyphasorState:
     """
-    What a detector has learnt and counted so far; levels in the waveform's unit, NaN if unknown.
+    State levels and counts of a detector; levels in the waveform's unit, NaN if unknown.
 
-    `waiting` are samples in which pulses will be looked for when there are levels; `too_close`
-    counts pulses dropped for `minimum_interval`, `gaps` breaks of the sample times and
-    `windows_without_levels` learning windows in which the waveform had no two levels.
+    `waiting` counts samples that are searched for pulses when the levels are known; `too_close`
+    pulses dropped because of `minimum_interval`, `gaps` interruptions of the sample times and
+    `windows_without_levels` learning windows in which the waveform did not have two levels.
     """
 
     low: float
@@ -52,21 +56,28 @@ class KeyphasorState:
 
 class KeyphasorDetector:
     """
-    Find the pulses of one keyphasor in a stream of blocks of samples, whatever their sizes.
+    Find the pulses of one keyphasor in a stream of blocks of samples of any size.
 
-    The state levels are learnt from the first `learning_time` seconds in which there are two, and
-    followed window by window; samples wait until then, so that no pulse is lost. A `threshold`
-    together with `hysteresis` 0 needs no learning.
+    The detector learns the two state levels from the first `learning_time` seconds that show them,
+    and updates them once per window of that length. Samples wait until then, so that no pulse is
+    lost. With a `threshold` and `hysteresis` 0 it learns nothing.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
-    :param hysteresis: width of the band around the threshold, in parts of the levels' difference.
-    :param polarity: 'negative' where the pulse goes down. It decides what is the rising edge.
+    :param hysteresis: width of the band around the threshold, a fraction of the level difference.
+    :param polarity: 'negative' for pulses below the resting level; their first edge is 'rising'.
     :param edge: the pulse's 'rising' (first) edge, its 'falling' edge or the 'centre' of the two.
     :param interpolate: False gives the time of the first sample past the threshold.
     :param minimum_interval: pulses that follow sooner (s) are dropped and counted.
     :param learning_time: seconds, two revolutions or more.
     :param minimum_difference: state levels closer than this (waveform's unit) are noise.
     :raises ParameterError: an option is out of range.
+
+    >>> detector = KeyphasorDetector(threshold=2.5, hysteresis=0.0)
+    >>> tach = np.tile([0.0, 0.0, 5.0, 5.0, 0.0], 3)
+    >>> detector.update(tach[:7], 0.0, 100.0), detector.update(tach[7:], 0.07, 100.0)
+    (array([0.015]), array([0.065, 0.115]))
+    >>> detector.state.pulses
+    3
     """
 
     def __init__(
@@ -117,7 +128,7 @@ class KeyphasorDetector:
 
     @property
     def state(self) -> KeyphasorState:
-        """Return what has been learnt and counted."""
+        """Return the state levels and the counts so far."""
         levels = self._levels or StateLevels(np.nan, np.nan, significant=False)
         low, high = sorted((self._sign * levels.low, self._sign * levels.high))
         waiting = 0 if self._levels else sum(part.size for *_, part in self._window)
@@ -131,8 +142,8 @@ class KeyphasorDetector:
         """
         Take the next samples (n,), the first at `start_time` (s), and return new pulse times (s).
 
-        A `start_time` more than half a sample away from where the last block ended is a gap: no
-        pulse is read across it. A block refused by an error leaves a gap and changes nothing else.
+        A `start_time` more than half a sample from the end of the last block is a gap, across
+        which no pulse is found. A block that raises an error is a gap and changes nothing else.
 
         :raises SignalError: wrong shape, not finite, or another sample rate than before.
         """
@@ -174,18 +185,18 @@ class KeyphasorDetector:
         block = self._sign * given.astype(np.float64)
         if not np.all(np.isfinite(block)):
             bad = int(np.argmin(np.isfinite(block)))
-            raise SignalError(f'sample {bad} of the block is {given[bad]}: only finite '
-                              'samples can be used; leave the block out, which is a gap')
+            raise SignalError(f'sample {bad} of the block is {given[bad]}: samples must be '
+                              'finite; leave the block out, which makes a gap')
         return block
 
     def _take(self, piece: tuple[float, int, FloatArray]) -> FloatArray:
-        """Remember a piece for learning and look for pulses in it if the levels are known."""
+        """Keep a piece for learning; return the pulses in it if the levels are known."""
         if self._learns:
             self._window.append(piece)
         return self._detect(piece) if self._levels or not self._learns else _NONE
 
     def _learn(self) -> FloatArray:
-        """Learn from a full window; return the pulses in it if they had to wait for that."""
+        """Learn the levels from a full window; return its pulses if they waited for the levels."""
         window = np.concatenate([part for *_, part in self._window])
         levels, known = state_levels(window), self._levels
         useful = levels.significant and levels.difference > self._minimum_difference
@@ -248,7 +259,7 @@ class KeyphasorDetector:
 
 
 def _same(levels: StateLevels, known: StateLevels) -> bool:
-    """Whether newly measured levels are so near the known ones that those may stay."""
+    """Whether new levels differ so little from the known ones that those are kept."""
     return (abs(levels.middle - known.middle) <= _DEAD_BAND * known.difference
             and 0.5 <= levels.difference / known.difference <= 2.0)
 
@@ -266,6 +277,13 @@ def _last(
     return kept[::-1]
 
 
+def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
+    """Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap."""
+    found = [detector.update(part.samples[0], part.start_time, part.sample_rate)
+             for block in blocks for part in block.finite_parts()]
+    return np.concatenate([*found, detector.flush()])
+
+
 def detect_pulses(
     tach: npt.ArrayLike, sample_rate: float, *, start_time: float = 0.0,
     threshold: float | None = None, hysteresis: float = 0.1,
@@ -276,12 +294,12 @@ def detect_pulses(
     Return the pulse times (pulse,) in s of the sampled waveform (sample,) of a keyphasor.
 
     The first sample is at `start_time`, `sample_rate` in Hz; the other keywords are those of
-    `KeyphasorDetector`. No pulse is found across samples that are NaN or infinite. A `DataWarning`
-    says why there are no pulses, where there are none. Raises `ParameterError` for options and
-    `SignalError` for an array or a rate that cannot be used.
+    `KeyphasorDetector`. Samples that are NaN or infinite are a gap, across which no pulse is
+    found. If there is no pulse at all, a `DataWarning` says why. Raises `ParameterError` for
+    options and `SignalError` for an array or a rate that cannot be used.
 
-    One pulse a revolution of a shaft at 25 Hz. `interpolate=False` gives the times at which a
-    keyphasor that is sampled at 2 kHz sees them:
+    One pulse per revolution of a shaft at 25 Hz. With `interpolate=False` each pulse has the time
+    of a sample, as from a keyphasor that is sampled at 2 kHz:
 
     >>> import numpy as np
     >>> import sa_jitter_ros as sa
@@ -301,14 +319,14 @@ def detect_pulses(
     if samples.ndim != 1 or samples.dtype.kind not in 'fiub':
         detector.update(samples, start_time, sample_rate)  # raises what is wrong with it
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
-    found = [detector.update(part.samples[0], part.start_time, sample_rate)
-             for part in block.finite_parts()]
-    pulses = np.concatenate([*found, detector.flush()])
+    pulses = pulses_in_blocks(detector, [block])
     if not pulses.size:
         state = detector.state
-        why = (f'its levels are {state.low:g} and {state.high:g}, the threshold '
-               f'{state.threshold:g}' if np.isfinite(state.low) else
-               f'no two levels stand out in {samples.size} samples: is the shaft turning?')
+        why = (f'its levels are {state.low:g} and {state.high:g}, the threshold is '
+               f'{state.threshold:g}; set a threshold between the levels'
+               if np.isfinite(state.low) else
+               f'its {samples.size} samples do not show two levels; check that the shaft turns '
+               'and that the sensor is connected')
         warnings.warn(f'the keyphasor waveform has no pulses: {why}', DataWarning, stacklevel=2)
     return pulses
 
@@ -317,12 +335,15 @@ def counter_pulses(
     counts: npt.ArrayLike, *, start_time: float = 0.0, sample_rate: float,
 ) -> FloatArray:
     """
-    Return the pulse times (s) of a sampled pulse counter (n,): each step up by 1 is a pulse.
+    Return the pulse times (s) of a sampled pulse counter (n,): each increase by 1 is a pulse.
 
-    A pulse has the time of the first sample that counts it; several in one sample are spread
-    evenly over the time since the sample before.
+    A pulse has the time of the first sample that counts it. Several pulses in one sample are
+    spaced evenly over the time since the sample before.
 
-    :raises SignalError: not one channel of integers, or the counter runs backwards.
+    :raises SignalError: not one channel of integers, or the counter decreases.
+
+    >>> counter_pulses([7, 7, 8, 8, 10], sample_rate=10.0)
+    array([0.2 , 0.35, 0.4 ])
     """
     values = np.asarray(counts)
     if values.ndim != 1 or values.dtype.kind not in 'iu':
@@ -335,7 +356,7 @@ def counter_pulses(
     if np.any(steps < 0):
         bad = int(np.argmax(steps < 0)) + 1
         raise SignalError(f'the counter falls from {values[bad - 1]} to {values[bad]} at sample '
-                          f'{bad}: unwrap it first')
+                          f'{bad}: add the range of the counter after each overflow')
     total = np.arange(1, int(steps.sum()) + 1)
     level = values - values[:1]
     sample = np.searchsorted(level, total)

@@ -1,20 +1,20 @@
 """
-Whether a pulse is valid, judged by its interval from the last valid one.
+Classification of pulses by their interval from the last valid pulse.
 
 A pulse is *regular* if its interval is within the tolerance of the last accepted interval or of
-the median of the last three: the one follows a changing speed, the other outlives a displaced
-pulse. All others are named by their interval in units of the nearer of the two:
+the median of the last three. The last interval follows a changing speed; the median is not changed
+by one displaced pulse. The interval in units of the nearer of the two classifies all other pulses:
 
-* double: less than a half. It is dropped and the trigger cycle goes on.
-* early: dropped, and the trigger cycle in which it came is discarded.
-* missing: within the tolerance of a multiple, not too many pulses short. They are put in evenly
-  (bridge), or the trigger cycle is discarded and a new run begins (break).
+* double: less than a half. The pulse is dropped, the trigger cycle continues.
+* early: less than one. The pulse is dropped, the trigger cycle is discarded.
+* missing: within the tolerance of a multiple, up to the maximum of missing pulses. The missing
+  pulses are interpolated (bridge), or the trigger cycle is discarded and a new run begins (break).
 * late: everything else. The trigger cycle is discarded and a new run begins.
 
-Four intervals in a row that agree with each other but not with the expected one are the new
-expected one. After eight pulses in a row that nothing explains the interval is learnt as at the
-start, where pulses wait until the target matches them. A wheel with gaps does so after every early
-or late pulse and every break, since its index is lost.
+Four consecutive intervals that agree with each other but not with the expected one become the new
+expected interval. After eight consecutive irregular pulses the interval is learnt again as at the
+start, where pulses wait until they match the target. A wheel with gaps is matched again after
+every early or late pulse and every break, because its index is lost.
 """
 
 from collections import deque
@@ -39,10 +39,10 @@ class IntervalJudge:
     """
 
     def __init__(
-        self, target: Target, clock: TriggerCounter, *, bridge: bool, tolerance: float,
+        self, target: Target, counter: TriggerCounter, *, bridge: bool, tolerance: float,
         maximum_missing: int, minimum_interval: float,
     ) -> None:
-        self._target, self._clock = target, clock
+        self._target, self._counter = target, counter
         self._bridge = bridge
         self._tolerance = tolerance
         self._maximum_missing = maximum_missing
@@ -54,8 +54,8 @@ class IntervalJudge:
         self.forget()
 
     def forget(self) -> None:
-        """Be ready for a sequence of which nothing is known."""
-        self._clock.stop(known=False)
+        """Forget the interval and the match: the next pulses begin a new sequence."""
+        self._counter.stop(known=False)
         self._lock: Lock | None = None
         self.counts['unlocked'] += len(self._pending)
         self._pending = []
@@ -67,7 +67,7 @@ class IntervalJudge:
 
     @property
     def calm(self) -> bool:
-        """Whether `take_regular` may be used."""
+        """Whether so many pulses were regular that `take_regular` can be used."""
         return self._calm >= _CALM
 
     @property
@@ -76,7 +76,7 @@ class IntervalJudge:
         return len(self._pending)
 
     def take_regular(self, pulses: FloatArray) -> int:
-        """Accept the regular pulses (n,) with which these begin; return how many there are."""
+        """Accept the pulses (n,) up to the first irregular one; return their number."""
         assert self._lock is not None
         slots = (self._slot + np.arange(pulses.size)) % self._lock.steps.size
         steps, tolerance = self._lock.steps[slots], self._lock.tolerance[slots]
@@ -88,7 +88,7 @@ class IntervalJudge:
         regular &= gaps >= self._minimum_interval
         count = pulses.size if regular.all() else int(np.argmin(regular))
         if count:
-            self._clock.extend(pulses[:count].tolist(), steps[:count].tolist())
+            self._counter.extend(pulses[:count].tolist(), steps[:count].tolist())
             self.counts['accepted'] += count
             self._intervals.extend(intervals[count:count + 3].tolist())
             self._recent.extend(pulses[:count][-_AGREEING - 1:].tolist())
@@ -107,7 +107,7 @@ class IntervalJudge:
             self._judge(pulse)
 
     def fits(self, gap: float) -> bool:
-        """Whether a pulse so long (s) after the last one would be regular."""
+        """Whether a pulse at this interval (s) from the last one would be regular."""
         if self._lock is None:
             return False
         interval = gap / float(self._lock.steps[self._slot])
@@ -115,17 +115,17 @@ class IntervalJudge:
         return any(abs(interval - each) <= tolerance * each for each in self._expected())
 
     def drop_unconfirmed(self) -> int:
-        """Go back to the last confirmed pulse; return how many pulses that drops."""
-        self._clock.stop(known=False)
+        """Drop the pulses after the last confirmed one; return their number."""
+        self._counter.stop(known=False)
         dropped = max(len(self._pending), 1)
-        self.counts['accepted'] -= not self._pending  # it began a run, and does so no more
+        self.counts['accepted'] -= not self._pending  # it was accepted as the start of a run
         self._pending = []
         self.last = self.confirmed
         self._calm = 0
         return dropped
 
     def _judge(self, pulse: float) -> None:
-        """Accept, drop or break at a pulse that comes after the last one."""
+        """Accept a pulse that follows the last one, drop it, or begin a new run at it."""
         if self._lock is None:
             self._match(pulse)
             return
@@ -152,7 +152,7 @@ class IntervalJudge:
             self._drop_double()
         elif number < step:
             self.counts['early'] += 1
-            self._clock.stop()
+            self._counter.stop()
             if not self._lock.even:
                 self._lose(pulse)
         elif (0 < missing <= self._maximum_missing
@@ -171,20 +171,20 @@ class IntervalJudge:
 
     def _drop_double(self) -> None:
         self.counts['doubles'] += 1
-        self._clock.double()
+        self._counter.double()
 
     def _expected(self) -> tuple[float, float]:
         return self._intervals[-1], sorted(self._intervals)[len(self._intervals) // 2]
 
     def _agree(self) -> bool:
-        """Whether the latest pulses follow an interval of their own."""
+        """Whether the intervals of the latest pulses agree with each other."""
         intervals = np.diff(self._recent)
-        # Strictly less: the intervals of 0 of a repeated pulse are none to follow.
+        # Strictly less: intervals of 0, of a repeated pulse, do not count as agreement.
         return len(intervals) == _AGREEING and bool(np.all(
             np.abs(np.diff(intervals)) < self._tolerance * intervals[:-1]))
 
     def _slots_passed(self, teeth: int) -> int:
-        """Return how many teeth present lie so many teeth ahead, 0 if that tooth is missing."""
+        """Return the number of pulses in the next `teeth` teeth, 0 if the last one is missing."""
         assert self._lock is not None
         passed = 0
         while teeth > 0:
@@ -195,10 +195,10 @@ class IntervalJudge:
     def _accept(self, pulse: float, step: int, passed: int) -> None:
         assert self._lock is not None
         self._slot = (self._slot + passed) % self._lock.steps.size
-        if self._clock.running:
-            self._clock.extend([pulse], [step])
+        if self._counter.running:
+            self._counter.extend([pulse], [step])
         else:
-            self._clock.begin(pulse, int(self._lock.teeth[self._slot]), passed=step)
+            self._counter.begin(pulse, int(self._lock.teeth[self._slot]), passed=step)
         if passed == 1:
             self._intervals.append((pulse - self.last) / step)
         self.counts['accepted'] += 1
@@ -208,25 +208,25 @@ class IntervalJudge:
         """
         Discard the trigger cycle and begin a new run, of a wheel once it is matched again.
 
-        `passed` is how many teeth have gone by since the last pulse, None where that is not known.
+        `passed` is the number of teeth since the last pulse, None where it is not known.
         """
         if self._lock is None or not self._lock.even:
             self._lose(pulse)
             return
-        self._clock.begin(pulse, 0, passed=passed)
+        self._counter.begin(pulse, 0, passed=passed)
         self.counts['accepted'] += 1
         self.last = pulse
 
     def _lose(self, pulse: float) -> None:
-        """Discard the trigger cycle and match the target afresh, from this pulse on."""
-        self._clock.stop(known=False)
+        """Discard the trigger cycle and match the target again from this pulse on."""
+        self._counter.stop(known=False)
         self._lock = None
         self._calm = self._strikes = 0
         self._pending = [pulse]
         self.last = pulse
 
     def _match(self, pulse: float) -> None:
-        """Try to match the pulses that wait to the target."""
+        """Match the waiting pulses to the target if they fit it."""
         self._pending.append(pulse)
         self.last = pulse
         lock = self._target.lock(self._pending)
@@ -241,6 +241,6 @@ class IntervalJudge:
         self._lock, self._slot, self.last = lock, lock.slot, waiting[0]
         self._intervals.clear()
         self._intervals.append(lock.interval)
-        self._clock.begin(waiting[0], int(lock.teeth[lock.slot]))
+        self._counter.begin(waiting[0], int(lock.teeth[lock.slot]))
         for each in waiting[1:]:
             self._judge(each)

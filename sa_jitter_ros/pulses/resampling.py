@@ -1,17 +1,16 @@
 """
 Resampling: values of a sampled signal between its samples.
 
-One operator serves all channels: the value at a position is a weighted sum of the samples around
-it, so that the positions of a trigger cycle make a sparse matrix, applied to samples x channels at
-once. Between two samples the weight of each is a polynomial of the position (exactly so for linear
-and the cubics, to 2e-7 for the band-limited kernel), which makes all weights one matrix product.
-Positions that are further apart than the samples need an anti-alias filter: the band-limited
-kernel, three times as long and stretched so that it is flat to 0.8 of the cut-off and closed from
-the cut-off on, whatever the method.
+The value at a position is a weighted sum of the samples around it. The positions of a trigger
+cycle thus make a sparse matrix, which is applied to all channels at once. Between two samples each
+weight is a polynomial of the position (exact for linear and both cubic methods, to 2e-7 for the
+band-limited kernel), so that all weights are one matrix product. Positions that are further apart
+than the samples need an anti-alias filter. For every method this is the band-limited kernel, three
+times as long and stretched: flat to 0.8 of the cut-off, closed from the cut-off on.
 
-What an interpolator costs is its gain at the frequency f (`gain`): none to speak of for the
-default (Kaiser-windowed sinc, below 0.001 dB to 0.32 fs), but sinc^2(f/fs) for linear
-interpolation, which at f_kp = fs costs three times what the pulse jitter costs.
+`gain` is the gain of an interpolator at the frequency f. The loss of the default (Kaiser-windowed
+sinc) is below 0.001 dB up to 0.32 fs. Linear interpolation has the gain sinc^2(f/fs); for a
+keyphasor that is sampled at fs, its loss is three times that of the pulse jitter.
 """
 
 from functools import lru_cache
@@ -76,7 +75,7 @@ def _polynomials(method: str, cutoff: float) -> FloatArray:
     nodes = np.cos(np.pi * (np.arange(powers) + 0.5) / powers)
     taps = np.arange(1 - width, width + 1)
     weights = _kernel(method, stretch * (taps - (nodes[:, None] + 1.0) / 2.0), half)
-    weights /= weights.sum(axis=1, keepdims=True)  # a constant stays what it is
+    weights /= weights.sum(axis=1, keepdims=True)  # the gain of a constant is 1
     return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), weights))
 
 
@@ -87,7 +86,12 @@ def _known(method: str) -> str:
 
 
 def margin(method: str, *, cutoff: float = 1.0) -> int:
-    """Return how many samples interpolation needs on either side of a position."""
+    """
+    Return the number of samples that interpolation needs on either side of a position.
+
+    >>> margin('linear'), margin('band_limited'), margin('linear', cutoff=0.5)
+    (1, 8, 54)
+    """
     _, half, stretch = _stretch(method, cutoff)
     return math.ceil(half / stretch)
 
@@ -98,6 +102,13 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
 
     It is the Fourier transform of the kernel: sinc^2 for linear, 3 sinc^4 / (2 + cos 2 pi f) for
     the cubic spline.
+
+    >>> for method in METHODS:
+    ...     print(method, gain(method, np.array([0.1, 0.25])).round(3))
+    band_limited [1. 1.]
+    linear [0.968 0.811]
+    cubic [0.998 0.939]
+    spline [1.    0.986]
     """
     half = _HALF_WIDTH[_known(method)]
     x, step = np.linspace(-half, half, 1024 * half + 1, retstep=True)
@@ -110,10 +121,15 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
     """
     Return `samples` (n, channels) at `positions` (m,), counted in samples from the first.
 
-    Positions must lie within [0, n - 1]; towards either end the signal is continued by point
-    reflection. `cutoff` in (0, 1] is the band that survives, as a fraction of half the sampling
-    rate. Returns (m, channels). Raises `SignalError` for positions outside the samples or the
-    wrong number of dimensions, `ParameterError` for an unknown method or cut-off.
+    Positions must lie within [0, n - 1]; beyond either end the signal is continued by point
+    reflection. `cutoff` in (0, 1] is the highest frequency that remains, as a fraction of half the
+    sampling rate. Returns (m, channels). Raises `SignalError` for positions outside the samples or
+    the wrong number of dimensions, `ParameterError` for an unknown method or cut-off.
+
+    >>> samples = np.sin(0.2 * np.arange(100.0))[:, None]
+    >>> positions = np.array([40.25, 50.5])
+    >>> interpolate(samples, positions)[:, 0].round(4), np.sin(0.2 * positions).round(4)
+    (array([ 0.9808, -0.6251]), array([ 0.9808, -0.6251]))
     """
     if not 0.0 < cutoff <= 1.0:
         raise ParameterError(f'cutoff is {cutoff}: give more than 0 and at most 1')
@@ -126,8 +142,8 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
         return np.empty((0, samples.shape[1]))
     low, high = float(positions.min()), float(positions.max())
     if not (low >= 0.0 and high <= len(samples) - 1):
-        raise SignalError(f'positions {low:.6g} to {high:.6g} asked of samples 0 to '
-                          f'{len(samples) - 1}: stay within the samples')
+        raise SignalError(f'positions {low:.6g} to {high:.6g} are not within samples 0 to '
+                          f'{len(samples) - 1}: give positions within the samples')
     base = np.floor(positions)
     powers = np.ones((len(polynomials), len(positions)))
     np.subtract(2.0 * (positions - base), 1.0, out=powers[1])

@@ -1,9 +1,9 @@
 """
-Targets: where the teeth of a keyphasor's wheel are, and how pulses are matched to them.
+Targets: the positions of the teeth on a keyphasor's wheel, and the match of pulses to teeth.
 
-An even target gives equal angles between pulses. A toothed wheel lacks some teeth (60-2, 36-1,
-36-2-1); its index is the tooth after the widest gap. Both look at the latest pulses and say, once
-these fit, which tooth each belongs to.
+An even target has equal angles between its pulses. A toothed wheel may lack some teeth (60-2,
+36-1, 36-2-1); its index is the tooth after the widest gap. Once the latest pulses fit a target, it
+tells which tooth caused each of them.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,11 @@ from scipy.ndimage import median_filter
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
-# A pulse sooner than this part of the expected interval is a second pulse of the same tooth.
+# A pulse after less than this fraction of the expected interval is a second one of the same tooth.
 DOUBLE = 0.5
-# Teeth next to a gap stand out of place by up to 2 degrees, a fifth of a tooth of 36. The gap
-# itself must not pass for one that is a tooth wider or narrower.
+# Sensors shift the pulses of teeth next to a gap by up to 2 degrees, a fifth of the pitch of 36
+# teeth.
+# The gap must still be distinguished from one that is a tooth wider or narrower.
 _BESIDE_GAP = 0.45
 _ACROSS_GAP = 0.9  # teeth
 
@@ -32,7 +33,7 @@ class Lock:
     How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
 
     For every tooth present (m,), counted from the index: `steps` to the next one in teeth, `teeth`
-    its number, and the `tolerance` of the interval behind it, in parts of that interval.
+    its number, and the `tolerance` of the interval behind it, a fraction of that interval.
     `interval` (s) is the expected time from tooth to tooth.
     """
 
@@ -45,7 +46,7 @@ class Lock:
 
     @property
     def even(self) -> bool:
-        """Whether all teeth are alike, so that none can be lost."""
+        """Whether all teeth are equal, so that the index cannot be lost."""
         return self.steps.size == 1
 
 
@@ -59,7 +60,7 @@ class Target(Protocol):
 
 
 class EvenTarget:
-    """Equal angles: two intervals in a row that agree, double pulses left out, are a lock."""
+    """Equal angles: two consecutive intervals that agree, without double pulses, are a lock."""
 
     memory = 8
 
@@ -70,7 +71,7 @@ class EvenTarget:
         """Match the latest pulses (s), None if they do not fit (yet)."""
         if len(pulses) < 3:
             return None
-        # The latest pulse is a good one if anything fits; the one before may be a double.
+        # If the pulses fit, the latest one is no double; the one before it may be one.
         for before in pulses[-2], pulses[-3]:
             if self._agrees(pulses, pulses[-1] - before):
                 one = np.ones(1, dtype=np.int64)
@@ -90,10 +91,11 @@ class EvenTarget:
 
 class ToothedWheel:
     """
-    A wheel of `teeth` teeth (those missing counted) of which `missing` are left out.
+    A wheel with `teeth` tooth positions, of which `missing` have no tooth.
 
-    Where the gaps are is learnt from one revolution. Several gaps have one index if the widest, or
-    what stands in front of it, is unique; else the index may change whenever the wheel is lost.
+    The positions of the gaps are learnt from one revolution. With several gaps the index is unique
+    if the widest gap, or the teeth in front of it, are unique. Otherwise the index may be another
+    one after every loss of the match.
     """
 
     def __init__(self, *, teeth: int, missing: int, tolerance: float) -> None:
@@ -116,8 +118,8 @@ class ToothedWheel:
             return None
         single = single[-self._present - 1:]
         intervals = np.diff(every[single])
-        # An even speed gives the tooth interval from the revolution, a changing one from its
-        # neighbours, which needs gaps to be rare.
+        # At a steady speed the tooth interval follows from the revolution, at a changing one from
+        # the intervals around it, of which few may be gaps.
         guesses = [np.full(intervals.size, intervals.sum() / self._teeth)]
         if self._present >= 8:
             guesses.append(median_filter(intervals, size=5, mode='mirror'))

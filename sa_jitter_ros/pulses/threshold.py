@@ -1,9 +1,9 @@
 """
-Threshold crossings of a keyphasor waveform, and the state levels that place the threshold.
+Threshold crossings of a keyphasor waveform, and the state levels between which the threshold is.
 
 The state levels are the modes of the lower and of the upper half of the amplitude histogram (as in
 IEEE Std 181-2011), so that the length of a pulse and a few overshoots do not change them. A
-crossing counts when the signal leaves a band around the threshold (Schmitt trigger).
+crossing counts once the signal leaves a band around the threshold (Schmitt trigger).
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,19 @@ __all__ = ['SchmittTrigger', 'StateLevels', 'state_levels']
 FloatArray = npt.NDArray[np.float64]
 
 _BINS = 100
-# In units of the noise that the steps between samples suggest, the means of the two halves lie
-# 1.6 (normal), 1.7 (uniform) or 2 (one bit) apart where samples are white noise, but sqrt(n) in a
-# square wave of n samples a period and 1.27/sin(pi/n) in a sine.
+# Difference of the means of both halves over the noise, which follows from the steps between
+# samples. It is 1.6 (normal), 1.7 (uniform) or 2 (one bit) for white noise, but sqrt(n) for a
+# square wave of n samples a period and 1.27/sin(pi/n) for a sine.
 _CONTRAST = 2.4
 
 
 @dataclass(frozen=True)
 class StateLevels:
     """
-    State levels of a piece of waveform, in its own unit.
+    State levels of a piece of waveform, in the unit of the waveform.
 
-    `significant` says that samples move between two levels: False for a constant or white noise.
+    `significant` is True where samples change between two levels, False for a constant or white
+    noise.
     """
 
     low: float
@@ -41,15 +42,18 @@ class StateLevels:
 
     @property
     def difference(self) -> float:
-        """Return the distance of the states."""
+        """Return the difference of the two levels."""
         return self.high - self.low
 
 
 def state_levels(samples: FloatArray) -> StateLevels:
     """
-    Find the state levels of finite samples (n,).
+    Return the state levels of finite samples (n,).
 
-    A mean of the samples in the modal histogram bin stands for the level.
+    A level is the mean of the samples in the most frequent histogram bin.
+
+    >>> state_levels(np.tile([0.0, 0.1, 5.0, 5.0, 0.0, 0.0], 20))
+    StateLevels(low=0.0, high=5.0, significant=True)
     """
     low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
     half = 0.5 * (low + high)
@@ -59,12 +63,12 @@ def state_levels(samples: FloatArray) -> StateLevels:
     contrast = float(samples[upper].mean() - samples[~upper].mean())
     noise = float(np.diff(samples).std()) / np.sqrt(2.0)
     counts, edges = np.histogram(samples, bins=_BINS, range=(low, high))
-    # Of equally frequent levels the outer ones count.
+    # Of equally frequent bins the outer one is taken.
     lower_mode = int(np.argmax(counts[:_BINS // 2]))
     upper_mode = _BINS - 1 - int(np.argmax(counts[:_BINS // 2 - 1:-1]))
     low = _mean_between(samples, edges[lower_mode], edges[lower_mode + 1])
     high = _mean_between(samples, edges[upper_mode], edges[upper_mode + 1])
-    # A machine that starts to turn late in these samples has both modes at its level of rest.
+    # If the machine starts late in these samples, both modes are at its resting level.
     significant = contrast > _CONTRAST * noise and high - low > 0.5 * contrast
     return StateLevels(low, high, significant=bool(significant))
 
@@ -75,7 +79,7 @@ def _mean_between(samples: FloatArray, low: float, high: float) -> float:
 
 class SchmittTrigger:
     """
-    Find the threshold crossings of one stream of finite samples, whatever its blocks.
+    Find the threshold crossings in a stream of blocks of finite samples of any size.
 
     :param interpolate: False puts a crossing on the first sample past the threshold.
     """
@@ -92,9 +96,9 @@ class SchmittTrigger:
         """
         Return the crossings that these samples (n,) confirm and which of them rise, (c,) each.
 
-        `index` is the place of the first sample in the stream; crossings are such places, not
-        whole numbers if interpolated. `band` is half the hysteresis, in the unit of the samples.
-        What the signal does before it first leaves the band is no crossing.
+        `index` is that of the first sample in the stream. Crossings are given as such indices,
+        fractional if interpolated. `band` is half the hysteresis, in the unit of the samples.
+        Before the signal first leaves the band there are no crossings.
         """
         if self._previous is None:
             self._previous = float(samples[0])
@@ -112,8 +116,8 @@ class SchmittTrigger:
             self._high = bool(level[0])
         changes = np.flatnonzero(level != np.append(bool(self._high), level)[:-1])
         confirmed, rising = decided[changes], level[changes]
-        # The last crossing before the decision has the direction of the change, whatever noise
-        # made the signal cross inside the band before.
+        # The last crossing before the decision has the direction of the change, even if noise
+        # made the signal cross the threshold several times inside the band.
         last = np.searchsorted(after, confirmed, side='right') - 1
         held = np.nan if self._crossing is None else self._crossing
         found = np.where(last >= 0, np.append(positions, held)[last], held)

@@ -1,4 +1,4 @@
-"""From accepted pulses to trigger pulses: counting teeth."""
+"""From accepted pulses to trigger pulses, by counting teeth."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ class TriggerPulses:
     """
     Trigger pulses (n,), each the end of a valid trigger cycle unless it starts a run.
 
-    `times` in s; `starts_run` where no valid cycle lies between the trigger pulse before and this
-    one; `restarted` where, besides, time ran back. `count` is how many trigger cycles a pulse is
-    after the first one: it runs on over missing pulses, also those that break a run, and begins
-    again at 0 where the number is unknown or not whole. `measured` is False for a missing pulse
-    that was put in between its neighbours, `doubtful` True where a double pulse was dropped in the
-    trigger cycle that ends here: which of the two was the true one may be wrong.
+    `times` in s. `starts_run`: no valid cycle ends at this pulse. `restarted`: time also ran back.
+    `count` is the number of trigger cycles since the first pulse. It includes cycles with missing
+    pulses, also where these break a run, and restarts at 0 where the number of cycles is unknown
+    or not whole. `measured` is False for a missing pulse that was interpolated between its
+    neighbours. `doubtful`: a double pulse was dropped in the trigger cycle that ends here, and the
+    one that was kept may be the wrong one.
     """
 
     times: FloatArray
@@ -44,10 +44,10 @@ class TriggerPulses:
 
 class TriggerCounter:
     """
-    Count the teeth of runs of pulses and give the time of every `teeth_per_trigger`-th.
+    Count the teeth in runs of pulses and return the time of every `teeth_per_trigger`-th.
 
-    A run begins at tooth 0. Its first trigger pulse is given together with the second, which makes
-    it the start of a whole trigger cycle; runs without one leave no trace but a discarded cycle.
+    A run begins at tooth 0. Its first trigger pulse is returned together with the second one, when
+    a whole trigger cycle is known. A run without a whole cycle counts as one discarded cycle.
     """
 
     def __init__(self, *, teeth: int, teeth_per_trigger: int) -> None:
@@ -89,12 +89,12 @@ class TriggerCounter:
         self._steps += steps
 
     def double(self) -> None:
-        """Note that a double of the latest pulse was dropped."""
+        """Record that a double of the latest pulse was dropped."""
         if self.running:
             self._doubles.append(len(self._times) - 1)
 
     def stop(self, *, known: bool = True) -> None:
-        """End the run and discard its unfinished trigger cycle; `known` tells its end is valid."""
+        """End the run, discard its unfinished trigger cycle; `known`: the last pulse is valid."""
         if self.running:
             self._count()
             self._last = self._origin + self._steps[0]
@@ -105,7 +105,7 @@ class TriggerCounter:
         self._doubtful = False
 
     def restart(self) -> None:
-        """Mark the start of the next run as one for which time ran back."""
+        """Mark the next run as one that starts after time ran back."""
         self._restarted = True
 
     def take(self) -> TriggerPulses:
@@ -146,7 +146,7 @@ class TriggerCounter:
         doubtful[0] |= self._doubtful
         self._doubtful = bool(doubtful[-1])
         starts, restarts = np.zeros((2, targets.size), np.bool_)
-        # Teeth that are missing stand evenly between their neighbours.
+        # Missing teeth are interpolated between their neighbours.
         return TriggerPulses(
             np.interp(targets, teeth, self._times), starts, restarts,
             (self._origin + targets) // self._per_trigger,

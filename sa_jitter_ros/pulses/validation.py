@@ -1,12 +1,13 @@
 """
-Which pulses of a keyphasor can be believed, and which of them begin a trigger cycle.
+Pulse validation: which pulses of a keyphasor are valid, and which of them begin a trigger cycle.
 
-This layer puts pulses in order of time; `interval_judge` decides by their intervals which are
-valid and `trigger_counter` counts those. A pulse earlier than the last by `time_tolerance` or less
-is out of order and dropped. One that is earlier by more waits. If a later pulse continues the old
-sequence, those that waited (one or two) are out of order; a third in their own order, or one that
-fits them and not the old sequence, makes them a new run. If the last pulse had not been confirmed
-by a regular one, it is that one which is out of order.
+This module checks the order in time. `interval_judge` then decides by the intervals which pulses
+are valid, and `trigger_counter` counts these. A pulse that is earlier than the last one by at most
+`time_tolerance` is out of order and is dropped. A pulse that is earlier by more waits for the next
+pulses. If one of these continues the old sequence, the one or two waiting pulses are out of order.
+If three pulses follow each other in time, or one fits the waiting ones and not the old sequence,
+they begin a new run. If no regular pulse confirmed the last pulse before time ran back, that last
+pulse is the one out of order.
 """
 
 from dataclasses import astuple, dataclass, replace
@@ -24,7 +25,7 @@ __all__ = ['MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
 FloatArray = npt.NDArray[np.float64]
 MissingPulses = Literal['break', 'bridge']
-# Pulses looked at together while they are regular, and one by one around those that are not.
+# Pulses judged together while they are regular, and one by one around irregular ones.
 _CHUNK = 1024
 _FEW = 32
 _RESTART = 3
@@ -33,12 +34,13 @@ _RESTART = 3
 @dataclass(frozen=True)
 class PulseCounts:
     """
-    What became of the pulses so far.
+    Number of pulses so far, by what the validation decided.
 
-    `accepted` pulses are regular, end a gap or start a run. Missing ones were not there. All
-    others were dropped, but for `late` ones, which start a run; `unlocked` ones came while no
-    steady interval was known. `relearnt` counts changes of speed within an interval or two, and
-    `cycles_discarded` trigger cycles that were begun and lost.
+    `accepted` pulses are regular, end a gap or start a run. Missing pulses are those that did not
+    arrive: interpolated (`missing_bridged`) or the end of a run (`missing_broken`). `late` pulses
+    start a run. All others were dropped; `unlocked` ones because no steady interval was known yet.
+    `relearnt` counts changes of speed within one or two intervals, `cycles_discarded` trigger
+    cycles that began and were lost, `restarts` how often time ran back.
     """
 
     accepted: int = 0
@@ -61,23 +63,31 @@ class PulseCounts:
 
 class PulseValidator:
     """
-    Validate a stream of pulse times, whatever its blocks, and return its trigger pulses.
+    Validate a stream of pulse times, in blocks of any size, and return its trigger pulses.
 
-    The result is causal: a trigger pulse is returned as soon as it ends a trigger cycle, the first
-    one of a run together with the second. At the start pulses wait for two intervals that agree
-    (a wheel with missing teeth: for a revolution); none is lost by that.
+    A trigger pulse is returned as soon as it ends a trigger cycle, the first one of a run together
+    with the second. At the start, pulses wait until two intervals agree (for a wheel with missing
+    teeth: for a revolution); no pulse is lost by this.
 
     :param pulses_per_revolution: of the tach shaft; with missing teeth, those counted.
     :param pulses_per_trigger: pulses in a trigger cycle, None for all of a revolution.
-    :param missing_teeth: teeth that the wheel lacks, in one gap or several.
-    :param missing_pulses: 'bridge' puts missing pulses evenly between their neighbours, 'break'
+    :param missing_teeth: number of teeth that the wheel lacks, in one gap or several.
+    :param missing_pulses: 'bridge' interpolates missing pulses between their neighbours, 'break'
         discards the trigger cycle.
-    :param interval_tolerance: of an interval, in parts of the expected one. 0.25 suits most; less
-        finds pulses displaced by less, up to 0.45 follows a cranking engine.
+    :param interval_tolerance: of an interval, as a fraction of the expected one. A lower value
+        finds smaller displacements of pulses; a higher one, up to 0.45, follows a cranking engine.
     :param maximum_missing: more missing pulses than this in a row are a standstill.
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
-    :param time_tolerance: how far (s) time may run back before it is another run.
+    :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
     :raises ParameterError: an option is out of range, or cycles do not fit the wheel.
+
+    One pulse of eight is missing, and one is doubled:
+
+    >>> validator = PulseValidator(missing_pulses='bridge')
+    >>> validator.update([0.0, 1.0, 2.0, 2.01, 3.0, 5.0, 6.0, 7.0]).times.tolist()
+    [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    >>> validator.counts.doubles, validator.counts.missing_bridged
+    (1, 1)
     """
 
     def __init__(
@@ -96,8 +106,8 @@ class PulseValidator:
         if missing_pulses not in ('break', 'bridge'):
             raise ParameterError(f"missing_pulses '{missing_pulses}': use 'break' or 'bridge'")
         if not 0.0 < interval_tolerance < 0.5:
-            raise ParameterError(f'interval_tolerance {interval_tolerance} must lie between 0 '
-                                 'and 0.5, where one pulse can be told from none and two')
+            raise ParameterError(f'interval_tolerance {interval_tolerance} must be above 0 and '
+                                 'below 0.5: from 0.5 on a missing pulse looks like a late one')
         for name, value in (('minimum_interval', minimum_interval),
                             ('time_tolerance', time_tolerance)):
             if not 0.0 <= value < np.inf:
@@ -105,14 +115,15 @@ class PulseValidator:
         if missing_teeth and teeth % per_trigger and per_trigger % teeth:
             raise ParameterError(
                 f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
-                'wheel, so that cycles would lose its index: choose a divisor or a multiple')
+                'wheel, so that trigger cycles would begin at changing teeth: choose a divisor '
+                'or a multiple')
         target: Target = EvenTarget(tolerance=interval_tolerance)
         if missing_teeth:
             target = ToothedWheel(
                 teeth=teeth, missing=missing_teeth, tolerance=interval_tolerance)
-        self._clock = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
+        self._counter = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
         self._judge = IntervalJudge(
-            target, self._clock, bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
+            target, self._counter, bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval)
         self.pulses_per_trigger = per_trigger
         self._time_tolerance = time_tolerance
@@ -121,13 +132,13 @@ class PulseValidator:
 
     @property
     def counts(self) -> PulseCounts:
-        """Return what became of the pulses so far."""
+        """Return the counts so far."""
         return PulseCounts(
             **self._judge.counts, out_of_order=self._out_of_order, restarts=self._restarts,
-            non_finite=self._non_finite, cycles_discarded=self._clock.discarded)
+            non_finite=self._non_finite, cycles_discarded=self._counter.discarded)
 
     def finish(self) -> PulseCounts:
-        """Return the counts when no pulse follows: those that still wait are unlocked."""
+        """Return the counts at the end of the stream: pulses that still wait are unlocked."""
         counts = self.counts
         return replace(
             counts, unlocked=counts.unlocked + len(self._held) + self._judge.waiting)
@@ -157,7 +168,7 @@ class PulseValidator:
                 done += 1
                 if self._judge.calm:
                     break
-        return self._clock.take()
+        return self._counter.take()
 
     def _take(self, pulse: float) -> None:
         judge = self._judge
@@ -175,13 +186,13 @@ class PulseValidator:
             judge.take(pulse)
 
     def _continues_held(self, pulse: float) -> bool:
-        """Whether a pulse goes with those that wait rather than with the sequence before."""
+        """Whether a pulse continues the waiting pulses rather than the sequence before."""
         return pulse <= self._judge.last or (
             not self._judge.fits(pulse - self._judge.last)
             and self._judge.fits(pulse - self._held[-1]))
 
     def _hold(self, pulse: float) -> None:
-        """Let a pulse wait after time ran back, or begin a new run with those that do."""
+        """Let a pulse wait after time ran back, or begin a new run with the waiting pulses."""
         if self._held and pulse <= self._held[-1]:
             self._out_of_order += len(self._held)
             self._held = []
@@ -189,7 +200,7 @@ class PulseValidator:
         if len(self._held) == _RESTART or pulse > self._judge.last:
             self._restarts += 1
             self._judge.forget()
-            self._clock.restart()
+            self._counter.restart()
             held, self._held = self._held, []
             for each in held:
                 self._judge.take(each)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
-from sa_jitter_ros.recordings.limits import check_inflation
+from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, SampleDecoder, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (
@@ -183,7 +183,7 @@ def _reader(path: Path) -> Iterator[Any]:
     except ImportError as error:
         raise RecordingError(
             "reading bags needs the Python package rosbags: 'pip install rosbags'") from error
-    check_inflation(path)
+    check_bag(path)
     with Reader(path) as reader:
         if reader.compression_mode == 'message':
             raise RecordingError('compressed message by message: convert it with ros2 bag convert '

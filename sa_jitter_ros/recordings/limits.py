@@ -25,7 +25,7 @@ MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 MAX_TIME = 1e15  # s, as 30 million years
 MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
-MAX_INFLATION = 200  # measured signals shrink a few fold; only a bomb shrinks more than this
+MAX_INFLATION = 200  # size over packed size; of measured signals it is below 10
 _BLOCK = 1 << 17
 _MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50
 _REPEATED, _COMPRESSED = 1, 2
@@ -60,7 +60,15 @@ def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
                     'unit of the sensor')
 
 
-def check_inflation(path: Path) -> None:
+def check_inflation(name: str, packed: int, size: int, remedy: str) -> None:
+    """Raise RecordingError if so many `packed` bytes unpack to a `size` that no signal has."""
+    if size > max(IN_MEMORY_BYTES, MAX_INFLATION * packed):
+        raise RecordingError(f'{name}: {packed} bytes unpack to {size}, more than '
+                             f'{MAX_INFLATION} times as many, which no measured signal does: '
+                             f'{remedy}')
+
+
+def check_bag(path: Path) -> None:
     """Raise RecordingError if a bag's file or folder holds what unpacks to far more."""
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if file.suffix == '.mcap':
@@ -110,7 +118,6 @@ def _zstd_chunks(stream: BinaryIO) -> Iterator[tuple[int, int]]:
 
 def _check_zstd(stream: BinaryIO, start: int, stop: int) -> None:
     """Raise RecordingError if the zstd frames from `start` to `stop` may inflate too much."""
-    most = max(IN_MEMORY_BYTES, MAX_INFLATION * (stop - start))
     total, at = 0, start
     while at < stop:
         stream.seek(at)
@@ -131,7 +138,5 @@ def _check_zstd(stream: BinaryIO, start: int, stop: int) -> None:
             last, kind, size = block & 1, block >> 1 & 3, block >> 3
             total += _BLOCK if kind == _COMPRESSED else size
             at += 3 + (1 if kind == _REPEATED else size)
-            if total > most:
-                raise RecordingError(f'{stop - start} bytes inflate to more than {most}: looks '
-                                     'like a bomb; record it without compression')
+            check_inflation('compressed data', stop - start, total, 'record without compression')
         at += 4 * (descriptor >> 2 & 1)

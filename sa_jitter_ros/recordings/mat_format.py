@@ -26,7 +26,7 @@ import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import (
     FIELDS, MAX_FIELD_BYTES, RawArray, recording_from_fields, size_limit)
-from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES, MAX_INFLATION
+from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 Buffer = bytes | mmap.mmap
@@ -194,10 +194,7 @@ class _Reader:
 def _inflate(whole: Buffer, element: _Element, size: int) -> Buffer:
     """Unpack a compressed variable of `size` bytes, into a mapped file if it is large."""
     packed = element.stop - element.start
-    if size > max(IN_MEMORY_BYTES, MAX_INFLATION * packed):
-        raise RecordingError(
-            f'a variable of {packed} bytes inflates to {size}, more than {MAX_INFLATION}-fold: '
-            "looks like a zip bomb; save it with '-v6', which does not compress")
+    check_inflation('a variable', packed, size, "save it with '-v6', which does not compress")
     unpack, at, left = zlib.decompressobj(), element.start, size
     with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as spool:
         while left > 0 and (at < element.stop or unpack.unconsumed_tail):

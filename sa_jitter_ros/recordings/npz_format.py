@@ -20,7 +20,7 @@ from numpy.lib import format as npy
 from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields, size_limit
-from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES, MAX_INFLATION
+from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 _COPY_BYTES = 1 << 20
@@ -97,10 +97,7 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
         if info.compress_type == zipfile.ZIP_STORED:
             offset = _data_offset(path, info) + start
             return np.memmap(path, dtype, 'r', offset, shape, order)
-        if size > MAX_INFLATION * info.compress_size:
-            raise RecordingError(
-                f'{name}: {info.compress_size} bytes inflate to {size}, more than '
-                f'{MAX_INFLATION}-fold: looks like a zip bomb; store it uncompressed')
+        check_inflation(name, info.compress_size, size, 'store it without compression')
         with tempfile.TemporaryFile() as spool:
             while chunk := stream.read(_COPY_BYTES):
                 spool.write(chunk)

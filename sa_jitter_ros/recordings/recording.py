@@ -1,4 +1,4 @@
-"""What a recording is: a description of the machine and samples read block by block."""
+"""A recording: a description of the machine, and samples that are read block by block."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +10,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
+from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 
@@ -30,7 +32,7 @@ class SampleSource(Protocol):
         """Return the number of samples of each channel."""
 
     def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks; all but the last have the asked length."""
+        """Iterate over `channel` x `sample` blocks; all but the last have this length."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +62,8 @@ class Recording:
     """
     One recording of a machine: vibration, its keyphasor and what is known about both.
 
-    Sample k of the vibration (and of the tach waveform) was taken at `start_time` + k/rate;
-    pulse times are seconds on the same clock. NaN samples mean that there is no data (a gap).
+    Sample k of the vibration (and of the tach waveform) was taken at `start_time` + k/rate; pulse
+    times are seconds on the same clock. NaN samples are a gap in the data.
 
     Parameters
     ----------
@@ -80,8 +82,8 @@ class Recording:
     tach
         The sampled keyphasor waveform (one channel), read with `tach_blocks`.
     tach_rate
-        Sampling rate of the keyphasor, Hz; with `pulse_times` the clock of their
-        detection, where known.
+        Sampling rate of the keyphasor, Hz; with `pulse_times` the rate of the clock that timed
+        them, if known.
     pulses_per_revolution
         Of the tach shaft.
     pulses_per_trigger
@@ -89,7 +91,7 @@ class Recording:
     ratio
         Speed of the shaft of interest over the speed of the tach shaft.
     orders
-        Orders worth looking at, multiples of the shaft of interest.
+        Orders of interest, multiples of the shaft of interest.
     reference_pulse_times
         Of a better keyphasor, s.
     description
@@ -97,14 +99,26 @@ class Recording:
     acquisitions
         How many separate acquisitions the file holds (this is one of them).
     remarks
-        What the reader had to do to the data, one sentence each.
+        How the reader repaired the data, one sentence each.
     path
-        File or folder that error messages name; '' for a recording that is not of a file.
+        File or folder that error messages name; '' for a recording without a file.
 
     Raises
     ------
     RecordingError
         If rates, counts or times contradict each other, or are beyond `limits`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> recording = Recording(ArraySource(np.zeros((2, 5000))), sample_rate=1e3,
+    ...                       pulse_times=np.arange(0.0, 5.0, 0.04), ratio=2.5)
+    >>> recording.channel_names, recording.duration
+    (('channel 0', 'channel 1'), 5.0)
+    >>> [block.shape for block in recording.blocks(2000)]
+    [(2, 2000), (2, 2000), (2, 1000)]
+    >>> recording.keyphasor_pulses(duration=0.1)
+    array([0.  , 0.04, 0.08])
 
     """
 
@@ -133,7 +147,6 @@ class Recording:
             raise RecordingError(
                 f'vibration of {channels} channels x {self.vibration.samples} samples: needs 1 '
                 f'to {MAX_CHANNELS} channels and at least one sample')
-        _check_positive('sample_rate', self.sample_rate)
         check_rate('sample_rate', self.sample_rate, RecordingError)
         _check_positive('ratio', self.ratio)
         if not math.isfinite(self.start_time):
@@ -144,7 +157,6 @@ class Recording:
         if self.tach is not None and self.tach.channels != 1:
             raise RecordingError(f'tach of {self.tach.channels} channels: must be one waveform')
         if self.tach_rate is not None:
-            _check_positive('tach_rate', self.tach_rate)
             check_rate('tach_rate', self.tach_rate, RecordingError)
         if self.pulses_per_revolution < 1:
             raise RecordingError(
@@ -186,7 +198,7 @@ class Recording:
         Iterate over the vibration with bounded memory.
 
         Each block is `channel` x `sample`; all but the last hold `samples_per_block` samples.
-        Raises RecordingError where the file turns out to be broken.
+        Raises RecordingError if the file is found to be broken.
         """
         return self._checked(self.vibration, samples_per_block)
 
@@ -203,6 +215,38 @@ class Recording:
         blocks = [block[0] for block in self.tach_blocks()]
         return np.concatenate(blocks) if blocks else np.empty(0)
 
+    def keyphasor_pulses(self, *, interpolate: bool = True, duration: float = math.inf
+                         ) -> FloatArray:
+        """
+        Return the pulse times (s) of the keyphasor in the first `duration` seconds.
+
+        They are `pulse_times`, else those found in the tach waveform (`interpolate` as in
+        `detect_pulses`), else `reference_pulse_times`. Raises RecordingError where there is none
+        of these.
+        """
+        end = self.start_time + duration
+        times = self.pulse_times
+        if times is None and self.tach is None:
+            times = self.reference_pulse_times
+        if times is not None:
+            return times if math.isinf(duration) else times[times <= end]
+        if self.tach is None or self.tach_rate is None:
+            raise RecordingError('no keyphasor: the recording has neither pulse_times nor a tach '
+                                 'waveform; add one of them, or name the channel that is the '
+                                 'waveform (tach_channel, --tach-channel)')
+        count = math.ceil(min(duration * self.tach_rate, self.tach.samples))
+        return pulses_in_blocks(KeyphasorDetector(interpolate=interpolate),
+                                self._tach_samples(count, self.tach_rate))
+
+    def _tach_samples(self, count: int, rate: float) -> Iterator[SampleBlock]:
+        index = 0
+        for block in self.tach_blocks():
+            if index >= count:
+                return
+            yield SampleBlock(block[:, :count - index], self.start_time + index / rate, rate,
+                              index)
+            index += block.shape[1]
+
     def _checked(self, source: SampleSource, samples_per_block: int) -> Iterator[FloatArray]:
         if samples_per_block < 1:
             raise RecordingError(f'samples_per_block {samples_per_block}: must be at least 1')
@@ -212,10 +256,10 @@ class Recording:
 @contextmanager
 def recording_errors(path: str | Path) -> Iterator[None]:
     """
-    Turn whatever a parser raises on a broken file into a RecordingError of one line.
+    Turn any exception of a parser on a broken file into a RecordingError of one line.
 
-    Parsers of zip, MATLAB, sqlite and MCAP files document no closed set of exceptions for hostile
-    bytes, hence the broad clause.
+    Parsers of zip, MATLAB, sqlite and MCAP files do not document which exceptions broken bytes
+    cause, hence the broad clause.
     """
     place = f'{path}: ' if str(path) else ''
     try:
@@ -231,7 +275,7 @@ def recording_errors(path: str | Path) -> Iterator[None]:
 
 
 def _line(error: Exception) -> str:
-    """Return what an error says, which may quote the file, in one line that can be read."""
+    """Return the message of an error, which may quote the file, as one line of limited length."""
     text = ' '.join(str(error).split())
     return text if len(text) <= 500 else f'{text[:500]} ...'
 

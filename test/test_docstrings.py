@@ -1,0 +1,28 @@
+"""The examples in the docstrings of the package run, and every function has one."""
+
+import doctest
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import sa_jitter_ros
+
+PACKAGE = Path(sa_jitter_ros.__file__).parent
+MODULES = ['.'.join(path.relative_to(PACKAGE.parent).with_suffix('').parts)
+           for path in sorted(PACKAGE.rglob('*.py')) if '\n    >>> ' in path.read_text('utf-8')
+           or '\n>>> ' in path.read_text('utf-8')]
+RESULTS = ('Average', 'Averager', 'Correction', 'Recording')
+
+
+@pytest.mark.parametrize('name', MODULES)
+def test_examples_of_a_module(name):
+    module = import_module(name.removesuffix('.__init__'))
+    found = doctest.testmod(module)
+    assert found.attempted
+    assert not found.failed
+
+
+@pytest.mark.parametrize('name', [
+    name for name in sa_jitter_ros.__all__ if name[0].islower() or name in RESULTS])
+def test_a_public_name_has_an_example(name):
+    assert '>>> ' in getattr(sa_jitter_ros, name).__doc__
