@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import design
@@ -31,6 +32,13 @@ def settings(text):
             int(re.search(r'trigger cycles +(\d+)', text)[1]))
 
 
+@pytest.fixture
+def no_figure(monkeypatch):
+    """Leave the figure empty, whose iso-lines take seconds."""
+    monkeypatch.setattr(design, 'draw', lambda *arguments: Figure())
+
+
+@pytest.mark.usefixtures('no_figure')
 @pytest.mark.parametrize('name', ['--loss', '--attenuation'])
 def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
     output = tmp_path / 'design.png'
@@ -91,6 +99,7 @@ def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, 
     assert sizes[1] > 1.3 * sizes[0]
 
 
+@pytest.mark.usefixtures('no_figure')
 def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
     examples = re.findall(r'^    \$ ros2 run sa_jitter_ros design (.*)\n((?:    .*\n|\n)+)',
                           PAGE.read_text(encoding='utf-8'), re.MULTILINE)
@@ -109,6 +118,7 @@ def test_the_figure_bears_orders_without_iso_lines_and_pulses_that_could_swap(
     assert (tmp_path / 'a.png').exists()
 
 
+@pytest.mark.usefixtures('no_figure')
 @pytest.mark.parametrize(('arguments', 'message'), [
     ([], 'required: --orders, --trigger-speed'),
     ([*BENCH, '--loss', '1.5'], 'maximum_loss is 1.5: give a fraction'),

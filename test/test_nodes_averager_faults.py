@@ -71,7 +71,8 @@ class SceneBench:
 
 
 @pytest.mark.parametrize(('averaging', 'seed'), [
-    ('block', 1), ('block', 2), ('sliding', 3), ('exponential', 4)])
+    ('block', 1), pytest.param('block', 2, marks=pytest.mark.campaign), ('sliding', 3),
+    pytest.param('exponential', 4, marks=pytest.mark.campaign)])
 def test_every_average_is_true_whatever_happens(ros_graph, averaging, seed):
     b = SceneBench(ros_graph, seed, averaging=averaging)
     for _ in range(2):

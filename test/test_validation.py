@@ -170,6 +170,7 @@ def test_the_command_writes_page_numbers_and_figures(quick):
         assert finding['ours'].replace('|', '\\|') in text
 
 
+@pytest.mark.campaign
 def test_what_does_not_hang_on_chance_agrees_in_a_quick_run(quick):
     numbers = json.loads((quick / 'validation.json').read_text(encoding='utf-8'))
     found = {(item['item'], item['paper'].split(':')[0]): item['agreement']

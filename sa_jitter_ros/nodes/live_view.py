@@ -1,4 +1,4 @@
-"""Node `live_view`: what all nodes publish, on a page for a web browser."""
+"""Node `live_view`: a web page with the latest results of all nodes."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -11,28 +11,29 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
-    Attenuations, Board, CHANNELS, indicators_content, number, ORDERS, orders_content, PulseErrors,
+    Attenuations, Board, CHANNELS, indicators_content, ORDERS, orders_content, PulseErrors,
     pulses_content, SPEEDS, table_content, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.report.report import plain
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 LARGEST_REPORT = 1_000_000  # characters of missing_effect
-NODES, NODE_VALUES = 64, 100  # whose diagnostics are kept; values of each
+NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
-    Parameter('shafts', ['shaft'], 'shafts to show, named as the averager names them',
+    Parameter('shafts', ['shaft'], 'names of the shafts to show, as in the averager',
               read_only=True),
     Parameter('host', '127.0.0.1', 'address to listen on', read_only=True),
-    Parameter('port', 8420, 'port of the page, or the next free one; 0 for any', minimum=0,
-              maximum=65535, read_only=True),
-    Parameter('open_to_network', False, 'allow a host that other machines can reach: whoever '
-              'reaches it sees everything', read_only=True),
-    Parameter('vibration_unit', '', 'unit of the vibration, for the labels'),
-    Parameter('channel_names', [], 'names of the vibration channels, for the labels',
+    Parameter('port', 8420, 'port of the page; the next free one if it is in use; 0: any free '
+              'port', minimum=0, maximum=65535, read_only=True),
+    Parameter('open_to_network', False, 'allow a host that other machines can reach; everybody '
+              'who can reach it sees everything', read_only=True),
+    Parameter('vibration_unit', '', 'unit of the vibration, for labels'),
+    Parameter('channel_names', [], 'names of the vibration channels, for labels',
               element=str),
 )
 
@@ -40,15 +41,15 @@ PARAMETERS = (
 class LiveView(MonitoringNode):
     """Serves a page with the latest results of the other nodes."""
 
-    _server: PageServer | None = None  # until the parameters have been found good
+    _server: PageServer | None = None  # until the parameters are checked
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('live_view', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
         require_shaft_names('shafts', values['shafts'])
         if not (is_loopback(values['host']) or values['open_to_network']):
-            raise ParameterError(f'host {values["host"]!r} is open to other machines: leave it '
-                                 '127.0.0.1, or set open_to_network too')
+            raise ParameterError(f'other machines can reach host {values["host"]!r}: set host to '
+                                 '127.0.0.1, or allow it by open_to_network: true')
         self._board = Board()
         self._averages = 0
         self._speeds: list[float] = []
@@ -64,11 +65,12 @@ class LiveView(MonitoringNode):
         self.parameters.watch(check=lambda values: None, apply=self._apply)
         self._server = PageServer(self._board.since, host=values['host'], port=values['port'])
         if self._server.port != values['port'] != 0:
-            self.warn(f'port {values["port"]} is in use: {self._server.port} is used instead')
+            self.warn(f'port {values["port"]} is in use: the page is on port '
+                      f'{self._server.port}')
         self.get_logger().info(f'open {self._server.address} in a browser')
 
     def destroy_node(self) -> None:
-        """Close the page, too."""
+        """Stop the page and destroy the node."""
         if self._server is not None:
             self._server.close()
         super().destroy_node()
@@ -122,15 +124,14 @@ class LiveView(MonitoringNode):
 
     def _on_missing_effect(self, message: String) -> None:
         if len(message.data) > LARGEST_REPORT:
-            raise MessageError(f'{len(message.data)} characters: at most {LARGEST_REPORT} are '
-                               'taken')
+            raise MessageError(f'{len(message.data)} characters: send at most {LARGEST_REPORT}')
         try:
             report = json.loads(message.data, parse_constant=lambda name: None,
-                                parse_float=lambda text: number(float(text)))
+                                parse_float=lambda text: plain(float(text)))
         except (RecursionError, ValueError) as error:
-            raise MessageError(f'no JSON: {error}') from None
+            raise MessageError(f'the text is no JSON: {error}') from None
         if not isinstance(report, dict):
-            raise MessageError(f'JSON {type(report).__name__}: send an object')
+            raise MessageError(f'the text is a JSON {type(report).__name__}: send an object')
         self._board.put('missing_effect', lambda: report, data=False)
 
     def _on_speed(self, message: Float64) -> None:
@@ -140,7 +141,7 @@ class LiveView(MonitoringNode):
         self._board.put('shaft_speed', lambda: {'value': speeds[-1], 'history': speeds})
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        nodes = dict(self._nodes)  # the one before may be on its way to a client
+        nodes = dict(self._nodes)  # a thread may be sending the one before
         for status in message.status:
             nodes.pop(status.name, None)
             nodes[status.name] = {
@@ -153,7 +154,7 @@ class LiveView(MonitoringNode):
     # --- diagnostics ---
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Say where the page is and whether there is something on it."""
+        """Return the address of the page and the number of averages on it."""
         assert self._server is not None
         silence = self._board.silence()
         state = 'no data received yet' if silence is None else (

@@ -1,8 +1,8 @@
 """
-What the live view shows: the latest of every topic and bounded histories, as JSON has it.
+The data of the live view: the latest message of each topic and short histories, as JSON.
 
-A subscriber puts messages on the board, clients take what is newer than the version they have.
-Contents are made when they are taken. Numbers that are not finite become None.
+The node puts messages on the board; clients get what is newer than the version that they have. The
+JSON is made when a client asks for it. Numbers that are not finite become None.
 """
 
 from collections import deque
@@ -17,14 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage, ResidualMessage
+from sa_jitter_ros.report.report import plain
 
 FloatArray = NDArray[np.float64]
 Json = Any
 
-CHANNELS, ORDERS, INDICATORS = 64, 256, 64  # that are shown
-CURVE_POINTS, ALL_POINTS = 1200, 16000  # of one waveform, of all channels
-HISTORY, HISTORY_NUMBERS = 30, 20000  # averages whose attenuation is kept; numbers in them
-PULSES = 1000  # whose errors are kept
+# Largest numbers that are kept and shown:
+CHANNELS, ORDERS, INDICATORS = 64, 256, 64
+CURVE_POINTS, ALL_POINTS = 1200, 16000  # points of one waveform, and of all channels
+HISTORY, HISTORY_NUMBERS = 30, 20000  # earlier averages, and attenuations in all of them
+PULSES = 1000
 SPEEDS = 200
 
 
@@ -36,33 +38,33 @@ class _Item:
 
 
 class Board:
-    """Contents by name with versions; safe to use from several threads."""
+    """Contents by name, with versions; several threads may use it."""
 
     def __init__(self) -> None:
         self._lock = Lock()
         self._items: dict[str, _Item] = {}
         self._version = 0
-        self._heard = -math.inf
+        self._last_data = -math.inf  # s, time of the last data
         self._run = secrets.token_hex(4)
 
     def put(self, name: str, content: Callable[[], Json], *, data: bool = True) -> None:
-        """Replace a content; `data` tells that it comes from the machine."""
+        """Replace a content; `data` is true for results of measurements."""
         now = time.monotonic()
         with self._lock:
             self._version += 1
             self._items[name] = _Item(self._version, now, content)
-            self._heard = now if data else self._heard
+            self._last_data = now if data else self._last_data
 
     def silence(self) -> float | None:
-        """Seconds since the machine was heard, None if never."""
-        return time.monotonic() - self._heard if math.isfinite(self._heard) else None
+        """Return the time in s since the last data, None before the first."""
+        return time.monotonic() - self._last_data if math.isfinite(self._last_data) else None
 
     def since(self, version: int) -> dict[str, Json]:
         """
-        Return the contents that came after a version, and the version they make.
+        Return the contents that are newer than a version, and the present version.
 
-        `now` and `received` are seconds of one clock; `run` is another one when the board is a
-        new one, whose versions say nothing about those of the old.
+        `now` and `received` are times in s of one clock. `run` identifies the board: versions of
+        different boards do not compare.
         """
         with self._lock:
             items = {name: item for name, item in self._items.items() if item.version > version}
@@ -74,13 +76,13 @@ class Board:
 
 
 class PulseErrors:
-    """The last pulse errors (pulse, `PULSE_ERROR_FIELDS`) of one shaft."""
+    """The latest pulse errors (pulse, `PULSE_ERROR_FIELDS`) of one shaft."""
 
     def __init__(self) -> None:
         self.values: FloatArray = np.empty((0, 3))
 
     def add(self, values: FloatArray) -> FloatArray:
-        """Append an average's; where averages overlap the newer counts. Returns all."""
+        """Add those of an average, which replace earlier ones of the same time; return all."""
         first = np.min(values[:, 0], initial=math.inf)
         kept = self.values[self.values[:, 0] < first]
         self.values = np.concatenate((kept, values))[-PULSES:]
@@ -88,14 +90,14 @@ class PulseErrors:
 
 
 class Attenuations:
-    """The attenuations (channel, order) of the last averages of one shaft."""
+    """The attenuations (channel, order) of the latest averages of one shaft."""
 
     def __init__(self) -> None:
         self._orders: FloatArray = np.empty(0)
         self._values: deque[FloatArray] = deque()
 
     def add(self, orders: FloatArray, values: FloatArray) -> list[FloatArray]:
-        """Append an average's; other orders or channels begin anew. Returns all."""
+        """Add those of an average; other orders or channels start a new list. Return all."""
         if not np.array_equal(orders, self._orders, equal_nan=True):
             self._orders = orders
             self._values = deque(
@@ -104,29 +106,18 @@ class Attenuations:
         return list(self._values)
 
 
-def listed(values: FloatArray) -> Json:
-    """Nested lists of an array, None for what is not finite."""
-    result = values.astype(object)
-    result[~np.isfinite(values)] = None
-    return result.tolist()
-
-
-def number(value: float) -> float | None:
-    """Return a number as JSON has it."""
-    return value if math.isfinite(value) else None
-
-
 def header_content(message: Any) -> dict[str, Json]:
-    """Return the numbers of a dataclass as JSON has them."""
-    return {name: number(value) for name, value in asdict(message).items()
+    """Return the numbers of a dataclass by name."""
+    return {name: plain(value) for name, value in asdict(message).items()
             if isinstance(value, (int, float))}
 
 
 def envelope(values: FloatArray, points: int) -> FloatArray:
     """
-    Return curves (channel, n) with at most `points` points (even), for a screen.
+    Return curves (channel, n) with at most `points` points, an even number.
 
-    Of more points the lowest and the highest of every stretch remain: no peak is lost.
+    Longer curves are divided into `points` / 2 sections: the lowest and the highest value of each
+    remain, so that no peak is lost.
     """
     if values.shape[1] <= points:
         return values
@@ -136,42 +127,42 @@ def envelope(values: FloatArray, points: int) -> FloatArray:
 
 
 def rounded(values: FloatArray) -> FloatArray:
-    """Values to a hundred-thousandth of the largest: short, and finer than any screen."""
+    """Round values to 1e-5 of the largest, for short texts; a screen shows less."""
     peak = np.max(np.abs(values), where=np.isfinite(values), initial=0.0)
     return np.round(values, min(5 - math.floor(math.log10(peak)), 300)) if peak > 0.0 else values
 
 
 def waveform_content(average: AverageMessage) -> Json:
-    """Content of a waveform: its header, points in a revolution, curves by channel."""
+    """Return a waveform: header, points per revolution, curves by channel."""
     shown = average.values[:CHANNELS]
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
     return {'header': header_content(average.header), 'points': average.values.shape[1],
-            'channels': listed(rounded(envelope(shown, points)))}
+            'channels': plain(rounded(envelope(shown, points)))}
 
 
 def indicators_content(average: AverageMessage) -> Json:
-    """Content of condition indicators: their names, values (channel, indicator)."""
+    """Return condition indicators: header, names, values (channel, indicator)."""
     values = average.values[:CHANNELS, :INDICATORS]
     names = average.names or [f'indicator {i}' for i in range(average.values.shape[1])]
     return {'header': header_content(average.header), 'names': names[:values.shape[1]],
-            'values': listed(values)}
+            'values': plain(values)}
 
 
 def orders_content(average: AverageMessage, history: list[FloatArray]) -> Json:
-    """Content of order amplitudes: fields (channel, order), attenuations of earlier averages."""
+    """Return order amplitudes: fields (channel, order), attenuations of earlier averages."""
     shown = average.values[:CHANNELS, :ORDERS]
     return {'header': header_content(average.header),
-            'history': [listed(item) for item in history],
-            **{name: listed(shown[..., i]) for i, name in enumerate(average.names)}}
+            'history': [plain(item) for item in history],
+            **{name: plain(shown[..., i]) for i, name in enumerate(average.names)}}
 
 
 def pulses_content(average: AverageMessage, values: FloatArray) -> Json:
-    """Content of pulse errors: fields (pulse,) of the last pulses."""
+    """Return pulse errors: header, fields (pulse,) of the latest pulses."""
     return {'header': header_content(average.header),
-            **{name: listed(values[:, i]) for i, name in enumerate(average.names)}}
+            **{name: plain(values[:, i]) for i, name in enumerate(average.names)}}
 
 
 def table_content(message: PredictionMessage | ResidualMessage, names: tuple[str, ...]) -> Json:
-    """Content of a prediction or residual: fields (order,) and header."""
+    """Return a prediction or residual: header, fields (order,)."""
     return {**header_content(message),
-            **{name: listed(message.values[:ORDERS, i]) for i, name in enumerate(names)}}
+            **{name: plain(message.values[:ORDERS, i]) for i, name in enumerate(names)}}

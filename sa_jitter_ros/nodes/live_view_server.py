@@ -1,8 +1,8 @@
 """
-The HTTP side of the live view: a page and what it shows, to read only.
+The web server of the live view: a page and its data, read-only.
 
-The page needs nothing but this server: no request leaves it (a content security policy says so).
-A name that some other site lets point here (DNS rebinding) is refused by the Host header.
+The page requests nothing from other servers, as its content security policy states. A check of the
+Host header prevents DNS rebinding, by which a foreign site could read the data.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from sa_jitter_ros.errors import ParameterError
 
-PORTS_TRIED = 20  # from `port` on, so that a second view on the same host starts too
-CONNECTIONS = 32  # served at once; more are hung up on
+PORTS_TRIED = 20  # from `port` on, so that a second view on the same host starts, too
+CONNECTIONS = 32  # at once; more are closed
 KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
 HEADERS = {
     'Cache-Control': 'no-store',
@@ -34,7 +34,7 @@ HEADERS = {
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address to listen on."""
+    """Return whether only this machine can reach an address to listen on."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -43,9 +43,10 @@ def is_loopback(host: str) -> bool:
 
 def is_own_name(header: str) -> bool:
     """
-    Whether a Host header names this machine, whatever the port (a tunnel changes it).
+    Return whether a Host header names this machine, with any port (a tunnel changes it).
 
-    Addresses cannot be rebound; of names only those are taken that no foreign name server answers.
+    Every address is accepted, because it cannot be rebound, but only names that no foreign name
+    server can resolve.
     """
     try:
         host = urlsplit(f'//{header}').hostname or ''
@@ -54,17 +55,17 @@ def is_own_name(header: str) -> bool:
     try:
         ipaddress.ip_address(host)
     except ValueError:
-        own = socket.gethostname().lower()
-        return host in ('localhost', own, f'{own}.local')
+        machine = socket.gethostname().lower()
+        return host in ('localhost', machine, f'{machine}.local')
     return True
 
 
 class PageServer:
     """
-    Serves the page and `snapshot(since)`, a JSON object, from a thread of its own.
+    Serves the page and the JSON object `snapshot(since)` from a separate thread.
 
-    Listens on `host` and the first free port from `port` on (0: any). Raises `ParameterError`
-    if it cannot. `requests` and `refused` are counts.
+    It listens on `host` and the first free port from `port` on (0: any). Raises `ParameterError`
+    where this is not possible. `requests` and `refused` are counts.
     """
 
     def __init__(self, snapshot: Callable[[int], dict[str, Any]], *, host: str, port: int) -> None:
@@ -83,16 +84,16 @@ class PageServer:
 
     @property
     def requests(self) -> int:
-        """Requests answered."""
+        """Number of answered requests."""
         return self._server.requests
 
     @property
     def refused(self) -> int:
-        """Requests refused: another method than GET, a foreign host name, too many at once."""
+        """Number of refused requests: no GET, a foreign host name, too many at once."""
         return self._server.refused
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop the server."""
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
@@ -108,7 +109,7 @@ def _listen(host: str, port: int) -> '_Server':
                 raise ParameterError(f'cannot listen on {host} port {candidate}: '
                                      f'{error.strerror or error}') from None
     raise ParameterError(f'ports {port} to {last - 1} of {host} are in use: set another port, or '
-                         '0 for any')
+                         '0 for any free port')
 
 
 class _Server(ThreadingHTTPServer):
@@ -123,11 +124,11 @@ class _Server(ThreadingHTTPServer):
         self._free = BoundedSemaphore(CONNECTIONS)
 
     def server_bind(self) -> None:
-        """Bind without asking a name server who we are."""
+        """Bind without a query to a name server."""
         TCPServer.server_bind(self)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve in a thread, if not too many do so already."""
+        """Serve in a thread, unless there are too many connections."""
         if self._free.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
@@ -142,7 +143,7 @@ class _Server(ThreadingHTTPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a browser that hung up."""
+        """Ignore that a browser closed the connection."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)
 
@@ -156,11 +157,11 @@ class _Handler(BaseHTTPRequestHandler):
         """Answer with a file of the page or with the snapshot."""
         path, _, query = self.path.partition('?')
         if not is_own_name(self.headers.get('Host', '')):
-            self._refuse(HTTPStatus.FORBIDDEN, 'open this page by address or as localhost')
+            self._refuse(HTTPStatus.FORBIDDEN, 'open this page by its address or as localhost')
         elif path == '/snapshot.json':
             since = parse_qs(query).get('since', ['0'])[0]
             if not (since.isascii() and since.isdecimal() and len(since) < 20):
-                self._refuse(HTTPStatus.BAD_REQUEST, 'since is the version of a snapshot')
+                self._refuse(HTTPStatus.BAD_REQUEST, 'since must be the version of a snapshot')
                 return
             content = json.dumps(self.server.snapshot(int(since)), allow_nan=False)
             self._send(HTTPStatus.OK, 'application/json', content.encode())
@@ -171,7 +172,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, 'no such page')
 
     def _only_get(self) -> None:
-        self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, 'this server is to read only', Allow='GET')
+        self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, 'read-only: use GET', Allow='GET')
 
     do_CONNECT = do_DELETE = do_HEAD = do_OPTIONS = do_PATCH = do_POST = do_PUT = do_TRACE = \
         _only_get
@@ -191,4 +192,4 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
 
     def log_message(self, *arguments: Any) -> None:
-        """Keep the terminal to the nodes' own messages."""
+        """Write no line for each request: the terminal is for messages of nodes."""

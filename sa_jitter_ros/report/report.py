@@ -83,9 +83,13 @@ def summary(content: Mapping[str, Json]) -> str:
 
 
 def plain(value: Any) -> Json:
-    """Return numpy and tuples as JSON has them, with None for what is not finite."""
+    """Return a value with the types of JSON; numbers that are not finite become None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype.kind == 'f':
+        content = value.astype(object)
+        content[~np.isfinite(value)] = None
+        return content.tolist()
     if isinstance(value, (list, tuple, np.ndarray)):
         return [plain(item) for item in value]
     if isinstance(value, (bool, np.bool_)):

@@ -12,7 +12,7 @@ function make(name, attributes = {}, text = null) {
 
 export const known = value => value !== null && value !== undefined;
 
-// A number for people: 4 significant digits, powers of ten only where they are needed.
+// A number as text: 4 significant digits, powers of ten only where they are needed.
 export function format(value, digits = 4) {
   if (!known(value)) return '–';
   const size = Math.abs(value);
@@ -176,8 +176,8 @@ export class Chart {
     }
   }
 
-  // Calls `told(position from 0 to 1, or null)` as the pointer moves, and shows where it is.
-  follow(told) {
+  // Calls `changed(position from 0 to 1, or null)` as the pointer moves, and shows where it is.
+  follow(changed) {
     const cursor = make('line', {class: 'cursor', y1: MARGIN.top,
                                  y2: this.height - MARGIN.bottom});
     const show = () => {
@@ -186,7 +186,7 @@ export class Chart {
       cursor.setAttribute('visibility', inside ? 'visible' : 'hidden');
       cursor.setAttribute('x1', inside ? this.pointer : 0);
       cursor.setAttribute('x2', inside ? this.pointer : 0);
-      told(inside ? position : null);
+      changed(inside ? position : null);
     };
     this.svg.append(cursor);
     this.svg.onpointermove = event => {

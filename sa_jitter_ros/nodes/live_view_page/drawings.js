@@ -1,4 +1,4 @@
-// The charts of the page, each from what is known now.
+// The charts of the page.
 
 import {Chart, format, known, linear, logarithmic, places, range} from './charts.js';
 import {channel, channelName, find, finite, ofShaft, orderRows, part, predicted, timeUnit, unit,
@@ -25,7 +25,7 @@ function drawWaveform(chart, place) {
   if (!raw) { chart.empty('no synchronous average received yet'); return; }
   const first = Math.max(0, Math.min(channel(), raw.channels.length - CURVES));
   const shown = raw.channels.length > CURVES ? first + place : place;
-  // The two arrive one after the other: that of the average before is as good.
+  // The corrected average arrives after the raw one: until then the one before is shown.
   const fresh = corrected && Math.abs(raw.header.sequence - corrected.header.sequence) < 2;
   const spread = standardError(raw)?.channels[shown];
   const limits = [-2, 2].map(factor => raw.channels[shown].map((value, i) =>
@@ -43,9 +43,9 @@ function drawWaveform(chart, place) {
   for (const [style, values] of curves) {
     chart.curve(style, i => 360 * i / values.length, values);
   }
-  const usual = waveformNote(raw, fresh);
+  const note = waveformNote(raw, fresh);
   chart.follow(position => {
-    find('waveform-note').textContent = position === null ? usual
+    find('waveform-note').textContent = position === null ? note
       : `${channelName(shown)} at ${(360 * position).toFixed(1)}°: ` + [
         ...curves, ...(spread ? [['standard error', spread]] : [])].map(
         ([style, values]) => `${style} ` + format(
@@ -53,7 +53,7 @@ function drawWaveform(chart, place) {
   });
 }
 
-// The standard error of this very average, null where it is not published.
+// The standard error of this average, null where it is not published.
 function standardError(raw) {
   const error = ofShaft('standard_error');
   return error?.header.sequence === raw.header.sequence && error.points === raw.points
@@ -98,7 +98,7 @@ export function drawAttenuation(chart) {
                                       row.predicted?.high]);
   chart.axes({
     x: orderAxis(chart, rows), xLabel: `order of ${find('shaft').value}`,
-    y: linear(range(values, {include: [1]})), yLabel: 'attenuation (1: nothing lost)',
+    y: linear(range(values, {include: [1]})), yLabel: 'attenuation (1: no loss)',
     title: note || channelName(channel())});
   chart.level('zero', 1);
   rows.forEach((row, i) => {

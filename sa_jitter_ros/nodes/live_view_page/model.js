@@ -1,4 +1,4 @@
-// What is known, and what belongs together in it.
+// The data of the page, and how its parts belong together.
 
 import {format, known} from './charts.js';
 
@@ -15,7 +15,7 @@ export const unit = () => settings().vibration_unit || 'unit of the vibration';
 export const channelName = i => settings().channel_names[i] ?? `channel ${i}`;
 export const finite = values => values.filter(known);
 
-// The unit of time in which a value reads well.
+// The unit of time that suits a value.
 export function timeUnit(value) {
   return TIMES.find(([size]) => Math.abs(value) >= 0.9995 * size) ?? TIMES.at(-1);
 }
@@ -32,8 +32,8 @@ export function predicted() {
   if (!prediction) return {rows: new Map(), note: 'no prediction received'};
   if (header) {
     const turns = (header.end_time - header.start_time) * header.mean_trigger_speed;
-    const missed = turns * prediction.ratio - header.fundamental_cycles;  // whole ones count
-    if (missed >= 2 || missed < -1e-3 * header.fundamental_cycles) {
+    const excess = turns * prediction.ratio - header.fundamental_cycles;  // of whole cycles
+    if (excess >= 2 || excess < -1e-3 * header.fundamental_cycles) {
       return {rows: new Map(), note: `prediction is for ratio ${format(prediction.ratio, 6)}, `
         + 'another shaft'};
     }
@@ -47,7 +47,7 @@ export function predicted() {
   return {rows, note};
 }
 
-// One object an order of the shown channel.
+// One object for each order of the shown channel.
 export function orderRows() {
   const orders = ofShaft('order_amplitude');
   const rows = orders?.order[channel()] ?? [];

@@ -1,4 +1,4 @@
-// The page: asks for what is new twice a second and draws it.
+// The page: gets new data twice a second and draws it.
 
 import {Chart} from './charts.js';
 import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms}
@@ -6,7 +6,7 @@ import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms
 import {channelName, find, ofShaft, settings, state} from './model.js';
 import {drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles} from './words.js';
 
-const PERIOD = 500;  // ms between questions
+const PERIOD = 500;  // ms between requests
 
 function drawState(failure = null) {
   const box = find('state'), silence = state.silence;
@@ -21,10 +21,10 @@ function drawState(failure = null) {
 function fillChoice(select, options) {
   if (select.options.length === options.length
       && options.every((text, i) => select.options[i].text === text)) return;
-  const kept = select.value;
+  const before = select.value;
   select.replaceChildren(...options.map((text, i) => new Option(
     text, select.id === 'shaft' ? text : String(i))));
-  if ([...select.options].some(item => item.value === kept)) select.value = kept;
+  if ([...select.options].some(item => item.value === before)) select.value = before;
   select.parentElement.hidden = options.length < 2;
 }
 
@@ -36,7 +36,7 @@ const charts = {
   errors: new Chart(find('errors'), 280, drawErrors),
   residual: new Chart(find('residual'), 280, drawResidual),
 };
-// What to draw, and when: on a change of a part whose name ends so.
+// What to draw when a part changes whose name matches.
 const DRAWN = [
   [drawTiles, /speed|order_amplitude|pulse_error|prediction|residual|missing_effect/],
   [drawWaveforms, /average$|standard_error/],
@@ -59,7 +59,7 @@ function draw(changed) {
     if (!changed.includes('settings') && !changed.some(name => names.test(name))) continue;
     try {
       action();
-    } catch (error) {  // a report that is not as ours are hides nothing else
+    } catch (error) {  // a malformed report must not hide the rest
       console.error(error);
     }
   }
@@ -73,7 +73,7 @@ async function ask() {
                                {signal: AbortSignal.timeout(5000)});
     if (!answer.ok) throw new Error(`status ${answer.status}`);
     const news = await answer.json();
-    if (state.run !== null && news.run !== state.run) {  // the node was started anew
+    if (state.run !== null && news.run !== state.run) {  // the node was restarted
       Object.assign(state, {run: news.run, version: 0, parts: {}});
       return;
     }
@@ -95,7 +95,7 @@ find('shaft').onchange = drawAll;
 find('channel').onchange = drawAll;
 find('pause').onclick = () => {
   state.paused = !state.paused;
-  find('pause').textContent = state.paused ? 'Go on' : 'Pause';
+  find('pause').textContent = state.paused ? 'Continue' : 'Pause';
   find('pause').setAttribute('aria-pressed', state.paused);
   drawState();
 };

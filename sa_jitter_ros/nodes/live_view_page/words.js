@@ -1,4 +1,4 @@
-// The numbers and tables of the page, each from what is known now.
+// The numbers and tables of the page.
 
 import {format, known} from './charts.js';
 import {drawSpeedLine} from './drawings.js';
@@ -9,34 +9,34 @@ const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'S
 const LOSSES = /dropped|gaps|restarts|clock_deviation|rejected|refused/;
 
 const rms = values => Math.sqrt(values.reduce((sum, x) => sum + x * x, 0) / values.length);
-function say(id, text) { find(id).textContent = text; }
+function show(id, text) { find(id).textContent = text; }
 
 export function drawTiles() {
   const orders = ofShaft('order_amplitude'), pulses = ofShaft('pulse_error');
   const header = orders?.header ?? ofShaft('synchronous_average')?.header;
   const speed = part('shaft_speed')?.value, prediction = part('prediction');
-  say('speed', known(speed) ? `${format(speed, 5)} Hz` : '–');
+  show('speed', known(speed) ? `${format(speed, 5)} Hz` : '–');
   drawSpeedLine();
-  say('average', header ? `No. ${header.sequence}` : '–');
-  say('average-note', header ? `${header.trigger_cycles} trigger cycles, `
+  show('average', header ? `No. ${header.sequence}` : '–');
+  show('average-note', header ? `${header.trigger_cycles} trigger cycles, `
     + `${header.fundamental_cycles} revolutions of ${find('shaft').value}` : '');
   const errors = finite(pulses?.error ?? []);
-  say('pulses', errors.length ? `${withTimeUnit(rms(errors))} RMS` : '–');
+  show('pulses', errors.length ? `${withTimeUnit(rms(errors))} RMS` : '–');
   const declared = prediction?.pulse_error_standard_deviation;
-  say('pulses-note', (errors.length ? `${errors.length} pulses; ` : '')
+  show('pulses-note', (errors.length ? `${errors.length} pulses; ` : '')
     + (known(declared) ? `declared ${withTimeUnit(declared)}` : ''));
-  const judged = orderRows().flatMap(({attenuation, past, predicted: row}) =>
+  const comparisons = orderRows().flatMap(({attenuation, past, predicted: row}) =>
     finite([attenuation, ...past]).filter(() => known(row?.low))
       .map(value => value >= row.low && value <= row.high));
-  say('band', judged.length
-    ? `${(100 * judged.filter(Boolean).length / judged.length).toFixed(0)} %` : '–');
-  say('band-note', predicted().note || (judged.length
+  show('band', comparisons.length
+    ? `${(100 * comparisons.filter(Boolean).length / comparisons.length).toFixed(0)} %` : '–');
+  show('band-note', predicted().note || (comparisons.length
     ? `90 % expected; ${orders.history.length} averages` : ''));
   const report = part('missing_effect'), residual = part('residual');
   const [before, after] = [report?.error_before?.rms, report?.error_after?.rms];
-  say('error', known(before) ? `${format(before, 2)} → ${format(after, 2)}`
+  show('error', known(before) ? `${format(before, 2)} → ${format(after, 2)}`
     : known(residual?.rms) ? format(residual.rms, 2) : '–');
-  say('error-note', known(before) ? `RMS before → after; verdict: ${report.verdict}`
+  show('error-note', known(before) ? `RMS before → after; verdict: ${report.verdict}`
     : residual ? `RMS of ${residual.acquisitions} acquisitions, chi² per degree of freedom `
       + format(residual.chi2_per_dof, 3) : '');
 }
@@ -100,15 +100,15 @@ export function drawEffects() {
       `missing effect: ${effect.name} (${parameters.join('; ')})`;
     list.appendChild(document.createElement('dd')).textContent = (effect.evidence ?? '')
       + (effect.indistinguishable_from?.length
-        ? `; cannot be told from ${effect.indistinguishable_from.join(', ')}` : '');
+        ? `; not distinguishable from ${effect.indistinguishable_from.join(', ')}` : '');
   }
   find('effects').replaceChildren(list);
 }
 
 export function drawNodes() {
   const nodes = Object.entries(part('/diagnostics') ?? {}).sort(([a], [b]) => a < b ? -1 : 1);
-  fill(find('nodes'), [['node'], ['level'], ['message'], ['lost or refused'], ['other counts'],
-                       ['seen', 'number']],
+  fill(find('nodes'), [['node'], ['level'], ['message'], ['dropped or refused'], ['other counts'],
+                       ['last status', 'number']],
        nodes.map(([name, node]) => {
     const age = state.now - node.received;
     const [style, level] = age > 5 ? LEVELS[3] : LEVELS[node.level] ?? LEVELS[3];
