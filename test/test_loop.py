@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from sa_jitter_ros import loop
+from sa_jitter_ros import json_values, loop
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.loop import close_loop
@@ -42,7 +42,8 @@ def found(recording):
 
 
 def test_examples():
-    assert doctest.testmod(loop).failed == 0
+    for module in (loop, json_values):
+        assert doctest.testmod(module).failed == 0
 
 
 def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, tmp_path):

@@ -12,7 +12,7 @@ import shlex
 import sys
 import time
 
-from sa_jitter_ros.commands.parser import Parser
+from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from validation import (
     analytic_approximation, angle_laws, multi_harmonic, parametric_study, residual_kurtosis,

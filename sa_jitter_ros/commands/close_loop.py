@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 import sys
 
-from sa_jitter_ros.commands.parser import Parser
-from sa_jitter_ros.commands.recording_options import add_recording_options, read_options
+from sa_jitter_ros.commands.command_line import add_recording_options, Parser, read_options
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop

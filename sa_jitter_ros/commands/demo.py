@@ -1,36 +1,100 @@
 """
-The demo: the whole chain as separate processes over DDS, live progress, a table and figures.
+Command `demo`: the whole chain as separate processes over DDS, with progress, table and figures.
 
-Plays a recording, or a simulated gearbox without one, through tach detector, averager and
-predictor, and compares what comes out with what was predicted.
+It plays a recording, or a simulated gearbox, through tach detector, averager and predictor, and
+compares the measured with the predicted attenuation.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
+import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
+from sa_jitter_ros.commands.command_line import add_recording_options, Parser, read_options
 from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
-from sa_jitter_ros.commands.demo_watcher import Watcher
-from sa_jitter_ros.commands.parser import Parser
-from sa_jitter_ros.commands.recording_options import add_recording_options, read_options
 from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
+from sa_jitter_ros.nodes.messages import (
+    AverageMessage, decode_average, decode_prediction, PredictionMessage)
 from sa_jitter_ros.recordings import read
+from std_msgs.msg import Float64, Float64MultiArray
 
-START_TIMEOUT = 30.0  # s for discovery
-PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may hold thousands of pulses a second
+# The timeouts end a demo that hangs; a busy computer needs tens of seconds to start the nodes.
+START_TIMEOUT = 120.0  # s until the nodes have found each other
+SILENCE_TIMEOUT = 60.0  # s without a status of the node that plays the signals
+LAST_AVERAGE = 3.0  # s without a new average after the end of the signals
+PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may contain thousands of pulses a second
 LIVE_ACQUISITIONS = 4  # averages in a residual
-QUIET = 3.0  # s without a new average after the source has ended
+
+
+class Watcher(Node):
+    """Receives all results of one shaft and the diagnostics of all nodes."""
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('demo', **node_kwargs)
+        self.averages: dict[str, list[AverageMessage]] = {
+            kind: [] for kind in ('synchronous_average', 'corrected_average', 'order_amplitude',
+                                  'pulse_error', 'standard_error')}
+        self.prediction: PredictionMessage | None = None
+        self.speed = float('nan')
+        self.status: dict[str, dict[str, str]] = {}
+        self.status_time: dict[str, float] = {}
+        for kind in self.averages:
+            self.create_subscription(Float64MultiArray, f'shaft/{kind}', self._add_to(kind),
+                                     RESULT_QOS)
+        self.create_subscription(Float64MultiArray, 'prediction', self._on_prediction,
+                                 LATCHED_QOS)
+        self.create_subscription(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+
+    def _add_to(self, kind: str) -> Callable[[Float64MultiArray], None]:
+        return lambda message: self.averages[kind].append(decode_average(kind, message))
+
+    def _on_prediction(self, message: Float64MultiArray) -> None:
+        self.prediction = decode_prediction(message)
+
+    def _on_speed(self, message: Float64) -> None:
+        self.speed = message.data
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self.status_time[status.name] = time.monotonic()
+            self.status[status.name] = {
+                'message': status.message, **{item.key: item.value for item in status.values}}
+
+    def amplitudes(self) -> list[AverageMessage]:
+        """Return the order amplitudes received so far."""
+        return self.averages['order_amplitude']
+
+    def progress(self) -> str:
+        """Return one line: speed, averages so far, dropped pulses and cycles, strongest orders."""
+        dropped = {key: sum(int(values.get(key, 0)) for values in self.status.values())
+                   for key in ('pulses_dropped', 'cycles_dropped')}
+        parts = [f'speed {self.speed:8.3f} Hz', f'averages {len(self.amplitudes()):3d}',
+                 *(f'{key.replace("_", " ")} {count}' for key, count in dropped.items())]
+        if self.amplitudes():
+            table = self.amplitudes()[-1].values
+            channel = int(np.argmax(np.nansum(table[:, :, 1], axis=1)))
+            strongest = np.argsort(-np.nan_to_num(table[channel, :, 1]))[:3]
+            parts.append('strongest: ' + ', '.join(
+                f'order {table[channel, i, 0]:g} {table[channel, i, 1]:.4g}' for i in strongest))
+        return ' | '.join(parts)
 
 
 def node_command(name: str, parameters: dict[str, object]) -> list[str]:
-    """Command line of one of this package's nodes with parameters."""
+    """Return the command line of one of this package's nodes with parameters."""
     command = [sys.executable, '-c',
                f'from sa_jitter_ros.nodes.{name} import main; raise SystemExit(main())',
                '--ros-args', '--log-level', 'warn']
@@ -42,7 +106,7 @@ def node_command(name: str, parameters: dict[str, object]) -> list[str]:
 
 
 def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]:
-    """Nodes to start and their parameters; with `live` those that are only for eyes, too."""
+    """Return the nodes to start and their parameters; `live` adds those of the web page."""
     nodes: dict[str, dict[str, object]] = {
         'synchronous_averager': {
             'pulses_per_revolution': plan.pulses_per_revolution,
@@ -58,7 +122,7 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
             'follow_shaft_speed': True},
         plan.source: {**plan.source_parameters, 'playing': False}}
     if plan.waveform:
-        # as the prediction declares it: the first sample past the threshold
+        # The declared jitter is that of a pulse time which is the first sample past the threshold.
         nodes['tach_detector'] = {'interpolate': False, 'tach_type': PULSE_BLOCKS}
         nodes['synchronous_averager']['tach_type'] = PULSE_BLOCKS
     if live:
@@ -70,20 +134,27 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
 
 def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
           children: Sequence[subprocess.Popen[bytes]], *, live: bool = False) -> None:
-    """Start the source, show progress, return when it has ended and the averages are in."""
+    """Start the signals, print the progress, and return when the last average has come."""
     def spin(seconds: float) -> None:
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            executor.spin_once(timeout_sec=left)
-            dead = [child for child in children if child.poll() not in (None, 0)]
-            if dead:
-                raise SaJitterError(f'a node ended with status {dead[0].returncode}')
+        while (remaining := end - time.monotonic()) > 0.0:
+            executor.spin_once(timeout_sec=remaining)
+            ended = [child for child in children if child.poll() not in (None, 0)]
+            if ended:
+                raise SaJitterError(f'a node ended with status {ended[0].returncode}')
 
     print('waiting for the nodes ...', flush=True)
     end = time.monotonic() + START_TIMEOUT
-    listeners = ['vibration', 'tach_pulse', *(['tach_waveform'] if plan.waveform else [])]
-    started, address = None, ''
-    while started is None:
+    inputs = ['vibration', 'tach_pulse', *(['tach_waveform'] if plan.waveform else [])]
+    source = AsyncParameterClient(watcher, plan.source)
+    address = ''
+
+    def ready() -> bool:
+        return (watcher.prediction is not None and source.services_are_ready() and all(
+            watcher.count_subscribers(topic) and watcher.count_publishers(topic)
+            for topic in inputs))
+
+    while not ready() or (live and not address):
         spin(0.2)
         if time.monotonic() > end:
             raise SaJitterError(f'the nodes did not find each other within {START_TIMEOUT:g} s')
@@ -91,20 +162,19 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
             address = watcher.status.get('live_view', {}).get('address', '')
             if address:
                 print(f'open {address} in a web browser', flush=True)
-        elif watcher.prediction is not None and all(
-                watcher.count_subscribers(topic) and watcher.count_publishers(topic)
-                for topic in listeners):
-            spin(1.0)  # the graph knows of them before they know of each other
-            started = watcher.set_parameter(plan.source, 'playing', True)
-    end = time.monotonic() + plan.seconds + START_TIMEOUT
-    last, count = time.monotonic(), 0
-    while time.monotonic() < end:
+    spin(1.0)  # the graph knows the nodes before they know each other
+    source.set_parameters([Parameter('playing', value=True)])
+    start = last = time.monotonic()
+    count = 0
+    while True:
         spin(1.0)
         print(watcher.progress(), flush=True)
+        now = time.monotonic()
         if len(watcher.amplitudes()) > count:
-            last, count = time.monotonic(), len(watcher.amplitudes())
+            last, count = now, len(watcher.amplitudes())
         ended = watcher.status.get(plan.source, {}).get('message', '').startswith('ended')
-        if ended and time.monotonic() - last > QUIET:
+        silence = now - watcher.status_time.get(plan.source, start)
+        if (ended and now - last > LAST_AVERAGE) or silence > SILENCE_TIMEOUT:
             break
 
 
@@ -117,10 +187,10 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
     print('\n' + text_table(plan, amplitudes, watcher.prediction))
     pulses = watcher.averages['pulse_error']
     if pulses:
-        errors = [item.values[:, 1] for item in pulses]
-        spread = (sum(float((e**2).sum()) for e in errors) / sum(map(len, errors))) ** 0.5
-        print(f'\npulse errors recovered from the vibration: {spread * 1e6:.3g} us (standard '
-              f'deviation), declared {1e6 / plan.keyphasor_rate / 12**0.5:.3g} us')
+        errors = np.concatenate([item.values[:, 1] for item in pulses])
+        std, declared = np.sqrt(np.mean(errors**2)), 1.0 / plan.keyphasor_rate / 12**0.5
+        print(f'\nstandard deviation of the pulse errors: {1e6 * std:.3g} us recovered from the '
+              f'vibration, {1e6 * declared:.3g} us declared')
     averager = watcher.status.get('synchronous_averager', {})
     refused = averager.get('shaft.corrections_refused')
     if refused:
@@ -140,17 +210,18 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo; 0, or 2 with one line on unusable input or output."""
+    """Run the demo; return 0, or 2 after one line on unusable input or output."""
     parser = Parser(
         prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
-                        help='.npz, .mat, .wav, .csv or rosbag2; a simulated gearbox without')
+                        help='.npz, .mat, .wav, .csv or rosbag2; without: a simulated gearbox')
     parser.add_argument('--keyphasor-rate', type=float, default=0.0, metavar='HZ',
-                        help='round pulse times up to this clock, as if the keyphasor had been '
-                        'sampled so slowly')
+                        help='round pulse times up to a clock of this rate, as if the keyphasor '
+                        'had been sampled with it')
     parser.add_argument('--live', action='store_true',
-                        help='show everything live on a page for a web browser, until Ctrl-C')
-    parser.add_argument('--output', type=Path, default=Path('out'), help='folder for the figures')
+                        help='show all results on a web page while they come, until Ctrl-C')
+    parser.add_argument('--output', type=Path, default=Path('out'),
+                        help='folder for the figures (out)')
     add_recording_options(parser)
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
@@ -163,9 +234,9 @@ def main(args: Sequence[str] | None = None) -> int:
             plan = plan_recording(
                 options.recording, read(options.recording, **read_options(options)),
                 keyphasor_rate=options.keyphasor_rate, parameters=read_options(options))
-        options.output.mkdir(parents=True, exist_ok=True)  # before the run, not after it
+        options.output.mkdir(parents=True, exist_ok=True)  # fails before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
-              f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles an average')
+              f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles per average')
         if not options.live:
             print('to watch it live in a web browser: ./run demo --live')
         os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

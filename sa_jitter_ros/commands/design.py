@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 import numpy as np
-from sa_jitter_ros.commands.parser import Parser
+from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.prediction.comb import Leakage
 from sa_jitter_ros.prediction.design import (

@@ -1,9 +1,9 @@
 """
-The trace on line: which effect makes the residual of averages that came over topics.
+The trace on line: which effect causes the residual of averages received from topics.
 
-Averages carry one amplitude per order and channel, not those of single trigger cycles, and pulse
-errors without a ripple between them. Effects that only those show cannot be told here; the loop
-off line can tell them.
+Such averages contain one amplitude per order and channel, not those of single trigger cycles, and
+pulse errors without the ripple between pulses. Effects that show only there are found by the loop
+off line.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,13 +28,13 @@ from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 Array = NDArray[Any]
 
-# A clock this much faster than the declared one is no cause of anything.
+# A clock this much faster than the declared one has no effect.
 _FINE = 50.0
-# Correlation with the errors of a grid, and their span in ticks, by which a grid makes the errors.
+# Errors that correlate more with those of a grid, and span fewer ticks, are caused by its clock.
 _FOLLOWS, _ONE_TICK = 0.5, 1.1
-_DECIDER = 'close_loop on a recording, which sees inside the trigger cycles,'
-_REASON = 'the topics do not carry {}: run close_loop on a recording'
-UNTOLD = {
+_DECISIVE = 'close_loop on a recording, which contains the signals within trigger cycles,'
+_REASON = 'the topics do not contain {}: run close_loop on a recording'
+ONLY_OFF_LINE = {
     'speed_fluctuation': _REASON.format('the angle error inside the trigger cycles'),
     'interpolation_loss': _REASON.format('the samples'),
     'additive_noise': _REASON.format('the amplitudes of single trigger cycles'),
@@ -44,7 +44,7 @@ UNTOLD = {
 
 @dataclass(frozen=True)
 class MeasuredNoise(Effect):
-    """The noise that the averages themselves report, `variance` (order,) of a peak amplitude."""
+    """The noise that the averages report: `variance` (order,) of a peak amplitude."""
 
     name: ClassVar[str] = 'measured_noise'
     summary: ClassVar[str] = 'noise that the averages report'
@@ -76,9 +76,9 @@ def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
     found = trace_bench(Bench(
         observation, lines, level, pulses, clock, np.ones(len(stretch[0].raw), int),
         _scatter(observation, lines, level), fit, held_out,
-        (*declared, _measured_noise(observation, lines)), UNTOLD), progress=progress)
+        (*declared, _measured_noise(observation, lines)), ONLY_OFF_LINE), progress=progress)
     return replace(found, declared=tuple(declared), findings=tuple(
-        replace(item, rivals=(*item.rivals, 'speed_fluctuation'), decider=_DECIDER)
+        replace(item, rivals=(*item.rivals, 'speed_fluctuation'), decider=_DECISIVE)
         if item.name == 'phase_wander' else item for item in found.findings))
 
 
@@ -95,8 +95,8 @@ def _longest_stretch(averages: Sequence[ReceivedAverage]) -> Sequence[ReceivedAv
         run.append(item)
         best = list(run) if len(run) > len(best) else best
     if not best:
-        raise SignalError('no pulse errors came with the averages: set correct_jitter: true of '
-                          'the averager')
+        raise SignalError('the averages have no pulse errors: set correct_jitter: true in the '
+                          'averager')
     return best
 
 
@@ -106,7 +106,8 @@ def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> O
     kept = [int(np.argmin(np.abs(measured - order))) for order in dict.fromkeys(model.orders)
             if np.isclose(measured, order, rtol=1e-6).any()]
     if not kept:
-        raise ModelError(f'averages have the orders {named(measured)}, none of which is declared')
+        raise ModelError(f'averages have the orders {named(measured)}, none of which is declared: '
+                         'declare orders of the averager in the predictor')
     count = averages[0].trigger_cycles
     found, times = [], []
     for number, item in enumerate(averages):
@@ -134,9 +135,9 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
     """
     Return the clock of the pulse times and the pulses.
 
-    For each acquisition, what convicts the clock comes first: errors of the smoothest motion that
-    its grid allows. What predicts comes second: the recovered errors, where they follow the first
-    and do not span more than a tick, so that the grid is what makes them.
+    For each acquisition, the first errors are those of the smoothest motion that the grid of the
+    clock allows: they test the clock. The second errors predict: they are the recovered ones, if
+    these follow the first and span no more than a tick, so that the clock causes them.
     """
     times = observation.pulses.times
     items = observation.acquisitions
@@ -146,10 +147,11 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     smooth = smooth_on_grid(times, clock.rate)
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
-    seen = np.asarray(observation.stacked('errors'))
-    follow = np.corrcoef((grid - grid.mean(axis=1, keepdims=True)).ravel(), seen.ravel())[0, 1]
-    span = float(np.median(np.ptp(seen, axis=1))) * clock.rate
-    better = seen if follow > _FOLLOWS and span < _ONE_TICK else grid
+    recovered = np.asarray(observation.stacked('errors'))
+    follow = np.corrcoef(
+        (grid - grid.mean(axis=1, keepdims=True)).ravel(), recovered.ravel())[0, 1]
+    span = float(np.median(np.ptp(recovered, axis=1))) * clock.rate
+    better = recovered if follow > _FOLLOWS and span < _ONE_TICK else grid
     return clock, [
         [Pulses(item.times, item.first, errors, item.missing) for errors in pair]
         for item, pair in zip(items, zip(grid, better))]

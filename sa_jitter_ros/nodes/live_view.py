@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from sa_jitter_ros.errors import MessageError, ParameterError
+from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.live_view_board import (
     Attenuations, Board, CHANNELS, indicators_content, ORDERS, orders_content, PulseErrors,
@@ -18,7 +19,6 @@ from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, dec
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.parameters import Parameter, require_shaft_names
-from sa_jitter_ros.report.report import plain
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 LARGEST_REPORT = 1_000_000  # characters of missing_effect
@@ -127,7 +127,7 @@ class LiveView(MonitoringNode):
             raise MessageError(f'{len(message.data)} characters: send at most {LARGEST_REPORT}')
         try:
             report = json.loads(message.data, parse_constant=lambda name: None,
-                                parse_float=lambda text: plain(float(text)))
+                                parse_float=lambda text: json_values(float(text)))
         except (RecursionError, ValueError) as error:
             raise MessageError(f'the text is no JSON: {error}') from None
         if not isinstance(report, dict):

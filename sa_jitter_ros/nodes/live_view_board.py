@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage, ResidualMessage
-from sa_jitter_ros.report.report import plain
 
 FloatArray = NDArray[np.float64]
 Json = Any
@@ -108,7 +108,7 @@ class Attenuations:
 
 def header_content(message: Any) -> dict[str, Json]:
     """Return the numbers of a dataclass by name."""
-    return {name: plain(value) for name, value in asdict(message).items()
+    return {name: json_values(value) for name, value in asdict(message).items()
             if isinstance(value, (int, float))}
 
 
@@ -137,7 +137,7 @@ def waveform_content(average: AverageMessage) -> Json:
     shown = average.values[:CHANNELS]
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
     return {'header': header_content(average.header), 'points': average.values.shape[1],
-            'channels': plain(rounded(envelope(shown, points)))}
+            'channels': json_values(rounded(envelope(shown, points)))}
 
 
 def indicators_content(average: AverageMessage) -> Json:
@@ -145,24 +145,24 @@ def indicators_content(average: AverageMessage) -> Json:
     values = average.values[:CHANNELS, :INDICATORS]
     names = average.names or [f'indicator {i}' for i in range(average.values.shape[1])]
     return {'header': header_content(average.header), 'names': names[:values.shape[1]],
-            'values': plain(values)}
+            'values': json_values(values)}
 
 
 def orders_content(average: AverageMessage, history: list[FloatArray]) -> Json:
     """Return order amplitudes: fields (channel, order), attenuations of earlier averages."""
     shown = average.values[:CHANNELS, :ORDERS]
     return {'header': header_content(average.header),
-            'history': [plain(item) for item in history],
-            **{name: plain(shown[..., i]) for i, name in enumerate(average.names)}}
+            'history': [json_values(item) for item in history],
+            **{name: json_values(shown[..., i]) for i, name in enumerate(average.names)}}
 
 
 def pulses_content(average: AverageMessage, values: FloatArray) -> Json:
     """Return pulse errors: header, fields (pulse,) of the latest pulses."""
     return {'header': header_content(average.header),
-            **{name: plain(values[:, i]) for i, name in enumerate(average.names)}}
+            **{name: json_values(values[:, i]) for i, name in enumerate(average.names)}}
 
 
 def table_content(message: PredictionMessage | ResidualMessage, names: tuple[str, ...]) -> Json:
     """Return a prediction or residual: header, fields (order,)."""
     return {**header_content(message),
-            **{name: plain(message.values[:ORDERS, i]) for i, name in enumerate(names)}}
+            **{name: json_values(message.values[:ORDERS, i]) for i, name in enumerate(names)}}

@@ -1,4 +1,4 @@
-"""The figures of a report: residual over orders, distributions, and what convicted the effect."""
+"""The figures of a report: residual over orders, distributions, and the evidence of effects."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -24,7 +24,7 @@ _FEWEST_CYCLES = 3
 _MOST_PANELS = 3
 _POINTS = 200
 _BAND = 1.96
-_SPREAD = 0.6  # of the distance of two orders over which its lines are spread
+_SPREAD = 0.6  # share of the distance between orders over which the lines of one are spread
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,14 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
             'residual', 'Residual over orders',
             f'Mean attenuation of the {held_out}, observed and predicted, and the difference of '
             'the two. Every mark is one line: an order on one channel. Bars are one standard '
-            'error; 95 of 100 lines of a right prediction lie in the grey band.',
+            'error. If the prediction is right, 95 % of the lines are in the grey band.',
             _residual_figure(trace)),
         Illustration(
             'distribution', 'Distribution of the amplitudes',
-            f'Distribution function of the amplitudes of the {held_out}, over the level of their '
-            'line, and the predicted one; and of all lines together as the share of '
-            'amplitudes below each predicted probability, which is the diagonal where the '
-            'prediction is right.', _distribution_figure(trace))]
+            f'Distribution functions of the amplitudes of the {held_out}, relative to the mean '
+            'level of their line, observed and predicted. Last panel: share of all amplitudes '
+            'below each predicted probability; if the prediction is right, it is the diagonal.',
+            _distribution_figure(trace))]
     if trace.evidence is None or trace.observation.model.trigger_cycles < _FEWEST_CYCLES:
         return tuple(found)
     effects = _effects(trace)
@@ -87,7 +87,7 @@ def _effects(trace: Trace) -> tuple[Effect, ...]:
 
 
 def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:
-    """Return label, colour, prediction and residual before and, with effects, after."""
+    """Return label, colour, prediction and residual, before and after effects were added."""
     before = ('declared model', BEFORE, trace.prediction_before, trace.before)
     if not trace.findings:
         return [before]
@@ -96,7 +96,7 @@ def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:
 
 
 def _positions(trace: Trace) -> tuple[Array, Array]:
-    """Return where each line is drawn, channels spread around their order's place; the orders."""
+    """Return the position of each line, channels side by side at their order; and the orders."""
     orders, place = np.unique(trace.observation.orders[trace.lines.order], return_inverse=True)
     channels, shift = np.unique(trace.lines.channel, return_inverse=True)
     offset = _SPREAD * ((shift + 0.5) / channels.size - 0.5)
@@ -116,14 +116,14 @@ def _residual_figure(trace: Trace) -> Figure:
     for label, colour, expected, _ in versions:
         axes[0].plot(position, expected.attenuation[held_out].mean(axis=0), '_', color=colour,
                      markersize=12, markeredgewidth=2, label=f'predicted, {label}')
-    axes[0].set_ylabel('attenuation\n(1: nothing lost)')
+    axes[0].set_ylabel('attenuation\n(1: no loss)')
     axes[0].legend(fontsize='small', loc='best')
-    for row, (label, colour, _, left) in zip(axes[1:], versions):
-        half = _BAND * left.standard_error
+    for row, (label, colour, _, residual) in zip(axes[1:], versions):
+        half = _BAND * residual.standard_error
         row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
                 width=_SPREAD / np.unique(trace.lines.channel).size)
-        row.errorbar(position, left.mean, yerr=left.standard_error, fmt='o', color=colour,
-                     markersize=4, capsize=2, label=f'{label}: RMS {left.rms:.4f}')
+        row.errorbar(position, residual.mean, yerr=residual.standard_error, fmt='o', color=colour,
+                     markersize=4, capsize=2, label=f'{label}: RMS {residual.rms:.4f}')
         row.axhline(0.0, color='0.4', linewidth=0.8)
         row.use_sticky_edges = False
         row.margins(y=0.08)
@@ -154,8 +154,8 @@ def _distribution_figure(trace: Trace) -> Figure:
                             _POINTS)
             distribution = _rows(expected.distribution, held_out * trace.lines.count + line)
             one.plot(x, distribution.cdf(x).mean(axis=0), color=colour, label=label)
-        one.set(title=f'order {order:g}, {channel}', xlabel='amplitude over its mean level',
-                ylabel='share below')
+        one.set(title=f'order {order:g}, {channel}', xlabel='amplitude / mean level',
+                ylabel='cumulative share')
         one.legend(fontsize='x-small')
     _probability_panel(trace, axes[-1])
     return figure
@@ -163,13 +163,13 @@ def _distribution_figure(trace: Trace) -> Figure:
 
 def _probability_panel(trace: Trace, axes: Axes) -> None:
     """Draw the share of all amplitudes below each predicted probability."""
-    for label, colour, expected, left in _versions(trace):
+    for label, colour, expected, residual in _versions(trace):
         probability = expected.distribution.cdf(trace.amplitude.reshape(-1, 1)).reshape(
             trace.amplitude.shape)[list(trace.held_out)].ravel()
-        _observed_share(axes, probability, color=colour, label=f'{label}: KS {left.ks:.3f}')
+        _observed_share(axes, probability, color=colour, label=f'{label}: KS {residual.ks:.3f}')
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
     axes.set(title='all lines', xlabel='predicted probability',
-             ylabel='share below')
+             ylabel='cumulative share')
     axes.legend(fontsize='x-small')
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report.figures import illustrate, Illustration
+from sa_jitter_ros.report.report import number_text, parameters_text, unit_text
 
 Json = Any
 
@@ -30,12 +31,12 @@ figcaption { color: #555 }
 """
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
-    ('rms_standard_error', 'part of the RMS that is its standard error (in quadrature)'),
-    ('rms_parameter_error', 'part of the standard error that the fitted parameters cause'),
+    ('rms_standard_error', 'standard error that the RMS contains (in quadrature)'),
+    ('rms_parameter_error', 'part of this standard error that the fitted parameters cause'),
     ('chi2_per_dof', 'chi2 per degree of freedom of the amplitudes'),
     ('ks', 'Kolmogorov-Smirnov distance from the predicted distribution'),
     ('cramer_von_mises', 'Cramer-von Mises statistic'),
-    ('coverage_95', 'share of amplitudes in the 95 % band'),
+    ('coverage_95', 'share of amplitudes in the predicted 95 % band'),
     ('p_value', 'p value of the residual'))
 
 
@@ -68,24 +69,25 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
 
 
 def verdict_sentence(content: Mapping[str, Json]) -> str:
-    """Return the verdict of a report in one plain sentence."""
+    """Return the verdict of a report in one sentence."""
     before, after = content['error_before'], content['error_after']
-    error = (f'the held-out error goes from {_number(before["rms"])} to {_number(after["rms"])} '
+    rms_before, rms_after = number_text(before['rms']), number_text(after['rms'])
+    error = (f'the held-out error goes from {rms_before} to {rms_after} '
              f'(RMS of observed minus predicted attenuation), chi2 per degree of freedom from '
-             f'{_number(before["chi2_per_dof"])} to {_number(after["chi2_per_dof"])}')
-    added = ' and '.join(f'{item["name"]} ({_parameters(item)})'
+             f'{number_text(before["chi2_per_dof"])} to {number_text(after["chi2_per_dof"])}')
+    added = ' and '.join(f'{item["name"]} ({parameters_text(item)})'
                          for item in content['missing_effects'])
     if content['verdict'] == 'none':
         return (f'The declared model suffices: no significant residual (p = '
-                f'{_number(before["p_value"])}), held-out error {_number(before["rms"])} (RMS of '
-                'observed minus predicted attenuation).')
+                f'{number_text(before["p_value"])}), held-out error {rms_before} (RMS of observed '
+                'minus predicted attenuation).')
     if content['verdict'] == 'traced':
-        return f'The declared model lacks {added}: with it {error}.'
-    left = ', '.join(filter(None, (f'p = {_number(after["p_value"])}', content['remains'])))
+        return f'The declared model lacks {added}. With it {error}.'
+    remains = ', '.join(filter(None, (f'p = {number_text(after["p_value"])}', content['remains'])))
     if added:
-        return (f'The residual is not explained: even with {added} a significant one remains '
-                f'({left}); {error}.')
-    return (f'The residual is significant ({left}, held-out error {_number(after["rms"])}) and '
+        return (f'The residual is not explained: even with {added} a significant residual remains '
+                f'({remains}); {error}.')
+    return (f'The residual is significant ({remains}, held-out error {rms_after}) and '
             'none of the known effects explains it.')
 
 
@@ -99,7 +101,8 @@ def html(content: Mapping[str, Json], figures: Sequence[Illustration],
         *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
         *_effects(content['missing_effects']),
         '<h2>Error of held-out acquisitions</h2>', _error_table(content),
-        '<h2>What the residual changes with</h2>', _dependence_table(content['dependence']),
+        '<h2>Dependence of the residual on other quantities</h2>',
+        _dependence_table(content['dependence']),
         *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
         '<h2>Candidates</h2>', _candidate_table(content['candidates']),
         '<h2>Lines</h2>', _line_table(content['lines']),
@@ -121,11 +124,11 @@ def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
     for number, item in enumerate(effects, 1):
         yield f'<h2>{number}. Missing effect: {escape(item["name"])}</h2>'
         yield _table(('parameter', 'value', 'standard error', 'unit'), [
-            (name, _number(value['value']), _number(value['standard_error']), _unit(value))
-            for name, value in item['parameters'].items()])
+            (name, number_text(value['value']), number_text(value['standard_error']),
+             unit_text(value)) for name, value in item['parameters'].items()])
         text = f'Evidence: {item["evidence"]}.'
         if item['indistinguishable_from']:
-            text += (' These data cannot tell it from '
+            text += (' These data do not distinguish it from '
                      f'{", ".join(item["indistinguishable_from"])}.')
         yield f'<p>{escape(text)}</p>'
 
@@ -133,26 +136,28 @@ def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
 def _error_table(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     return _table(('', 'before', 'after'), [
-        *((text, _number(before[key]), _number(after[key])) for key, text in _ERRORS),
-        ('unsteadiness: unexplained scatter of the amplitudes, included in the scale',
-         *2 * (_number(content['unsteadiness']),))])
+        *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
+        ('unsteadiness: unexplained scatter of the amplitudes, which chi2 and p value take into '
+         'account',
+         *2 * (number_text(content['unsteadiness']),))])
 
 
 def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
     return _table(
-        ('from its lowest to its highest', 'from', 'to', 'change before', 'p value',
-         'change after', 'p value'),
-        [(item['on'].replace('_', ' '), _number(item['low']),
-          f'{_number(item["high"])} {item["unit"]}'.strip(),
+        ('quantity', 'lowest', 'highest', 'change of the residual before', 'p value',
+         'change of the residual after', 'p value'),
+        [(item['on'].replace('_', ' '), number_text(item['low']),
+          f'{number_text(item["high"])} {item["unit"]}'.strip(),
           *(text for when in ('before', 'after') for text in (
-              f'{_number(item[when]["change"])} ± {_number(item[when]["standard_error"])}',
-              _number(item[when]['p_value'])))) for item in rows])
+              f'{number_text(item[when]["change"])} ± {number_text(item[when]["standard_error"])}',
+              number_text(item[when]['p_value'])))) for item in rows])
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
     return _table(('round', 'effect', 'held-out score', 'p value', 'outcome'), [
-        (item['round'], item['name'], _number(item['held_out_score']), _number(item['p_value']),
-         item['rejected_because'] or 'added') for item in candidates])
+        (item['round'], item['name'], number_text(item['held_out_score']),
+         number_text(item['p_value']), item['rejected_because'] or 'added')
+        for item in candidates])
 
 
 def _line_table(lines: Sequence[Mapping[str, Json]]) -> str:
@@ -160,13 +165,13 @@ def _line_table(lines: Sequence[Mapping[str, Json]]) -> str:
     return _table(
         ('order', 'channel', 'amplitude', 'observed attenuation', 'predicted before',
          'predicted after', 'standard error'),
-        [(_number(item['order']), item['channel'], *(_number(item[key]) for key in keys))
+        [(number_text(item['order']), item['channel'], *(number_text(item[key]) for key in keys))
          for item in lines])
 
 
 def _declared_table(content: Mapping[str, Json]) -> str:
-    rows = [(key, _number(value)) for key, value in content['declared'].items()]
-    rows += [('measured trigger_speed', _number(content['measured_speed'])),
+    rows = [(key, number_text(value)) for key, value in content['declared'].items()]
+    rows += [('measured trigger_speed', number_text(content['measured_speed'])),
              ('recordings', ', '.join(content['recordings'])),
              ('attenuation measured against', content['against']),
              ('acquisitions fitted', content['acquisitions']['fit']),
@@ -191,29 +196,3 @@ def _cell(value: Json) -> str:
     text = str(value)
     kind = ' class="number"' if re.fullmatch(r'–|[-\d.e+]+', text) else ''
     return f'<td{kind}>{escape(text)}</td>'
-
-
-def _parameters(effect: Mapping[str, Json]) -> str:
-    return ', '.join(
-        f'{name} = {_with_error(item["value"], item["standard_error"])} {_unit(item)}'.rstrip()
-        for name, item in effect['parameters'].items())
-
-
-def _with_error(value: Json, error: Json) -> str:
-    if isinstance(value, list):
-        errors = error if isinstance(error, list) else [error] * len(value)
-        return '[' + ', '.join(_with_error(*pair) for pair in zip(value, errors)) + ']'
-    return _number(value) + (f' ± {error:.2g}' if isinstance(error, float) else '')
-
-
-def _unit(parameter: Mapping[str, Json]) -> str:
-    return '' if parameter['unit'] == '1' else str(parameter['unit'])
-
-
-def _number(value: Json) -> str:
-    """Return a value as people read it, a dash for what is undefined."""
-    if value is None:
-        return '–'
-    if isinstance(value, list):
-        return '[' + ', '.join(_number(item) for item in value) + ']'
-    return f'{value:.4g}' if isinstance(value, float) else str(value)

@@ -1,8 +1,7 @@
-"""The report of a trace as data: what `report.json` holds, and numpy turned into plain JSON."""
+"""The content of `report.json`, and its summary as text."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-import math
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.json_values import json_values
 
 Json = Any
 
@@ -27,7 +27,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'predicted_after': trace.prediction_after.attenuation[list(trace.held_out), i].mean(),
         'standard_error': trace.after.standard_error[i],
     } for i, (c, g) in enumerate(zip(trace.lines.channel, trace.lines.order))]
-    content: Mapping[str, Json] = plain({
+    content: Mapping[str, Json] = json_values({
         'declared': {**asdict(observation.model), 'trigger_speed': observation.declared_speed,
                      'effects': {effect.name: effect.values for effect in trace.declared}},
         'measured_speed': observation.model.trigger_speed,
@@ -64,12 +64,11 @@ def summary(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     text = [f'verdict: {content["verdict"]}', *content['remarks']]
     for effect in content['missing_effects']:
-        values = ', '.join(f'{name} = {_number(item["value"])} {item["unit"]}'
-                           for name, item in effect['parameters'].items())
-        text.append(f'missing effect: {effect["name"]} ({values})')
+        text.append(f'missing effect: {effect["name"]} ({parameters_text(effect)})')
         text.append(f'  {effect["evidence"]}')
         if effect['indistinguishable_from']:
-            text.append(f'  cannot be told from: {", ".join(effect["indistinguishable_from"])}')
+            text.append(f'  these data do not distinguish it from: '
+                        f'{", ".join(effect["indistinguishable_from"])}')
     text.append(f'held-out error (RMS of observed minus predicted attenuation): '
                 f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
     text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
@@ -78,34 +77,15 @@ def summary(content: Mapping[str, Json]) -> str:
         text.append(content['remains'])
     if content['unsteadiness']:
         text.append('unexplained scatter of the amplitudes (unsteadiness): '
-                    f'{content["unsteadiness"]:.2%}, included in the scale of chi2 and p')
+                    f'{content["unsteadiness"]:.2%}; chi2 and p value take it into account')
     return '\n'.join(text)
 
 
-def plain(value: Any) -> Json:
-    """Return a value with the types of JSON; numbers that are not finite become None."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray) and value.dtype.kind == 'f':
-        content = value.astype(object)
-        content[~np.isfinite(value)] = None
-        return content.tolist()
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [plain(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value
-
-
 def _not_compared(trace: Trace) -> Sequence[str]:
-    """Say which declared orders have no line to compare."""
+    """Return a remark for each declared order that has no line to compare."""
     orders = trace.observation.orders
-    return [f'order {orders[g]:g} was declared and is not compared: on no channel is it as '
-            'coherent from cycle to cycle as the other lines'
+    return [f'order {orders[g]:g} is declared but not compared: on no channel is its phase as '
+            'constant from cycle to cycle as that of the other lines'
             for g in np.setdiff1d(np.arange(orders.size), trace.lines.order)]
 
 
@@ -121,7 +101,7 @@ def _effect(finding: Finding) -> Mapping[str, Json]:
     ranges = parameter_ranges(type(finding.effect))
     evidence = finding.evidence
     if finding.rivals:
-        evidence += f'; {finding.decider} would tell it from {", ".join(finding.rivals)}'
+        evidence += f'; {finding.decider} would distinguish it from {", ".join(finding.rivals)}'
     return {
         'name': finding.name,
         'parameters': {name: {'value': value,
@@ -138,7 +118,29 @@ def _candidate(item: Candidate) -> Mapping[str, Json]:
             'added': not item.rejected_because}
 
 
-def _number(value: Json) -> str:
+def parameters_text(effect: Mapping[str, Json]) -> str:
+    """Return the parameters of an effect of the report, with standard errors and units."""
+    return ', '.join(
+        f'{name} = {_with_error(item["value"], item["standard_error"])} {unit_text(item)}'.rstrip()
+        for name, item in effect['parameters'].items())
+
+
+def unit_text(parameter: Mapping[str, Json]) -> str:
+    """Return the unit of a parameter of the report; empty for a number without unit."""
+    return '' if parameter['unit'] == '1' else str(parameter['unit'])
+
+
+def number_text(value: Json) -> str:
+    """Return a value of the report with 4 digits, a dash for an undefined one."""
+    if value is None:
+        return '–'
     if isinstance(value, list):
-        return '[' + ', '.join(_number(item) for item in value) + ']'
+        return '[' + ', '.join(number_text(item) for item in value) + ']'
     return f'{value:.4g}' if isinstance(value, float) else str(value)
+
+
+def _with_error(value: Json, error: Json) -> str:
+    if isinstance(value, list):
+        errors = error if isinstance(error, list) else [error] * len(value)
+        return '[' + ', '.join(_with_error(*pair) for pair in zip(value, errors)) + ']'
+    return number_text(value) + (f' ± {error:.2g}' if isinstance(error, float) else '')

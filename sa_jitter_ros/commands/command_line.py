@@ -1,0 +1,34 @@
+"""Command lines: a parser with errors of one line, and the options of commands for recordings."""
+
+import argparse
+from typing import Any, NoReturn
+
+# Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
+_READ_OPTIONS = ('sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the error and exit with status 2."""
+        self.exit(2, f'{self.prog}: {message}\n')
+
+
+def add_recording_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options that a `.wav` or `.csv` needs, named as the parameters of the player."""
+    group = parser.add_argument_group('channels, if the file does not name them (.wav, .csv)')
+    group.add_argument('--tach-channel', default='', metavar='CHANNEL',
+                       help='name, or number from 0, of the channel with the tach waveform')
+    group.add_argument('--vibration-channels', nargs='+', default=(), metavar='CHANNEL',
+                       help='names or numbers of the vibration channels (default: all except the '
+                       'tach waveform)')
+    group.add_argument('--time-column', default='', metavar='COLUMN',
+                       help='name or number of the column of a .csv with the times in s')
+    group.add_argument('--sample-rate', type=float, metavar='HZ',
+                       help='sampling rate of the vibration, if the file does not contain it')
+
+
+def read_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that were given, as keywords of `read` and parameters of the player."""
+    return {name: value for name in _READ_OPTIONS if (value := getattr(options, name))}

@@ -1,0 +1,31 @@
+"""Results as values that JSON has."""
+
+from collections.abc import Mapping
+import math
+from typing import Any
+
+import numpy as np
+
+
+def json_values(value: Any) -> Any:
+    """
+    Return arrays and tuples as lists, and numbers that are not finite as None.
+
+    >>> json_values({'mean': np.array([[0.5, np.nan]]), 'orders': (19, 38)})
+    {'mean': [[0.5, None]], 'orders': [19, 38]}
+    """
+    if isinstance(value, Mapping):
+        return {str(key): json_values(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray) and value.dtype.kind == 'f':
+        content = value.astype(object)
+        content[~np.isfinite(value)] = None
+        return content.tolist()
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [json_values(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value
