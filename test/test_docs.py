@@ -6,7 +6,8 @@ it prints. A first line `# NAME` saves a block in that folder. Commands of this 
 as far as one process can: nodes are constructed with the parameters given, tables are printed.
 What cannot be run says so above the block, `<!-- not run: REASON -->`, and is skipped with it.
 
-`python test/test_docs.py` writes docs/parameters.md, the list of all parameters.
+`python test/test_docs.py` writes docs/parameters.md, the list of all parameters, and the figures
+that Python blocks draw.
 """
 
 from contextlib import contextmanager, redirect_stdout
@@ -20,11 +21,13 @@ import os
 from pathlib import Path
 import re
 import shlex
+from shutil import copyfile
 import subprocess
 import sys
 import tempfile
 
 from matplotlib.figure import Figure
+from matplotlib.image import imread
 import numpy as np
 import pytest
 from rclpy.context import Context
@@ -178,6 +181,8 @@ def run_python(block):
 
 
 PYTHON = [block for block in BLOCKS if block.language == 'python']
+FIGURES = [(block.document, name) for block in PYTHON
+           for name in re.findall(r"savefig\('([\w.-]+)'", block.text)]
 
 
 @pytest.mark.parametrize('document', [
@@ -187,6 +192,26 @@ def test_python_runs_and_prints_what_the_document_shows(document):
     for block in PYTHON:
         if block.document == document and not block.reason:
             assert stripped(run_python(block)) == stripped(SHOWN.get(block, '')), block.place
+
+
+@pytest.mark.parametrize(('document', 'name'), FIGURES)
+def test_figure_is_the_one_that_the_document_draws(document, name):
+    drawn = folder_of(document) / name
+    if not drawn.exists():
+        draw(document)
+    assert f'figures/{name})' in document.read_text(encoding='utf-8')
+    made, held = imread(drawn), imread(ROOT / 'docs' / 'figures' / name)
+    assert made.shape == held.shape, 'run: python test/test_docs.py'
+    # versions of matplotlib place a line of text or a tick a pixel apart
+    assert np.abs(made - held).mean() < 0.01, 'run: python test/test_docs.py'
+
+
+def draw(document):
+    """Run the Python of a document up to its last figure."""
+    blocks = [block for block in PYTHON if block.document == document and not block.reason]
+    last = max(i for i, block in enumerate(blocks) if 'savefig(' in block.text)
+    for block in blocks[:last + 1]:
+        run_python(block)
 
 
 def stripped(text):
@@ -520,3 +545,6 @@ def test_files_and_tests_that_are_named_exist(document):
 if __name__ == '__main__':
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'OFF'
     (ROOT / 'docs' / 'parameters.md').write_text(table_of_parameters(), encoding='utf-8')
+    for drawing, figure in FIGURES:
+        draw(drawing)
+        copyfile(folder_of(drawing) / figure, ROOT / 'docs' / 'figures' / figure)
