@@ -1,5 +1,5 @@
 """
-Speed and accuracy of the core beside what people use now, and how its cost grows.
+Speed and accuracy of the core beside other software, and how its cost grows.
 
 `python benchmarks/core_speed.py` writes its figures as JSON to the standard output.
 `performance.py` starts it in an environment of its own that holds the other packages.

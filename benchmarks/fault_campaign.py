@@ -131,7 +131,7 @@ class Campaign:
                     continue
                 if settings[-1].get('correct_jitter'):
                     self.corrected['corrected' if corrected else 'refused'] += 1
-                # the last whole average of the scene: little is left in any queue
+                # the last whole average of the scene: hardly anything waits in a queue
                 if place.run is scene.run and scene.tail <= place.first and (
                         2 * place.last - place.first + SLACK >= scene.last):
                     well.add(key)
@@ -177,10 +177,10 @@ class Campaign:
 
         def complete() -> bool:
             self._check(self._scene)
-            return not any(inbox.left for inbox in inboxes.values())
+            return not any(inbox.incomplete for inbox in inboxes.values())
         if not self.graph.spin(complete, 2.0):
-            self.wrong += [f'{key[0]}: {inbox.left} messages of no average of {key[1]}'
-                           for key, inbox in inboxes.items() if inbox.left]
+            self.wrong += [f'{key[0]}: {inbox.incomplete} messages of no average of {key[1]}'
+                           for key, inbox in inboxes.items() if inbox.incomplete]
         if self._base:
             grown = {key: int(value) - int(self._base[key]) for key, value in status.items()
                      if value.isdecimal() and self._base.get(key, '').isdecimal()}
@@ -253,10 +253,11 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
         f'{sum(faults.values()):,} faults in {found["scenes"]} scenes and {found["seconds"]:.0f} '
         f's (seed {found["seed"]}): {sum(averages.values()):,} averages were published and '
         f'checked ({", ".join(f"{name} {count:,}" for name, count in averages.items())}), '
-        f'**{len(found["wrong"])} things were wrong**, {len(found["died"])} nodes died of '
-        f'themselves. Of the averages with `correct_jitter`, {corrected["corrected"]:,} were '
-        f'corrected and {corrected["refused"]:,} refused; {found["residuals"]:,} residuals were '
-        f'recomputed and {sum(verdicts.values()):,} traces looked through '
+        f'**failed checks: {len(found["wrong"])}**, nodes that ended by themselves: '
+        f'{len(found["died"])}. Of the averages with `correct_jitter`, '
+        f'{corrected["corrected"]:,} were corrected and {corrected["refused"]:,} refused; '
+        f'{found["residuals"]:,} residuals were recomputed and {sum(verdicts.values()):,} traces '
+        'checked '
         f'({", ".join(f"{name} {count:,}" for name, count in verdicts.items())}). In '
         f'{len(extra) - len(again)} of {len(extra)} scenes all averages were back '
         f'within the faultless 1.4 s at its end{later}.')
@@ -281,6 +282,7 @@ def draw_faults(found: Mapping[str, Any], folder: Path) -> None:
     bars.set_yticks(place, kinds, fontsize=7)
     bars.set_ylim(-0.6, len(kinds) - 0.4)
     bars.set_xscale('log')
+    bars.set_xlabel('number')
     bars.legend(loc='upper center', bbox_to_anchor=(0.5, 1.07), ncols=2, fontsize=8)
     bars.grid(axis='x', alpha=0.3)
     roles = list(dict.fromkeys(role for role, _ in found['rss']))

@@ -1,12 +1,12 @@
 """
 Check averages and their corrections against the true vibration of the cycles that they claim.
 
-Only the messages are known: which source and teeth an average is of follows from its times, and at
-which angle it begins from its phases. The rest must then agree: amplitudes, phases, waveform,
-counts, and its place behind the averages before it.
+The check uses the messages alone. The times of an average give its source and teeth, its phases
+the angle at which it begins. The rest must then agree: amplitudes, phases, waveform, counts, and
+its place after the averages before it.
 
-A corrected average must be exactly that between the pulses less the errors that were published
-with it. These must be the errors of the teeth within their standard errors, but for a common
+A corrected average must be exactly that between the pulses minus the errors that were published
+with it. These must be the errors of the teeth within their standard errors, except for a common
 delay, which no vibration shows. Then the corrected values are true within their standard errors.
 """
 
@@ -19,11 +19,11 @@ from fault_machine import equal_weights, exponential_weights, FloatArray, Run, T
 import numpy as np
 from sa_jitter_ros.nodes.messages import AverageMessage
 
-AMPLITUDE = 5e-4  # of the largest value: what band-limited interpolation may cost an amplitude
-POINT = 4e-3  # and a point of the waveform, where samples are on one side of it only
+AMPLITUDE = 5e-4  # of the largest value: error of an amplitude by band-limited interpolation
+POINT = 4e-3  # the same of a point of the waveform with samples on one side only
 BELIEVED = 0.15  # of the pitch: pulses displaced by more must not be used
-LONGEST = 60  # trigger cycles that an exponential average is followed back
-RUNS = 8  # back to which averages are looked for
+LONGEST = 60  # trigger cycles of an exponential average that are computed
+RUNS = 8  # latest runs among which the source of an average is looked for
 LIMIT = 6.0  # standard errors: two of a thousand million normal variables are farther out
 MEAN = 1e-12  # s that recovered errors may be off on average: rounding
 
@@ -34,7 +34,7 @@ class WrongAverageError(AssertionError):
 
 @dataclass(frozen=True)
 class Place:
-    """Where an average was found; `zeros` are the teeth at which its angle may have been 0."""
+    """The run and teeth of an average; at one of the teeth `zeros` its angle was 0."""
 
     run: Run
     first: int
@@ -45,7 +45,7 @@ class Place:
 
 def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
                     values: Mapping[str, Any], gain: FloatArray) -> bool:
-    """Whether a waveform is the mean of a window that begins `start` trigger cycles from 0."""
+    """Tell whether a waveform is the mean of a window, `start` trigger cycles from 0."""
     r, count = window.cycles, window.trigger_cycles
     whole = window.waveforms(start, waveform.values.shape[1])
     cycles = len(whole)
@@ -83,7 +83,7 @@ class ShaftChecker:
         self._sequence, self.last = sequence, None
 
     def check(self, amplitude: AverageMessage, waveform: AverageMessage) -> Place:
-        """Return where the average is of; raises `WrongAverageError`."""
+        """Return the run and teeth of the average; raises `WrongAverageError`."""
         header = amplitude.header
         if waveform.header != header:
             raise WrongAverageError(f'{self._name}: waveform and amplitudes differ in {header}')

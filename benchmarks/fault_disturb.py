@@ -1,4 +1,4 @@
-"""What is done to the nodes themselves while they run, beside the faults of the source."""
+"""Faults of the nodes while they run: kills, stops, and changes of parameters."""
 
 from collections.abc import Callable
 from typing import Any
@@ -63,7 +63,7 @@ class Disturber:
         self._asked: list[tuple[str, str, Any, bool, Future]] = []
 
     def plan(self, *, kills: bool) -> list[Callable[[], None]]:
-        """Return what happens during a scene, none of which spoils another."""
+        """Return the disturbances of a scene, which do not interfere with each other."""
         rng = self.rng
         if kills and rng.random() < 0.12:
             role = str(rng.choice(['direct', 'direct', *ROLES]))

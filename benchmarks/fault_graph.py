@@ -70,7 +70,7 @@ ROLES = {
 #: Topics of the averages that are checked, by role and shaft.
 SHAFTS = {('direct', 'tach'): 'direct/tach', ('direct', 'gear'): 'direct/gear',
           ('averager', 'shaft'): 'shaft'}
-#: What of an average is looked at; the latter two come with a corrected one only.
+#: Topics of an average that are checked; the last two come with a corrected average only.
 KINDS = ('order_amplitude', 'synchronous_average', 'corrected_average', 'pulse_error')
 
 
@@ -81,12 +81,12 @@ def shown(value: Any) -> str:
 
 @dataclass
 class Life:
-    """A process of a role and what was heard of it."""
+    """A process of a role, its last status and its memory over time."""
 
     process: subprocess.Popen[bytes]
     started: float
     status: dict[str, str] = field(default_factory=dict)
-    heard: float = 0.0
+    status_time: float = 0.0
     rss: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -101,7 +101,7 @@ class Received:
 
 
 class Inbox:
-    """Averages of one shaft as they come; what belongs together is put together in its order."""
+    """Averages of one shaft as they arrive, put together from the messages of their topics."""
 
     def __init__(self, node: Any, topic: str) -> None:
         self._waiting: dict[str, list[AverageMessage]] = {kind: [] for kind in KINDS}
@@ -129,13 +129,13 @@ class Inbox:
         return found
 
     def forget(self) -> None:
-        """Drop what a killed node published only half of."""
+        """Drop the messages of averages that a killed node did not complete."""
         for messages in self._waiting.values():
             messages.clear()
 
     @property
-    def left(self) -> int:
-        """Messages that belong to no complete average."""
+    def incomplete(self) -> int:
+        """Return the number of messages that belong to no complete average."""
         return sum(map(len, self._waiting.values()))
 
 
@@ -191,12 +191,12 @@ class Graph:
             for role, life in self.lives.items():
                 if status.name == ROLES[role].name:
                     life.status = {item.key: item.value for item in status.values}
-                    life.heard = time.monotonic()
+                    life.status_time = time.monotonic()
 
     # --- processes ---
 
     def start(self, roles: Sequence[str]) -> None:
-        """Start nodes and wait until they are heard and hear."""
+        """Start nodes and wait until they publish their status and are subscribed."""
         before = {topic: item.get_subscription_count() for topic, item in self.publishers.items()}
         for role in roles:
             item = ROLES[role]
@@ -211,8 +211,8 @@ class Graph:
                 self.past.append((role, self.lives[role]))
             self.lives[role] = Life(
                 subprocess.Popen([sys.executable, '-c', code, *arguments]), time.monotonic())
-        if not self.spin(lambda: all(self.lives[role].heard for role in roles), 60.0):
-            raise RuntimeError(f'{roles} were not heard within 60 s')
+        if not self.spin(lambda: all(self.lives[role].status_time for role in roles), 60.0):
+            raise RuntimeError(f'{roles} sent no status within 60 s')
         wanted = {'direct': ('vibration', 'tach_pulse'), 'averager': ('vibration',),
                   'detector': ('tach_waveform',), 'predictor': ('shaft_speed',),
                   'analyser': ('shaft/order_amplitude', 'shaft/pulse_error', 'prediction')}
@@ -262,10 +262,10 @@ class Graph:
         """Serve callbacks until something is true, at most `limit` s; return whether it is."""
         end = time.monotonic() + limit
         while not until():
-            left = end - time.monotonic()
-            if left <= 0.0:
+            remaining = end - time.monotonic()
+            if remaining <= 0.0:
                 return False
-            self._executor.spin_once(timeout_sec=min(left, 0.05))
+            self._executor.spin_once(timeout_sec=min(remaining, 0.05))
         return True
 
     def send(self, topic: str, message: Any) -> None:
@@ -283,8 +283,8 @@ class Graph:
         """Return a node's status once it says the same twice: it has had all that was sent."""
         life, last = self.lives[role], {'': ''}
         while life.status != last:
-            last, heard = life.status, life.heard
-            if not self.spin(lambda heard=heard: life.heard > heard, 20.0):
+            last, status_time = life.status, life.status_time
+            if not self.spin(lambda status_time=status_time: life.status_time > status_time, 20.0):
                 self.died.append(f'{role} is silent')
                 break
         return life.status

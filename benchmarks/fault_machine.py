@@ -1,9 +1,9 @@
 """
-A machine whose truth is known, source by source, and the averages that it must give.
+A machine whose vibration is known, and the averages that follow from it.
 
-A *run* is what one source sends on one clock: cosines at orders of the tach shaft, which swell
-slowly, so that no two stretches are alike; and teeth, of which some are missing or displaced. What
-an average must be is integrated from the cosines themselves, between the pulses as they were sent.
+A *run* is what one source sends on one clock: cosines at orders of the tach shaft, whose amplitude
+changes slowly, so that no two intervals are alike; and teeth, some of them missing or displaced.
+The expected average is the integral of the cosines between the pulses as they were sent.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,7 +21,7 @@ TEETH = 2  # pulses in a revolution
 SWELL_RATE = 0.11  # Hz
 EDGE = 4.0 / RATE  # s that an edge of the tach waveform takes
 WIDTH = 10.0 / RATE  # s of a pulse at half its height
-MESH = 30.0  # order of the tach shaft that tells of the pulses
+MESH = 30.0  # order of the tach shaft that shows the pulse errors
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(160)
 NODES, WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 

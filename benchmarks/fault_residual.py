@@ -1,8 +1,8 @@
 """
-Whether residuals are those of averages and a prediction that were published, and reports whole.
+Check residuals against the published averages and predictions, and reports for completeness.
 
-All channels of the machine carry the same vibration, each times a factor: they tell the same
-attenuation with the same relative error, so that a residual is recomputed from the first of them.
+All channels of the machine carry the same vibration, each times a factor. They have the same
+attenuation with the same relative error, so the first channel suffices to recompute a residual.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ class WrongResidualError(WrongAverageError):
 
 
 class ResidualChecker:
-    """Checks residuals against the corrected averages and predictions that were heard."""
+    """Checks residuals against the corrected averages and predictions that were received."""
 
     def __init__(self) -> None:
         self._averages: list[AverageMessage] = []

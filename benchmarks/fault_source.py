@@ -108,7 +108,7 @@ class FaultySource:
         else:
             channels = int(rng.choice([n for n in (1, 2, 3) if n != run.channels]))
             self._start(clock=time, index=index, channels=channels, keep=True)
-            scene.rejected += 1  # only the second block tells that it is not a fault
+            scene.rejected += 1  # only the second block shows that it is not a fault
 
     # --- scenes ---
 

@@ -161,7 +161,7 @@ def measure(channels: int, seconds: float, *, large: bool = False, block_seconds
             executor.spin_once(timeout_sec=0.2)
 
     try:
-        spin(lambda: sink.status, 60.0)  # until the averager is heard
+        spin(lambda: sink.status, 60.0)  # until the averager sends its status
         source = subprocess.Popen(
             [sys.executable, __file__, '--publish', str(channels), str(seconds), str(length)],
             stdout=subprocess.PIPE, text=True, env=transport(large),

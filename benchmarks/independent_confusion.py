@@ -1,8 +1,8 @@
 """
 The loop on machines of another simulator: what it finds, and how wrong its numbers are.
 
-`python benchmarks/independent_confusion.py` draws machines (`independent_machines`), lets happen
-to them what their declared model lacks (`independent_effects`), closes the loop on recording and
+`python benchmarks/independent_confusion.py` draws machines (`independent_machines`) with effects
+that their declared model lacks (`independent_effects`), closes the loop on recording and
 parameter file as a user does, and judges the report. It writes one line of JSON a run to the
 standard error and prints a table at the end.
 """
@@ -34,7 +34,7 @@ _SCATTER = ('additive_noise', 'amplitude_modulation', 'interfering_tone')
 @dataclass(frozen=True)
 class Run:
     """
-    What the loop said of one machine.
+    What the loop reported of one machine.
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
     right. `before` and `after` are RMS residuals less their standard errors, in quadrature;
@@ -136,7 +136,7 @@ def _standard_errors(stated: Mapping[str, Any], truth: Any) -> float:
     if value.shape != np.shape(truth):
         return float('nan')
     off = value - truth
-    off = off - off[np.isfinite(error)].mean() if off.ndim else off  # None: a mark never seen
+    off = off - off[np.isfinite(error)].mean() if off.ndim else off  # None: a mark without pulses
     with np.errstate(divide='ignore', invalid='ignore'):
         z = off / error
     return float(np.sqrt(np.nanmean(z**2))) if z.ndim else float(z)

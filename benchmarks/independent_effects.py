@@ -1,10 +1,10 @@
 """
-What may happen to the machines of `independent_machines`, at a size that matters.
+Effects on the machines of `independent_machines`, at a size that matters.
 
-The contract's effects, and others that are in no module. Those on the mean are grown until they
-change the mean attenuation by a drawn RMS over the orders, counted by definition on the machine's
-own pulses; those on the scatter until the amplitude scatters a drawn number of times more than
-declared.
+These are the effects of the package, and others that it does not know. An effect on the mean grows
+until it changes the mean attenuation by a drawn RMS over the orders, which is computed from the
+pulses of the machine; an effect on the scatter grows until the amplitude scatters a drawn number
+of times more than declared.
 """
 
 from collections.abc import Callable, Mapping

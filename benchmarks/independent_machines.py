@@ -1,11 +1,11 @@
 """
-Machines of another simulator: nothing of `sa_jitter_ros` is used or known here.
+Machines of another simulator, which uses nothing of `sa_jitter_ros`.
 
 A machine turns by a closed-form angle, so that pulses and samples are exact at any time: a tach
 shaft whose marks make pulses; gears on a shaft of interest whose orders, sidebands and undeclared
-orders make the vibration. It is drawn at random. `Disturbance` holds what may happen to it
-beyond the declared model, which is: steady speed, pulses off by independent uniform errors of one
-keyphasor sample, white noise.
+orders make the vibration. All is drawn at random. The declared model is: steady speed, independent
+pulse errors, uniform over one keyphasor sample, and white noise. `Disturbance` holds deviations
+from it.
 """
 
 from collections.abc import Callable

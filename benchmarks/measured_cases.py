@@ -1,5 +1,5 @@
 """
-The loop on measured machines: what `close_loop` finds where nobody knows the truth.
+The loop on measured machines, whose true effects are unknown: what `close_loop` finds.
 
 Run `python benchmarks/measured_cases.py --data FOLDER` with the recordings that
 docs/measured_cases.md names; it prints the tables of that page. `--figures DIR` draws its
@@ -102,7 +102,7 @@ def other_cases() -> list[Case]:
 
 
 def transferred(clock: float, period_std: float) -> tuple[Case, Case]:
-    """Return channels that no fit has seen without and with the effect, declared, not fitted."""
+    """Return channels outside the fit, without the effect and with it declared."""
     model = {**GEAR0, 'keyphasor_rate': clock}
     effect = {'enabled': True, 'clock_rate': clock, 'period_std': period_std}
     recordings = [gear0(clock, _SECOND_HALF)]
@@ -132,7 +132,7 @@ def run(case: Case, data: Path) -> Case:
 
 
 def transfer_table(period_std: float, data: Path) -> str:
-    """Return what the effect leaves at clocks and on channels that the fit has not seen."""
+    """Return the RMS without and with the effect, at clocks and channels outside the fit."""
     lines = ['| clock | RMS without the effect | RMS with it |', '|---|---|---|']
     for clock in CLOCKS:
         if clock != FITTED:

@@ -1,4 +1,4 @@
-"""What the pages of measured numbers share: tables, and sections that are written by a command."""
+"""Tables and sections of the pages of measured numbers, which commands write."""
 
 from collections.abc import Iterable, Mapping, Sequence
 import re

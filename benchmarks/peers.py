@@ -1,10 +1,10 @@
 """
-What people use to average synchronously, and the core, as functions of one record.
+Synchronous averages by other software and by the core, as functions of one record.
 
 Each takes a `Record` and returns the average over one cycle of the shaft of interest, (channel,
 angle). The algorithms of MATLAB's `tsa` follow its documentation (Signal Processing Toolbox,
-`tsa`, section Algorithms); other packages are called as their own documentation says, and left
-out, with the reason, where they cannot be imported.
+`tsa`, section Algorithms); other packages are called as their documentation says. A package that
+cannot be imported is skipped, with the reason.
 """
 
 from collections.abc import Callable, Iterator

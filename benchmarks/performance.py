@@ -31,8 +31,8 @@ OURS = 'sa_jitter_ros, resampling and mean'
 REFERENCE = 'quintic spline'
 
 
-def plain_environment() -> dict[str, str]:
-    """Environment for a Python without ROS: one thread of linear algebra, this source tree."""
+def environment_without_ros() -> dict[str, str]:
+    """Return an environment without ROS, with one thread of linear algebra and this tree."""
     environment = {key: value for key, value in os.environ.items()
                    if key not in (WHEELS, 'PYTHONHOME')
                    and not (key == 'LD_LIBRARY_PATH' and WHEELS in os.environ)}
@@ -40,17 +40,17 @@ def plain_environment() -> dict[str, str]:
 
 
 def peer_python() -> str:
-    """Python of the environment that holds the peers, which is made at the first call."""
+    """Return the Python of the environment with the peers, which the first call makes."""
     python = HERE / '.venv' / 'bin' / 'python'
     if not python.exists():
         newest = shutil.which('python3.13')
         usable = newest and not subprocess.run([newest, '-c', ''], capture_output=True).returncode
         subprocess.run([newest if usable else sys.executable, '-m', 'venv', HERE / '.venv'],
-                       check=True, env=plain_environment())
+                       check=True, env=environment_without_ros())
     for names in PEERS:
         done = subprocess.run(
             [python, '-m', 'pip', 'install', '--quiet', '--disable-pip-version-check', *names],
-            env=plain_environment(), capture_output=True, text=True, check=False)
+            env=environment_without_ros(), capture_output=True, text=True, check=False)
         if done.returncode:
             print(f'performance: cannot install {names[-1]}: '
                   f'{done.stderr.strip().splitlines()[-1]}', file=sys.stderr)
@@ -71,7 +71,7 @@ def measure(quick: bool) -> dict[str, Any]:
     small = ['--scale', '0.1', '--rounds', '2'] if quick else []
     brief = ['--seconds', '6', '--channels', '8', '--large', '8', '--latency-seconds', '0'
              ] if quick else []
-    return {'core': run(peer_python(), 'core_speed.py', small, plain_environment()),
+    return {'core': run(peer_python(), 'core_speed.py', small, environment_without_ros()),
             'loop': run(sys.executable, 'loop_speed.py', small, environment),
             'graph': run(sys.executable, 'graph_speed.py', brief, environment)}
 
@@ -218,14 +218,14 @@ def _draw_core(comparison: Mapping[str, Any]) -> Figure:
     for name, row in comparison['rows'].items():
         if row['gains'] is None:
             continue
-        own = name.startswith('sa_jitter')
+        ours = name.startswith('sa_jitter')
         below = name in (OURS, 'tsa linear')  # their labels would meet another
         error = abs(row['gains'][-1])
-        axes.loglog(row['nanoseconds'], error, 'o', color='tab:blue' if own else 'tab:gray')
+        axes.loglog(row['nanoseconds'], error, 'o', color='tab:blue' if ours else 'tab:gray')
         axes.annotate(name.replace('sa_jitter_ros, ', ''), (row['nanoseconds'], error),
                       xytext=(5, -12 if below else 4), textcoords='offset points',
                       fontsize='small',
-                      color='tab:blue' if own else 'black')
+                      color='tab:blue' if ours else 'black')
     axes.set_xlabel('CPU time per sample and channel [ns]')
     axes.set_ylabel('gain error at 0.30 of the sampling rate [dB]')
     axes.set_title(f'{comparison["channels"]} channels x {comparison["seconds"]:g} s at 93.75 kHz;'

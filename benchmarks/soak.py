@@ -1,5 +1,5 @@
 """
-Machine time at the highest sustained rate: memory and latency of the nodes over half an hour.
+Soak at the highest sustained rate: memory and latency of the nodes over half an hour.
 
     .venv/bin/python benchmarks/soak.py --minutes 30 --channels 192
 
@@ -94,7 +94,7 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
 
     with nodes(correct) as running:
         if not spin(lambda: sink.status, 60.0):
-            raise RuntimeError('the averager was not heard within 60 s')
+            raise RuntimeError('the averager sent no status within 60 s')
         source = subprocess.Popen(
             [sys.executable, graph_speed.__file__, '--publish', str(channels), str(seconds),
              str(length)], stdout=subprocess.PIPE, text=True, env=transport(True))

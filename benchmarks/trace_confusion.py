@@ -1,5 +1,5 @@
 """
-Confusion matrix of the trace: simulated machines with one effect that nobody declared.
+Confusion matrix of the trace: simulated machines with effects that are not declared.
 
 Run `python benchmarks/trace_confusion.py --seeds 20 --null 200`; it prints what each effect was
 traced to, how the held-out error fell, and how far parameters were off in standard errors.
@@ -140,8 +140,8 @@ def fell(found: Trace, *, known: bool = False) -> bool:
     whose parameters come from half of the acquisitions; with `known` parameters the former only.
     """
     error = found.after.rms_standard_error**2 - known * found.after.rms_parameter_error**2
-    left = math.sqrt(max(found.after.rms**2 - error, 0.0))
-    return bool(found.findings) and left <= 0.2 * found.before.rms
+    remaining = math.sqrt(max(found.after.rms**2 - error, 0.0))
+    return bool(found.findings) and remaining <= 0.2 * found.before.rms
 
 
 def answer(found: Trace) -> str:

@@ -1,4 +1,4 @@
-"""A recording with worse pulses than it has, whose own pulses become the reference."""
+"""Recordings with pulses made worse, whose original pulses become the reference."""
 
 from dataclasses import replace
 

@@ -1,5 +1,5 @@
 """
-The benchmarks run, on small sizes, and find the accuracy that their page tells.
+The benchmarks run, on small sizes, and find the accuracy that their page states.
 
 How fast they find the package depends on what else the machine does: no test asserts it.
 """
@@ -157,7 +157,7 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     assert sum(found['faults'].values()) > 30
     assert min(found['averages'].values()) > 10
     assert found['corrected']['corrected'] > 5
-    assert f'**{len(late)} things were wrong**' in page.read_text()
+    assert f'**failed checks: {len(late)}**' in page.read_text()
     assert (tmp_path / 'reliability-faults.png').exists()
 
 
