@@ -1,5 +1,5 @@
 """
-Speed of prediction, recovery, Monte Carlo and the loop off line.
+Speed of prediction, recovery and the loop off line.
 
 `python benchmarks/loop_speed.py` writes its figures as JSON to the standard output.
 """
@@ -19,9 +19,8 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
-from sa_jitter_ros.prediction.distributions import Uniform
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter
 from timing import interleaved, machine
@@ -113,27 +112,6 @@ def clock(count: int, rounds: int) -> float:
     return median(elapsed[1:])
 
 
-def iterations(count: int, rounds: int) -> dict[str, float]:
-    """Monte Carlo iterations per second: averages of 40 trigger cycles at one order."""
-    signal = AveragedSignal(trigger_cycles=40, cycle_length=RATIO, order=19.0)
-    distribution = Uniform(RATIO * SPEED / KEYPHASOR_RATE)
-    rng = np.random.default_rng(3)
-
-    def one_by_one() -> None:
-        for _ in range(count // 100):
-            signal.whole_trigger_cycles(distribution.draw(rng, (1, 41)))
-
-    methods = {'whole trigger cycles': signal.whole_trigger_cycles,
-               'whole fundamental cycles': signal.whole_fundamental_cycles,
-               'majority assignment': signal.majority_assignment}
-    calls = {name: partial(monte_carlo, method, distribution, 40, count, seed=1)
-             for name, method in methods.items()}
-    timings = interleaved({**calls, 'whole trigger cycles, one by one': one_by_one},
-                          rounds=rounds)
-    return {name: (count // 100 if 'one by one' in name else count) / timing.best
-            for name, timing in timings.items()}
-
-
 def close_loop(megabytes: float) -> dict[str, Any]:
     """Seconds that the command takes on a recording with an effect that is not declared."""
     samples = round(megabytes * 1e6 / 8 / CHANNELS)
@@ -179,7 +157,6 @@ def main() -> int:
             ('prediction', partial(prediction, max(round(64 * scale), 2), rounds)),
             ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
             ('threads', partial(recovery_by_threads, max(round(100 * scale), 20), rounds)),
-            ('iterations', partial(iterations, round(200000 * scale), rounds)),
             ('close_loop', partial(close_loop, max(10.0 * scale, 3.0)))):
         print(f'loop: {name}', file=sys.stderr, flush=True)
         found[name] = measure()

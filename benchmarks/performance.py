@@ -154,8 +154,6 @@ def _loop(loop: Mapping[str, Any]) -> str:
             for name, value in loop['prediction'].items()]
     rows += [(f'recovery: {name}', f'{value:.0f} ms', 'below 250 ms' if ' 8 ' in name else '')
              for name, value in loop['recovery'].items()]
-    rows += [(f'Monte Carlo: {name}', f'{value:,.0f} iterations/s', '')
-             for name, value in loop['iterations'].items()]
     closed = loop['close_loop']
     rows.append((
         f'`close_loop`, recording of {closed["megabytes"]:.1f} MB ({closed["channels"]} channels, '

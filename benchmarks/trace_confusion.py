@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import Trace, trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect, IndexArray, Setting

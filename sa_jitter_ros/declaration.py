@@ -19,7 +19,7 @@ from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
     Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
     TRIGGER_CYCLES)
-from sa_jitter_ros.prediction.prediction import DeclaredModel, DISTRIBUTIONS
+from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
 NODE = 'jitter_predictor'

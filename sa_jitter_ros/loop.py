@@ -20,7 +20,7 @@ from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import Trace, trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.report.report import report, summary
 

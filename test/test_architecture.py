@@ -45,12 +45,6 @@ ROS = {'ament_index_python', 'builtin_interfaces', 'rcl_interfaces', 'rclpy'}
 ROS_USERS = ('nodes', 'commands.demo')  # the demo starts nodes
 INFERENCE_USERS = ('', 'inference', 'report', 'loop', 'nodes.residual_analyser')
 
-# Imports that are still to be removed: this table only shrinks.
-NOT_YET = {
-    'effects.effect': {'effects.evidence'},
-    'prediction.with_effects': {'effects.effect'},
-}
-
 
 def name_of(path):
     """Return the dotted name of a module below the package, '' for the package itself."""
@@ -97,7 +91,7 @@ def is_one_of(name, users):
 
 
 def import_graph(names):
-    """Return {module: modules of the package that it imports}, without those `NOT_YET` removed."""
+    """Return {module: modules of the package that it imports}."""
     graph = {}
     for name, path in names.items():
         graph[name] = set()
@@ -107,7 +101,6 @@ def import_graph(names):
                 target = target.rpartition('.')[0]
             if top == 'sa_jitter_ros' and target != name:
                 graph[name].add(target)
-        graph[name] -= NOT_YET.get(name, set())
     return graph
 
 
@@ -128,9 +121,8 @@ def test_every_room_has_its_rule():
 @pytest.mark.parametrize('path', MODULES, ids=name_of)
 def test_module_imports_what_its_room_allows(path):
     name, room, needed = name_of(path), room_of(path), needs(path)
-    exempt = {target.partition('.')[0] for target in NOT_YET.get(name, ())}
     others = {package for package in needed if not is_ros(package)}
-    assert others <= ROOMS[room] | {room} | exempt
+    assert others <= ROOMS[room] | {room}
     if not is_one_of(name, ROS_USERS):
         assert others == needed
     assert 'pytest' not in needed or name == 'nodes.testing'

@@ -7,12 +7,12 @@ from inspect import signature
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import (
-    Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges,
-    predict as predict_from_parameters, predict_with)
-from sa_jitter_ros.effects.effect import Pulses
+    Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges)
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from scipy.signal import lfilter
 from scipy.stats import kstest, norm
 
@@ -70,7 +70,7 @@ def test_registry_has_the_effects_of_the_contract():
 
 @pytest.mark.parametrize('name', EFFECTS)
 def test_every_effect_lowers_the_mean_or_widens_the_distribution(name):
-    before, after = predict(MODEL), predict_with(MODEL, [make_effect(name, **SMALL[name])])
+    before, after = predict(MODEL), predict(MODEL, [make_effect(name, **SMALL[name])])
     lower = before.mean_attenuation - after.mean_attenuation
     wider = after.standard_deviation - before.standard_deviation
     if name == 'keyphasor_quantisation':  # takes the place of the declared jitter
@@ -83,7 +83,7 @@ def test_every_effect_lowers_the_mean_or_widens_the_distribution(name):
 
 
 def test_no_effect_is_the_prediction_itself():
-    assert predict_with(MODEL).mean_attenuation == pytest.approx(predict(MODEL).mean_attenuation)
+    assert predict(MODEL).mean_attenuation == pytest.approx(predict(MODEL).mean_attenuation)
 
 
 @pytest.mark.parametrize('cycles', [3, 20])
@@ -94,7 +94,7 @@ def test_no_effect_is_the_prediction_itself():
     ('additive_noise', {}), ('interfering_tone', {})])
 def test_effects_of_no_size_leave_the_prediction_as_it_is(name, values, cycles):
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
-    plain, after = predict(model), predict_with(model, [make_effect(name, **values)])
+    plain, after = predict(model), predict(model, [make_effect(name, **values)])
     for figure in ('mean_attenuation', 'standard_deviation', 'quantile_05', 'quantile_95'):
         np.testing.assert_array_equal(getattr(after, figure), getattr(plain, figure))
 
@@ -102,7 +102,7 @@ def test_effects_of_no_size_leave_the_prediction_as_it_is(name, values, cycles):
 def test_excess_jitter_is_independent_normal(rng):
     errors = declared_errors(rng, 20_000)
     errors = errors + rng.normal(0.0, 5e-5, errors.shape)
-    check(predict_with(MODEL, [make_effect('excess_jitter', std=5e-5)]), average_of(errors))
+    check(predict(MODEL, [make_effect('excess_jitter', std=5e-5)]), average_of(errors))
 
 
 @pytest.mark.parametrize('correlation', [-0.6, 0.7])
@@ -111,7 +111,7 @@ def test_correlated_jitter_is_autoregressive(rng, correlation):
     white = rng.normal(0.0, 5e-5, (len(errors), 60 + errors.shape[1]))
     slow = lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white)[:, 60:]
     effect = make_effect('correlated_jitter', std=5e-5, correlation=correlation)
-    check(predict_with(MODEL, [effect]), average_of(errors + slow))
+    check(predict(MODEL, [effect]), average_of(errors + slow))
 
 
 @pytest.mark.parametrize(('correlation', 'cycles', 'std'), [
@@ -123,7 +123,7 @@ def test_cycles_that_remember_each_other_count_as_fewer(rng, correlation, cycles
     white[:, 1:] *= np.sqrt(1.0 - correlation**2)
     errors = errors + lfilter([1.0], [1.0, -correlation], white)
     effect = make_effect('correlated_jitter', std=std, correlation=correlation)
-    prediction, drawn = predict_with(model, [effect]), average_of(errors)
+    prediction, drawn = predict(model, [effect]), average_of(errors)
     check(prediction, drawn)
     for i in range(3):
         assert kstest(drawn[:, i], lambda x, i=i: prediction.cdf(x)[i]).statistic < (
@@ -148,7 +148,7 @@ def test_slow_motion_over_few_cycles_is_sampled(rng, cycles):
     angle = (errors[:, :-1, None] * (1.0 - u) + errors[:, 1:, None] * u
              + 0.02 / (2.0 * np.pi) * bands(rng, 10_000, cycles, (0.02, 0.1), u))
     gain = 1.0 + 0.2 * bands(rng, 10_000, cycles, (0.02, 0.4), u)
-    check(predict_with(model, effects), np.abs(np.stack([
+    check(predict(model, effects), np.abs(np.stack([
         (gain * np.exp(2j * np.pi * g * angle)).mean(axis=(1, 2)) for g in MODEL.orders], 1)))
 
 
@@ -158,7 +158,7 @@ def test_quantisation_is_rounding_up_to_the_clock(rng):
     times = np.cumsum(np.column_stack((rng.uniform(0.0, 1.0, len(periods)), periods)), axis=1)
     effect = make_effect('keyphasor_quantisation', clock_rate=clock, period_std=std)
     assert effect.replaces_jitter(MODEL)
-    prediction = predict_with(MODEL, [effect])
+    prediction = predict(MODEL, [effect])
     drawn = average_of(np.ceil(times * clock) / clock - times)
     check(prediction, drawn, 40_000)
 
@@ -166,8 +166,8 @@ def test_quantisation_is_rounding_up_to_the_clock(rng):
 def test_clock_of_another_rate_comes_on_top():
     effect = make_effect('keyphasor_quantisation', clock_rate=5_000.0)
     assert not effect.replaces_jitter(MODEL)
-    alone = predict_with(DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 5_000.0}), [effect])
-    assert np.all(predict_with(MODEL, [effect]).mean_attenuation < alone.mean_attenuation)
+    alone = predict(DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 5_000.0}), [effect])
+    assert np.all(predict(MODEL, [effect]).mean_attenuation < alone.mean_attenuation)
 
 
 def test_geometry_repeats_with_the_pulse_index(rng):
@@ -176,7 +176,7 @@ def test_geometry_repeats_with_the_pulse_index(rng):
     first = rng.integers(0, 3, 20_000)
     index = first[:, None] + np.arange(MODEL.trigger_cycles + 1)
     effect = make_effect('target_geometry', pulse_angles=angles)
-    check(predict_with(MODEL, [effect]),
+    check(predict(MODEL, [effect]),
           average_of(declared_errors(rng, 20_000) + pattern[index % 3]))
     pulses = Pulses(np.arange(21.0) / 25.0, first=4)
     assert effect.pattern(MODEL, pulses) == pytest.approx(pattern[(4 + np.arange(21)) % 3])
@@ -211,10 +211,10 @@ def test_geometry_counts_pulses_and_not_triggers():
 
 def test_skew_is_a_delay_that_grows(rng):
     delay = 2e-4 * np.arange(MODEL.trigger_cycles + 1) / 25.0
-    check(predict_with(MODEL, [make_effect('clock_skew', skew=2e-4)]),
+    check(predict(MODEL, [make_effect('clock_skew', skew=2e-4)]),
           average_of(declared_errors(rng, 20_000) + delay))
     quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
-    gain = predict_with(quiet, [make_effect('clock_skew', skew=2e-4)]).mean_attenuation
+    gain = predict(quiet, [make_effect('clock_skew', skew=2e-4)]).mean_attenuation
     frequency = np.array(MODEL.orders) * 25.0
     assert gain == pytest.approx(np.abs(np.sinc(frequency * 2e-4 * 0.8)), abs=1e-6)
 
@@ -222,7 +222,7 @@ def test_skew_is_a_delay_that_grows(rng):
 def test_speed_fluctuation_has_the_closed_form_at_small_size():
     quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
     effect = make_effect('speed_fluctuation', acceleration_std=20.0)
-    prediction = predict_with(quiet, [effect])
+    prediction = predict(quiet, [effect])
     cycles = 20.0 / (2.0 * np.pi)
     # 1/240 for a constant acceleration; the share of it that a sine is off its chord by
     u, turns = np.meshgrid(np.linspace(0.0, 1.0, 401), 2j * np.pi * np.linspace(0.05, 0.2, 101))
@@ -236,11 +236,11 @@ def test_speed_fluctuation_has_the_closed_form_at_small_size():
 
 def test_phase_wander_turns_by_its_standard_deviation():
     quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
-    prediction = predict_with(quiet, [make_effect('phase_wander', std=0.01)])
+    prediction = predict(quiet, [make_effect('phase_wander', std=0.01)])
     assert np.abs(prediction.moments.mean) == pytest.approx(
         np.exp(-0.5 * (0.01 * np.array(MODEL.orders)) ** 2), rel=1e-9)
     # What is slower is more alike over the cycles of an average, and scatters it more.
-    slow = predict_with(quiet, [make_effect('phase_wander', std=0.01, bandwidth=0.1)])
+    slow = predict(quiet, [make_effect('phase_wander', std=0.01, bandwidth=0.1)])
     assert np.abs(slow.moments.mean) == pytest.approx(np.abs(prediction.moments.mean), rel=1e-9)
     assert (slow.moments.variance > 2.0 * prediction.moments.variance).all()
 
@@ -250,7 +250,7 @@ def test_missing_pulses_are_counted_angle_that_lacks(rng):
     lost = rng.geometric(0.98, (20_000, MODEL.trigger_cycles)) - 1
     behind = np.concatenate((np.zeros((len(lost), 1)), np.cumsum(lost, axis=1)), axis=1) / 25.0
     drawn = average_of(behind)
-    prediction = predict_with(quiet, [make_effect('missing_pulses', probability=0.02)])
+    prediction = predict(quiet, [make_effect('missing_pulses', probability=0.02)])
     assert prediction.mean_attenuation == pytest.approx(
         drawn.mean(axis=0), abs=float(4.5 * drawn.std(axis=0).max() / np.sqrt(len(drawn))))
 
@@ -263,7 +263,7 @@ def test_moments_with_missing_pulses_are_exact(rng, probability, ratio, cycles):
     lost = rng.geometric(1.0 - probability, (40_000, cycles)) - 1
     behind = np.pad(np.cumsum(lost, axis=1), ((0, 0), (1, 0))) * ratio
     errors = behind + model.fundamental_frequency * rng.uniform(-5e-5, 5e-5, behind.shape)
-    moments = predict_with(
+    moments = predict(
         model, [make_effect('missing_pulses', probability=probability)]).moments
     for i, g in enumerate(model.orders):
         e = g * errors
@@ -280,7 +280,7 @@ def test_geometry_has_the_distribution_of_drawn_averages(rng, angles, cycles):
     pattern = np.array(angles) / (2.0 * np.pi * 25.0)
     index = rng.integers(0, len(angles), (20_000, 1)) + np.arange(cycles + 1)
     drawn = average_of(rng.uniform(-5e-5, 5e-5, index.shape) + pattern[index % len(angles)])
-    prediction = predict_with(model, [make_effect('target_geometry', pulse_angles=angles)])
+    prediction = predict(model, [make_effect('target_geometry', pulse_angles=angles)])
     check(prediction, drawn)
     for i in range(3):
         assert kstest(drawn[:, i], lambda x, i=i: prediction.cdf(x)[i]).statistic < 0.025
@@ -295,9 +295,9 @@ def test_long_averages_with_known_errors_are_predicted_or_refused(name, cycles):
     effects = [make_effect(name, **values)]
     if cycles > 20_000 and name in ('missing_pulses', 'keyphasor_quantisation'):
         with pytest.raises(ModelError, match=r'is 1000000 with 2 orders.* at most 20000 cycles'):
-            predict_with(model, effects)
+            predict(model, effects)
         return
-    prediction = predict_with(model, effects)
+    prediction = predict(model, effects)
     assert np.all((prediction.mean_attenuation > 0.0) & (prediction.mean_attenuation < 1.0))
 
 
@@ -310,14 +310,14 @@ def test_long_averages_with_known_errors_are_predicted_or_refused(name, cycles):
     ('interfering_tone', {'amplitude': 1e300}), ('excess_jitter', {'std': 0.01})])
 def test_effects_beyond_what_is_sensible_are_refused(name, values):
     with pytest.raises(ModelError, match=r'not below .*: '):
-        predict_with(MODEL, [make_effect(name, **values)])
+        predict(MODEL, [make_effect(name, **values)])
 
 
 def test_known_errors_of_too_many_orders_and_cycles_are_refused():
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': 10**6,
                              'orders': tuple(np.arange(1.0, 65.0))})
     with pytest.raises(ModelError, match=r'is 1000000 with 64 orders.* predict fewer'):
-        predict_with(model, [make_effect('clock_skew', skew=1e-7)])
+        predict(model, [make_effect('clock_skew', skew=1e-7)])
 
 
 def test_interpolation_loss_is_the_gain_of_the_interpolator():
@@ -326,23 +326,23 @@ def test_interpolation_loss_is_the_gain_of_the_interpolator():
     for method, gain in (('linear', np.sinc(ratio) ** 2),
                          ('spline', 3.0 * np.sinc(ratio) ** 4 / (2.0 + np.cos(
                              2.0 * np.pi * ratio)))):
-        prediction = predict_with(MODEL, [make_effect('interpolation_loss', method=method)])
+        prediction = predict(MODEL, [make_effect('interpolation_loss', method=method)])
         assert np.abs(prediction.moments.mean / plain) == pytest.approx(gain, abs=1e-4)
 
 
 def test_noise_and_tone_add_their_power():
     plain = predict(MODEL).moments.mean_square
-    noisy = predict_with(MODEL, [make_effect('additive_noise', std=1.0)]).moments.mean_square
+    noisy = predict(MODEL, [make_effect('additive_noise', std=1.0)]).moments.mean_square
     assert noisy - plain == pytest.approx(4.0 / (20_000.0 * 0.8))
     tone = make_effect('interfering_tone', frequency=250.5, amplitude=0.2)
-    added = predict_with(MODEL, [tone]).moments.mean_square - plain
+    added = predict(MODEL, [tone]).moments.mean_square - plain
     assert added[0] == pytest.approx(0.04 * np.sinc(0.5 * 0.8) ** 2, rel=1e-2)
     assert np.all(added[1:] < 1e-3 * added[0])
 
 
 def test_modulation_leaves_the_mean_and_widens_all_orders_alike():
     plain = predict(MODEL)
-    after = predict_with(MODEL, [make_effect('amplitude_modulation', std=0.2)])
+    after = predict(MODEL, [make_effect('amplitude_modulation', std=0.2)])
     assert after.moments.mean == pytest.approx(plain.moments.mean)
     spread = np.sqrt(after.moments.variance - plain.moments.variance) / np.abs(after.moments.mean)
     assert spread == pytest.approx(np.full(3, spread[0]), rel=0.04)
@@ -358,14 +358,14 @@ def test_slow_motions_keep_their_spectrum_in_long_averages(cycles):
         frequency = band[0] + (band[1] - band[0]) * steps
         exact = effect.std**2 * np.mean(np.sinc(cycles * frequency) ** 2)
         # Beyond 200 cycles the spectrum is blurred; a correlation cut off was 90 % off at 200.
-        assert predict_with(model, [effect]).moments.variance[0] == pytest.approx(
+        assert predict(model, [effect]).moments.variance[0] == pytest.approx(
             exact, rel=3e-4 if cycles <= 200 else 0.05)
 
 
 @pytest.mark.parametrize('std', [0.1, 0.5])
 def test_a_normal_gain_alone_is_normal(std):
     model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e12})
-    prediction = predict_with(model, [make_effect('amplitude_modulation', std=std)])
+    prediction = predict(model, [make_effect('amplitude_modulation', std=std)])
     z = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
     levels = 1.0 + np.sqrt(prediction.moments.variance[0]) * z
     np.testing.assert_allclose(prediction.cdf(levels)[0], norm.cdf(z), atol=1e-4)
@@ -380,7 +380,7 @@ def test_effects_combine(rng):
     errors = errors + rng.normal(0.0, 5e-5, errors.shape) + 2e-4 * index / 25.0
     errors = errors + (np.array(angles) / (2.0 * np.pi * 25.0))[
         (index + rng.integers(0, 2, (len(errors), 1))) % 2]
-    check(predict_with(MODEL, effects), average_of(errors))
+    check(predict(MODEL, effects), average_of(errors))
 
 
 def test_parameters_become_effects():
@@ -416,7 +416,7 @@ def test_bad_parameters_are_refused(name, values, text):
 def test_effects_of_sampling_need_the_sample_rate(effect):
     model = DeclaredModel(**{**vars(MODEL), 'sample_rate': 0.0})
     with pytest.raises(ModelError, match='declare sample_rate'):
-        predict_with(model, [effect])
+        predict(model, [effect])
 
 
 @pytest.mark.parametrize('rate', [2560.0, 6000.0, 13_000.0])
@@ -444,25 +444,25 @@ def test_pulses_on_no_grid_show_none(rng):
 def test_the_library_predicts_as_the_declared_model_does():
     assert doctest.testmod(library).failed == 0
     skew = {'skew': 1e-4}
-    result = predict_from_parameters(
+    result = library.predict(
         keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40, orders=[23, 46],
         noise_std=0.1, sample_rate=20e3, effects={'clock_skew': skew})
     model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
                           orders=(23.0, 46.0), noise_std=0.1, sample_rate=20e3)
-    same = predict_with(model, [make_effect('clock_skew', **skew)])
+    same = predict(model, [make_effect('clock_skew', **skew)])
     for name in ('order', 'mean_attenuation', 'variance', 'standard_deviation', 'quantile_05',
                  'quantile_50', 'quantile_95', 'loss', 'header'):
         np.testing.assert_array_equal(getattr(result, name), getattr(same, name))
     np.testing.assert_allclose(result.ppf(0.05)[:, 0], result.quantile_05)
     np.testing.assert_allclose(result.cdf(result.quantile_50[:, None]), 0.5, atol=1e-3)
     assert result.header == (25.0, 10e3, 40.0, 1.0, result.pulse_error_standard_deviation, 0.1)
-    names = list(signature(predict_from_parameters).parameters)
+    names = list(signature(library.predict).parameters)
     assert names[:-1] == [item.name for item in fields(DeclaredModel)]
 
 
 def test_the_library_refuses_unknown_effects_and_parameters():
     known = {'keyphasor_rate': 10e3, 'trigger_speed': 25.0, 'trigger_cycles': 40, 'orders': [1]}
     with pytest.raises(ParameterError, match='no effect'):
-        predict_from_parameters(**known, effects={'hum': {}})
+        library.predict(**known, effects={'hum': {}})
     with pytest.raises(ParameterError, match="no 'rate'"):
-        predict_from_parameters(**known, effects={'clock_skew': {'rate': 1.0}})
+        library.predict(**known, effects={'clock_skew': {'rate': 1.0}})

@@ -10,14 +10,14 @@ from sa_jitter_ros.effects.amplitude_modulation import _chance
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, flat_band_correlation, recovered_correlation, ripple_of_acceleration,
     SLOW_BAND)
-from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
 from sa_jitter_ros.effects.pulse_covariance import (
     _distribution_p_value, fit_covariance, log_likelihood, white)
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.inference.cycle_reader import RIPPLE_VARIANCE
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 

@@ -12,7 +12,8 @@ from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording

@@ -8,7 +8,7 @@ from sa_jitter_ros.inference.dependence import dependences, moving, still_moving
 from sa_jitter_ros.inference.fewer_cycles import fewer_cycles
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import make_bench, trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.html_report import html, verdict_sentence
 from sa_jitter_ros.report.report import report, summary

@@ -10,7 +10,7 @@ from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
 from sa_jitter_ros.inference.trace import trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATE, SPEED, CYCLES = 6000.0, 25.0, 20

@@ -16,7 +16,7 @@ from sa_jitter_ros.inference.record_pulses import record_pulses
 from sa_jitter_ros.inference.residual import residual
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.resampling import interpolate
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording

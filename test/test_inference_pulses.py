@@ -10,7 +10,7 @@ from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
 from sa_jitter_ros.inference.trace import make_bench, trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.report import report, summary
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, make_effects, mesh

@@ -6,19 +6,19 @@ import math
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.effects.effect import Pulses
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.inference.expectation import expect, Lines
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.scoring import STEADY
 from sa_jitter_ros.inference.trace import trace
-from sa_jitter_ros.prediction.moments import normal_mean
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter
 from sa_jitter_ros.simulation.gearbox import Gearbox
+from validation.analytic import normal_mean
 
 RATE, SPEED, CYCLES, NOISE, ACQUISITIONS = 5000.0, 25.0, 20, 0.05, 16
 JITTER = 1.0 / math.sqrt(12.0) / 5000.0

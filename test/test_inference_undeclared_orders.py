@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.inference.observation import observe
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATE, SPEED, CYCLES, ACQUISITIONS = 5000.0, 25.0, 20, 8

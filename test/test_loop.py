@@ -12,7 +12,7 @@ from sa_jitter_ros import json_values, loop
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.loop import close_loop
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
-from sa_jitter_ros.effects import EFFECTS, make_effect, predict_with
+from sa_jitter_ros.effects import EFFECTS, make_effect
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from std_msgs.msg import Float64, Float64MultiArray
 
 MODEL = {'keyphasor_rate': 5000.0, 'trigger_speed': 20.0, 'trigger_cycles': 30,
@@ -136,7 +137,7 @@ def test_effects_enter_the_prediction_and_leave_it_again(bench):
                                'effects.excess_jitter.std': 5e-5}).successful
     assert b.spin(lambda: len(b.received) == 2)
     model = DeclaredModel(**{**MODEL, 'orders': tuple(MODEL['orders'])})
-    with_effect = predict_with(model, (make_effect('excess_jitter', std=5e-5),))
+    with_effect = predict(model, (make_effect('excess_jitter', std=5e-5),))
     np.testing.assert_array_equal(b.received[-1].values[:, 1], with_effect.mean_attenuation)
     assert (b.received[-1].values[:, 1] < expected()[:, 1]).all()
     refused = b.set_parameters(**{'effects.excess_jitter.std': -1.0})

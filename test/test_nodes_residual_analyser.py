@@ -7,7 +7,7 @@ from bench import NodeBench, SteadyClock
 import numpy as np
 import pytest
 from rcl_interfaces.msg import SetParametersResult
-from sa_jitter_ros.effects import EFFECTS, make_effect, predict_with
+from sa_jitter_ros.effects import EFFECTS, make_effect
 from sa_jitter_ros.errors import ModelError, ParameterError, SignalError
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
@@ -17,7 +17,8 @@ from sa_jitter_ros.nodes.base import LATCHED_QOS
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor, prediction_message
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.report.report import report
 from sa_jitter_ros.simulation import (AdditiveNoise, band_limited, DeclaredJitter, Gearbox,
                                       make_effects, mesh)
@@ -31,7 +32,7 @@ ORDERS = np.array(MODEL.orders)
 
 def published(*effects, **changes):
     """Return the prediction of the model with effects."""
-    found = predict_with(replace(MODEL, **changes), effects)
+    found = predict(replace(MODEL, **changes), effects)
     speed, rate, cycles, ratio, error, _ = found.header
     return Published(found.order, found.mean_attenuation, found.standard_deviation, speed, rate,
                      int(cycles), ratio, error)
@@ -182,8 +183,8 @@ def test_prediction_tells_what_was_declared(change):
     model = replace(MODEL, **change)
     averages = [replace(item, trigger_speed=model.trigger_speed) for item in synthetic(4)]
     found = declared_by(averages, published(**change))
-    np.testing.assert_allclose(predict_with(found).mean_attenuation,
-                               predict_with(model).mean_attenuation)
+    np.testing.assert_allclose(predict(found).mean_attenuation,
+                               predict(model).mean_attenuation)
 
 
 def test_batch_keeps_independent_averages_of_one_run():
@@ -219,7 +220,7 @@ class AnalyserBench(NodeBench):
     def predict(self, **changes):
         """Publish a prediction."""
         self.send('prediction', messages.encode_prediction(
-            prediction_message(predict_with(replace(MODEL, **changes)))))
+            prediction_message(predict(replace(MODEL, **changes)))))
         self.settle()
 
     def average(self, averages, *, corrected=True):
@@ -367,7 +368,7 @@ def test_bad_messages_are_counted(bench):
                         header, np.full(good.pulses.shape, np.nan)))):
         b.send('shaft/pulse_error', message)
     b.settle()
-    table = prediction_message(predict_with(MODEL))
+    table = prediction_message(predict(MODEL))
     for message in (Float64MultiArray(data=[1.0]),
                     messages.encode_prediction(replace(table, values=table.values[:, :6])),
                     messages.encode_prediction(replace(table, trigger_speed=float('nan')))):

@@ -1,6 +1,6 @@
 """The prediction: declared models, every distribution, effects."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,14 +9,35 @@ from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistributio
 from sa_jitter_ros.prediction.angle_error import (
     gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.influence import Gain, Influence
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 from scipy import signal, stats
+from validation.monte_carlo import AveragedSignal, monte_carlo
 
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=41,
                       orders=(1.0, 19.0, 38.0), ratio=2.40789)
 SKEWED = tuple(np.random.default_rng(12).exponential(4e-5, 400))
+
+
+@dataclass(frozen=True)
+class Given(Influence):
+    """Processes and noise as they are given, `alone` in the place of the declared jitter."""
+
+    name = 'given'
+    items: tuple = ()
+    variance: object = 0.0
+    alone: bool = False
+
+    def processes(self, model):
+        return self.items
+
+    def line_variance(self, model):
+        return self.variance
+
+    def replaces_jitter(self, model):
+        return self.alone
 
 
 def simulate(model, order, iterations, seed):
@@ -98,28 +119,24 @@ def test_noise_adds_to_the_mean_square_what_one_line_holds():
 
 
 @pytest.mark.parametrize('cycles', [3, 41])
-def test_effects_enter_as_processes_offset_gain_and_noise(cycles):
+def test_gain_acts_on_the_component_alone_and_noise_adds_to_the_mean_square(cycles):
     model = replace(MODEL, trigger_cycles=cycles)
     plain = predict(model)
-    half = predict(model, gain=0.5)
+    half = predict(model, [Gain(0.5)])
     np.testing.assert_allclose(half.mean_attenuation, 0.5 * plain.mean_attenuation, rtol=1e-6)
     np.testing.assert_allclose(half.quantile_05, 0.5 * plain.quantile_05, rtol=1e-5)
-    turned = predict(model, gain=1j)
+    turned = predict(model, [Gain(1j)])
     np.testing.assert_allclose(turned.quantile_95, plain.quantile_95, rtol=1e-6)
-    loud = predict(model, line_variance=np.array([0.0, 0.1, 0.2]))
+    loud = predict(model, [Given(variance=np.array([0.0, 0.1, 0.2]))])
     np.testing.assert_allclose(loud.moments.mean_square - plain.moments.mean_square,
                                [0.0, 0.1, 0.2], atol=1e-12)
-    nothing = predict(model, offset=lambda u: np.zeros((cycles, u.size)))
-    np.testing.assert_allclose(nothing.moments.mean_square, plain.moments.mean_square, rtol=1e-12)
-    np.testing.assert_allclose(
-        nothing.mean_attenuation**2 + nothing.variance, plain.moments.mean_square, rtol=1e-9)
 
 
 def test_excess_jitter_of_few_cycles_is_sampled_with_the_declared_one(rng):
     model = replace(MODEL, orders=(19.0,), trigger_cycles=3)
     frequency = model.fundamental_frequency
     excess = IndependentPulseJitter(Normal(8e-5), frequency)
-    prediction = predict(model, processes=[excess])
+    prediction = predict(model, [Given([excess])])
     assert isinstance(prediction.distribution, SampledDistribution)
     errors = frequency * (model.distribution.draw(rng, (20_000, 4)) + 8e-5 * rng.normal(
         size=(20_000, 4)))
@@ -130,7 +147,7 @@ def test_excess_jitter_of_few_cycles_is_sampled_with_the_declared_one(rng):
 def test_correlated_jitter_is_predicted_beside_the_declared_one(rng):
     model = replace(MODEL, orders=(19.0,), trigger_cycles=20)
     std = 0.012  # fundamental cycles
-    prediction = predict(model, processes=[gaussian_pulse_jitter([std**2, 0.5 * std**2])])
+    prediction = predict(model, [Given([gaussian_pulse_jitter([std**2, 0.5 * std**2])])])
     noise = rng.normal(0.0, std / np.sqrt(2.0), (20_000, 22))
     errors = (noise[:, 1:] + noise[:, :-1]
               + model.fundamental_frequency * model.distribution.draw(rng, (20_000, 21)))
@@ -149,7 +166,7 @@ def slow_wander(std):
 @pytest.mark.parametrize(('cycles', 'std'), [(41, 0.05), (41, 0.15), (130, 0.1)])
 def test_slow_wander_is_predicted_beside_jitter(cycles, std, rng):
     model = replace(MODEL, orders=(38.0,), trigger_cycles=cycles)
-    prediction = predict(model, processes=[slow_wander(std / 38.0)])
+    prediction = predict(model, [Given([slow_wander(std / 38.0)])])
     points, n = 6, 6000  # points in a cycle
     forget = 0.8 ** (1.0 / points)
     noise = np.sqrt(1.0 - forget**2) * rng.normal(size=(points * cycles, n))
@@ -168,16 +185,16 @@ def test_slow_wander_is_predicted_beside_jitter(cycles, std, rng):
 @pytest.mark.parametrize('memory', [3, 40, 10**9])
 def test_an_effect_of_no_size_changes_nothing(memory):
     tiny = GaussianAngleError(lambda u, v, lag: np.full(np.broadcast(u, v).shape, 1e-20), memory)
-    np.testing.assert_allclose(predict(MODEL, processes=[tiny]).standard_deviation,
+    np.testing.assert_allclose(predict(MODEL, [Given([tiny])]).standard_deviation,
                                predict(MODEL).standard_deviation, rtol=1e-6)
 
 
 def test_effects_can_take_the_place_of_the_declared_jitter():
-    nothing = predict(MODEL, declared_jitter=False)
+    nothing = predict(MODEL, [Given(alone=True)])
     np.testing.assert_allclose(nothing.mean_attenuation, 1.0, rtol=1e-12)
     np.testing.assert_allclose(nothing.quantile_05, 1.0, rtol=1e-7)  # sqrt of rounding errors
     std = MODEL.fundamental_frequency / (np.sqrt(12.0) * MODEL.keyphasor_rate)
-    process = predict(MODEL, processes=[gaussian_pulse_jitter([std**2])], declared_jitter=False)
+    process = predict(MODEL, [Given([gaussian_pulse_jitter([std**2])], alone=True)])
     normal = predict(replace(MODEL, jitter_distribution='normal'))
     np.testing.assert_allclose(process.quantile_05, normal.quantile_05, rtol=1e-7)
 
@@ -215,13 +232,13 @@ def test_models_that_make_no_sense_are_refused(changes, message):
         replace(MODEL, **changes)
 
 
-@pytest.mark.parametrize(('arguments', 'message'), [
-    ({'gain': np.nan}, 'gain is nan: it must be finite'),
-    ({'gain': np.ones(2)}, r'gain has the shape \(2,\): give one value, or 3'),
-    ({'line_variance': -1.0}, 'line_variance is -1.0: it must be finite and at least 0')])
-def test_gain_and_noise_that_are_none_are_refused(arguments, message):
+@pytest.mark.parametrize(('effect', 'message'), [
+    (Gain(np.nan), 'gain is nan: it must be finite'),
+    (Gain(np.ones(2)), r'gain has the shape \(2,\): give one value, or 3'),
+    (Given(variance=-1.0), 'line_variance is -1.0: it must be finite and at least 0')])
+def test_gain_and_noise_that_are_none_are_refused(effect, message):
     with pytest.raises(ModelError, match=message):
-        predict(MODEL, **arguments)
+        predict(MODEL, [effect])
 
 
 def test_distribution_function_of_nothing_is_nothing():

@@ -8,12 +8,14 @@ from sa_jitter_ros.prediction.amplitude_distribution import (
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants, third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
-from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments, uniform_mean
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.prediction.sampled_distribution import sampled_distribution
+from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments
+from sa_jitter_ros.prediction.sampled_distribution import (
+    drawn_averages, SampledDistribution)
 from scipy import stats
 from validation.analytic import (
-    approximate_cycle_moments, inversion_cdf, laguerre_distribution, squared_amplitude_cumulants)
+    approximate_cycle_moments, inversion_cdf, laguerre_distribution, squared_amplitude_cumulants,
+    uniform_mean)
+from validation.monte_carlo import AveragedSignal, monte_carlo
 
 QUANTILES = np.array([0.001, 0.05, 0.5, 0.95, 0.999])
 
@@ -123,8 +125,9 @@ def test_bent_averages_keep_their_mean_square_in_noise():
 def test_sampled_distribution_is_that_of_few_cycles(cycles):
     distribution, order, noise = Triangular(0.25), 0.7, 0.02
     moments, _ = jittered(distribution, order, cycles)
-    sampled = sampled_distribution([order], [IndependentPulseJitter(distribution)], cycles,
-                                   moments.with_noise(noise), line_variance=noise)
+    drawn, unit_noise = drawn_averages([order], [IndependentPulseJitter(distribution)], cycles)
+    sampled = SampledDistribution(np.abs(drawn + np.sqrt(noise) * unit_noise),
+                                  moments.with_noise(noise).mean_square)
     signal = AveragedSignal(cycles, 0.4137, order)
     draws = np.abs(monte_carlo(signal.whole_trigger_cycles, distribution, cycles, 60_000, seed=5,
                                line_variance=noise))
@@ -136,8 +139,7 @@ def test_sampled_distribution_is_that_of_few_cycles(cycles):
 
 def test_quantiles_need_probabilities():
     distribution = normal_distribution(moments_of(1.0, 0.1, 0.1))
-    sampled = sampled_distribution([0.1], [IndependentPulseJitter(Uniform(1.0))], 2,
-                                   moments_of(1.0, 0.1, 0.1))
+    sampled = SampledDistribution(np.array([[0.9, 1.1]]), np.array([1.01]))
     for bad in (0.0, 1.0, -0.1, np.nan):
         for either in (distribution, sampled):
             with pytest.raises(ParameterError, match='between 0 and 1'):

@@ -9,10 +9,11 @@ from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction import design as module
 from sa_jitter_ros.prediction.comb import order_share
 from sa_jitter_ros.prediction.design import (
-    design, design_grid, loss_and_variation, required_keyphasor_rate, required_trigger_cycles)
-from sa_jitter_ros.prediction.detectability import detection_probability
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+    design, design_grid, detection_probability, loss_and_variation, required_keyphasor_rate,
+    required_trigger_cycles)
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
+from validation.monte_carlo import AveragedSignal, monte_carlo
 
 MODEL = DeclaredModel(keyphasor_rate=5000.0, trigger_speed=20.0, trigger_cycles=41,
                       orders=(1.0, 19.0, 38.0), ratio=2.40789)

@@ -1,7 +1,5 @@
 """Exact moments: closed forms, published values, Monte Carlo, and every combination of effects."""
 
-from itertools import product
-
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError
@@ -9,9 +7,10 @@ from sa_jitter_ros.prediction.angle_error import (
     gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Sum, Triangular, Uniform
-from sa_jitter_ros.prediction.moments import (
-    cycle_moments, multi_harmonic_moments, noise_line_variance, normal_mean, offset_moments,
-    uniform_mean)
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.moments import cycle_moments, noise_line_variance
+from sa_jitter_ros.prediction.scenario_moments import scenario_moments
+from validation.analytic import normal_mean, uniform_mean
 
 EXPONENTIAL = Empirical(np.random.default_rng(8).exponential(0.15, 3000))
 
@@ -137,68 +136,40 @@ def test_a_bump_in_every_cycle_as_a_speed_fluctuation_gives(rng):
     assert moments.mean[0].real == pytest.approx(gain, abs=1e-12)
 
 
-def test_a_deterministic_offset_beside_random_jitter(rng):
+def unit_model(cycles, *orders):
+    """Model of a shaft that turns once a second, so that errors in s are fundamental cycles."""
+    return DeclaredModel(keyphasor_rate=100.0, trigger_speed=1.0, trigger_cycles=cycles,
+                         orders=orders)
+
+
+def test_known_pulse_errors_beside_random_jitter(rng):
     cycles = 6
-    shape = 0.2 * rng.normal(size=cycles)
+    known = 0.2 * rng.normal(size=cycles + 1)
 
     def offset(u):
-        return shape[:, None] * (1.0 - u) + np.roll(shape, -1)[:, None] * u
+        return known[:-1, None] * (1.0 - u) + known[1:, None] * u
 
-    moments = offset_moments([0.8], [IndependentPulseJitter(Triangular(0.1))], cycles, offset)
+    moments = scenario_moments(unit_model(cycles, 0.8), [IndependentPulseJitter(Triangular(0.1))],
+                               known[None])
     errors = Triangular(0.1).draw(rng, (60_000, cycles + 1))
-    assert_moments(averages(errors, 0.8, offset), moments)
+    assert_moments(averages(errors, 0.8, offset), moments.of(0))
 
 
 def test_clock_skew_alone_is_a_sinc():
     cycles, slip = 50, 0.013  # fundamental cycles of delay per trigger cycle
-
-    def offset(u):
-        return slip * (np.arange(cycles)[:, None] + u)
-
-    moments = offset_moments([1.0, 2.0], [], cycles, offset)
-    np.testing.assert_allclose(np.abs(moments.mean),
+    moments = scenario_moments(unit_model(cycles, 1.0, 2.0), [],
+                               slip * np.arange(cycles + 1.0)[None])
+    np.testing.assert_allclose(np.abs(moments.mean[0]),
                                np.abs(np.sinc(slip * cycles * np.array([1.0, 2.0]))), atol=1e-12)
     np.testing.assert_allclose(moments.variance, 0.0, atol=1e-15)
 
 
-def test_a_zero_offset_changes_nothing():
+def test_known_errors_of_0_change_nothing():
     jitter = [IndependentPulseJitter(EXPONENTIAL)]
     plain = cycle_moments([0.5, 1.0], jitter).averaged(7)
-    offset = offset_moments([0.5, 1.0], jitter, 7, lambda u: np.zeros((7, u.size)))
+    known = scenario_moments(unit_model(7, 0.5, 1.0), jitter, np.zeros((1, 8)))
     for name in ('mean', 'variance', 'pseudo_variance'):
-        np.testing.assert_allclose(getattr(offset, name), getattr(plain, name), atol=1e-13)
-
-
-@pytest.mark.parametrize(('ratio', 'cycles'), [(1.0, 6), (2.0, 3), (0.4137, 3), (5.8154, 4)])
-def test_leakage_between_components(ratio, cycles, rng):
-    distribution, sources, amplitudes = EXPONENTIAL, (1.0, 2.0, 3.0), (1.0, 0.5j, -2.0)
-    moments = multi_harmonic_moments(
-        [2.0], sources, amplitudes, [IndependentPulseJitter(distribution)], cycles, ratio)
-    errors = distribution.draw(rng, (40_000, cycles + 1))
-    x, w = np.polynomial.legendre.leggauss(64)
-    u = 0.5 * (x + 1.0)
-    draws = 0.0
-    for k, (source, amplitude) in product(range(cycles), zip(sources, amplitudes)):
-        angle = np.outer(errors[:, k], 1.0 - u) + np.outer(errors[:, k + 1], u)
-        turn = np.exp(2j * np.pi * (source - 2.0) * ratio * (k + u))
-        draws = draws + amplitude * (np.exp(2j * np.pi * source * angle) @ (0.5 * w * turn))
-    assert_moments(draws / cycles, moments)
-
-
-def test_leakage_over_many_orders_takes_the_nodes_it_needs():
-    jitter = [IndependentPulseJitter(Uniform(0.4 / 19.0))]
-    default, fine = (multi_harmonic_moments(
-        [19.0, 38.0], [19.0, 38.0], [1.0, 2.0], jitter, 41, 2.40789, nodes=n) for n in (64, 400))
-    for name in ('mean', 'variance', 'pseudo_variance'):
-        np.testing.assert_allclose(getattr(default, name), getattr(fine, name), atol=1e-12)
-
-
-def test_one_component_alone_is_the_single_harmonic_case():
-    jitter = [IndependentPulseJitter(Uniform(0.3))]
-    single = cycle_moments([1.0], jitter).averaged(9)
-    multi = multi_harmonic_moments([1.0], [1.0], [1.0], jitter, 9, 2.286)
-    np.testing.assert_allclose(multi.variance, single.variance, atol=1e-14)
-    np.testing.assert_allclose(multi.pseudo_variance, single.pseudo_variance, atol=1e-14)
+        np.testing.assert_allclose(getattr(known, name)[0], getattr(plain, name), atol=1e-13)
 
 
 def test_noise_in_one_line_of_an_average_in_peak_units(rng):
@@ -220,10 +191,6 @@ def test_noise_in_one_line_of_an_average_in_peak_units(rng):
     (lambda jitter: cycle_moments([np.nan], jitter), 'orders hold nan'),
     (lambda jitter: cycle_moments([1.0], jitter).averaged(0), 'trigger_cycles is 0'),
     (lambda jitter: cycle_moments([1.0], jitter).averaged(2.5), 'trigger_cycles is 2.5'),
-    (lambda jitter: multi_harmonic_moments([1.0], [1.0], [1.0], jitter, 3, 0.0),
-     'cycle_length is 0.0'),
-    (lambda jitter: multi_harmonic_moments([1.0], [500.0], [1.0], jitter, 3, 1.0),
-     'makes 499 turns a trigger cycle'),
     (lambda jitter: gaussian_pulse_jitter([1.0, 0.9]), 'spectrum as low as'),
     (lambda jitter: gaussian_pulse_jitter([]), 'list of finite numbers'),
 ])

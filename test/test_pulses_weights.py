@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sa_jitter_ros.effects import make_effect, predict_with
+from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.effects.band import ACCELERATION_BAND
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import gaussian_pulse_jitter, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Uniform
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import cycle_moments
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, cycle_times, LINEAR
 from scipy import stats
 
@@ -152,7 +153,7 @@ def test_correlated_jitter_and_geometry_go_through_the_law(law, rng):
     index = (rng.integers(0, 3, (DRAWS, 1)) + np.arange(pulses.size)) % 3
     late = np.array(angles)[index] / (2.0 * np.pi * model.trigger_speed)
     jitter = model.distribution.draw(rng, shape)
-    assert_agrees(predict_with(model, [
+    assert_agrees(predict(model, [
         make_effect('correlated_jitter', std=6e-5, correlation=0.6),
         make_effect('target_geometry', pulse_angles=angles)]),
         averaged(model, pulses + jitter + slow + late))
@@ -181,10 +182,10 @@ def test_speed_fluctuation_is_what_the_law_cannot_follow(law, rng):
     std = 60.0
     draws = np.array([unsteady(model, std, rng) for _ in range(DRAWS // 2)])
     effect = make_effect('speed_fluctuation', acceleration_std=std)
-    prediction = predict_with(model, [effect])
+    prediction = predict(model, [effect])
     assert np.abs(prediction.moments.mean) == pytest.approx(
         draws.mean(axis=0).real, abs=4.5 * draws.real.std(axis=0).max() / np.sqrt(len(draws)))
-    linear = predict_with(replace(model, angle_law='linear'), [effect]).mean_attenuation
+    linear = predict(replace(model, angle_law='linear'), [effect]).mean_attenuation
     assert np.all(1.0 - prediction.mean_attenuation < 0.5 * (1.0 - linear))
 
 
@@ -192,4 +193,4 @@ def test_speed_fluctuation_is_what_the_law_cannot_follow(law, rng):
 def test_a_gap_is_refused_where_the_law_bends_around_it(law):
     effect = make_effect('missing_pulses', probability=0.01)
     with pytest.raises(ModelError, match=f'{law}.*no forward model; declare linear'):
-        predict_with(replace(MODEL, angle_law=law), [effect])
+        predict(replace(MODEL, angle_law=law), [effect])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.figures import illustrate
 from sa_jitter_ros.report.html_report import html, report_files, verdict_sentence

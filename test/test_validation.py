@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal
 from scipy.special import ndtr
 from validation import angle_laws, bench, reproduce, residual_kurtosis
+from validation.monte_carlo import AveragedSignal
 from validation.order_tracking import as_in_table_1, HarmonicCase, simulate, synchronous_average
 from validation.report import page
 from validation.results import agreement, compare, Finding, one_distribution, QUICK, Results, stage

@@ -1,5 +1,8 @@
 """
-The analytic approximation of Camerini et al. 2019, with its errata, and what it approximates.
+Closed forms of Camerini et al. 2019, its analytic approximation with errata, and the exact values.
+
+Eq. 38 is the mean amplitude under uniform jitter (`uniform_mean`), Fig. 7 the leakage between the
+components of a signal (`multi_harmonic_moments`).
 
 Eqs. 40-46 give the moments of one trigger cycle for uniform jitter (`approximate_cycle_moments`),
 Eqs. 47-52 the cumulants of the squared amplitude of a normal X, and Eqs. 53-63 a Laguerre
@@ -8,21 +11,97 @@ without approximation, by inverting the characteristic function of the quadratic
 needs neither; these are here to reproduce the paper and to check each other.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.angle_error import unit_nodes
-from sa_jitter_ros.prediction.moments import AverageMoments, CycleMoments
+from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.prediction.angle_error import (
+    AngleErrorProcess, joint_characteristic, unit_nodes)
+from sa_jitter_ros.prediction.moments import (
+    AverageMoments, correlation_length, CycleMoments, NODES, require_cycles, require_orders)
 from scipy.optimize import brentq
-from scipy.special import gammainc, gammaln
+from scipy.special import erf, gammainc, gammaln, sici
 
 Array = NDArray[Any]
 
 _FIRST_END, _LAST_END = 32, 16384  # of the inversion, in units of 1 / (2 std)
 _PANEL_NODES = 8
+_MOST_TURNS = 300.0  # of a source in a trigger cycle against an order: so far apart nothing leaks
+
+
+def uniform_mean(spread: ArrayLike) -> Array:
+    """
+    Return the mean amplitude for uniform jitter, closed form (Eq. 38).
+
+    `spread` is the width in cycles of the order, g D > 0.
+    """
+    x = np.pi * np.asarray(spread, float)
+    si, ci = sici(2.0 * x)
+    return np.asarray((np.cos(x) * (ci - np.euler_gamma - np.log(2.0 * x)) + np.sin(x) * si)
+                      / x**2)
+
+
+def normal_mean(spread: ArrayLike) -> Array:
+    """Return the mean amplitude for normal jitter; `spread` = g sigma > 0 in cycles."""
+    s = 2.0 * np.pi * np.asarray(spread, float)
+    return np.asarray(np.exp(-0.25 * s**2) * np.sqrt(np.pi) * erf(0.5 * s) / s)
+
+
+def multi_harmonic_moments(
+    orders: ArrayLike, source_orders: ArrayLike, amplitudes: ArrayLike,
+    processes: Sequence[AngleErrorProcess], trigger_cycles: int, cycle_length: float, *,
+    nodes: int = NODES,
+) -> AverageMoments:
+    """
+    Return the moments of analysed orders of a signal of several components, leakage included.
+
+    The signal is sum_s a_s exp(j 2 pi g_s theta) with `source_orders` g_s and complex `amplitudes`
+    a_s; a trigger cycle is `cycle_length` (r) fundamental cycles long. An integer r lets a source
+    leak coherently into its neighbours, a bias that no number of cycles removes (Fig. 7). Raises
+    ModelError for components that are more than 300 turns a trigger cycle away from an order.
+    """
+    g = require_orders(orders)
+    sources = require_orders(source_orders)
+    a = np.broadcast_to(np.asarray(amplitudes, complex), sources.shape)
+    require_cycles(trigger_cycles)
+    if not cycle_length > 0.0:
+        raise ModelError(f'cycle_length is {cycle_length}: a trigger cycle lasts more than 0 '
+                         'fundamental cycles')
+    turns = cycle_length * (sources[:, None] - g)  # per trigger cycle, (source, order)
+    most = float(np.max(np.abs(turns)))
+    if most > _MOST_TURNS:
+        raise ModelError(
+            f'a source makes {most:.6g} turns a trigger cycle against an analysed order, more '
+            f'than {_MOST_TURNS:g}: so far apart nothing leaks, leave it out')
+    u, w = unit_nodes(max(nodes, math.ceil(np.pi * most) + 24))
+    shift = 2.0 * np.pi * turns
+    weight = a[:, None, None] * np.exp(1j * shift[:, :, None] * u) * w
+    steps = np.exp(1j * shift[:, :, None] * np.arange(trigger_cycles))
+    first = [joint_characteristic(processes, [s], [u], [0]) for s in sources]
+    means = np.array([steps[s].mean(axis=-1) * (weight[s] @ first[s])
+                      for s in range(sources.size)])
+    variance = np.zeros(g.size)
+    pseudo = np.zeros(g.size, complex)
+    for lag in range(min(correlation_length(processes) + 1, trigger_cycles)):
+        scale = (1.0 if lag == 0 else 2.0) / trigger_cycles**2
+        points = ([u[:, None], u], [0, lag])
+        for s, early in enumerate(sources):
+            for t, late in enumerate(sources):
+                joint = (joint_characteristic(processes, [early, -late], *points)
+                         - np.multiply.outer(first[s], first[t].conj()))
+                beat = np.sum(steps[s][:, :trigger_cycles - lag]
+                              * steps[t][:, lag:].conj(), axis=-1)
+                variance += scale * np.real(
+                    beat * np.sum((weight[s] @ joint) * weight[t].conj(), axis=-1))
+                joint = (joint_characteristic(processes, [early, late], *points)
+                         - np.multiply.outer(first[s], first[t]))
+                beat = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
+                pseudo += scale * beat * np.sum((weight[s] @ joint) * weight[t], axis=-1)
+    return AverageMoments(means.sum(axis=0), variance, pseudo)
 
 
 def approximate_cycle_moments(spread: ArrayLike) -> CycleMoments:

@@ -9,10 +9,10 @@ from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Uniform
-from sa_jitter_ros.prediction.moments import cycle_moments, CycleMoments, uniform_mean
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
+from sa_jitter_ros.prediction.moments import cycle_moments, CycleMoments
 from scipy.stats import skew
-from validation.analytic import approximate_cycle_moments, laguerre_distribution
+from validation.analytic import approximate_cycle_moments, laguerre_distribution, uniform_mean
+from validation.monte_carlo import AveragedSignal, monte_carlo
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import agreement, Effort, Finding, Progress, Results
 

@@ -7,11 +7,11 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import AverageSettings
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal
 from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, cycle_times
 from scipy.stats import binomtest
 from validation.bench import (
     acquire, FAST, machine, PINION_SPEED, RATIO, SLOW, TEETH, TRIGGER_CYCLES)
+from validation.monte_carlo import AveragedSignal
 from validation.order_tracking import fourier_lines, synchronous_average
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import (

@@ -6,7 +6,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Uniform
-from sa_jitter_ros.prediction.moments import cycle_moments, multi_harmonic_moments
+from sa_jitter_ros.prediction.moments import cycle_moments
+from validation.analytic import multi_harmonic_moments
 from validation.order_tracking import HarmonicCase
 from validation.plots import panel_titles, panels
 from validation.results import (

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Uniform
 from sa_jitter_ros.prediction.moments import cycle_moments
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
 from validation.analytic import approximate_cycle_moments, squared_amplitude_cumulants
+from validation.monte_carlo import AveragedSignal, monte_carlo
 from validation.plots import panel_titles, panels
 from validation.results import agreement, Effort, Finding, Progress, Results
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.prediction.distributions import Uniform
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
 from scipy.stats import kstest
+from validation.monte_carlo import AveragedSignal, monte_carlo
 from validation.order_tracking import as_in_table_1, HarmonicCase, simulate
 from validation.plots import COLOURS, distribution, panel_titles, panels
 from validation.results import (

@@ -18,8 +18,8 @@ from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.prediction.comb import Leakage
 from sa_jitter_ros.prediction.design import (
-    Design, design, design_grid, RATE_DISTRIBUTIONS, required_keyphasor_rate)
-from sa_jitter_ros.prediction.detectability import detection_probability
+    Design, design, design_grid, detection_probability, RATE_DISTRIBUTIONS,
+    required_keyphasor_rate)
 
 EXAMPLES = """examples:
   rate and revolutions for the first two harmonics of a 19-tooth mesh, 3 % and 1 %:

@@ -1,9 +1,7 @@
 """Effects that a declared model may lack: one module each, listed in `registry`."""
 
 from sa_jitter_ros.effects.effect import Effect, parameter_defaults, parameter_ranges
-from sa_jitter_ros.effects.library import predict
 from sa_jitter_ros.effects.registry import EFFECTS, enabled_effects, make_effect
-from sa_jitter_ros.prediction.with_effects import predict_with, require_modelled
 
 __all__ = [
     'EFFECTS',
@@ -12,7 +10,4 @@ __all__ = [
     'make_effect',
     'parameter_defaults',
     'parameter_ranges',
-    'predict',
-    'predict_with',
-    'require_modelled',
 ]

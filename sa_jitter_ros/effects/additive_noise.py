@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import noise_line_variance
-from sa_jitter_ros.prediction.prediction import DeclaredModel
 from scipy import stats
 
 _SIGNIFICANT = 1e-4

@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import fading, flat_band_correlation, SLOW_BAND, slow_memory
-from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal, unit_nodes
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import optimize, stats
 
 _SIGNIFICANT = 1e-3

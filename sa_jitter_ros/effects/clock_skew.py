@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, Pulses
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import stats
 
 _SIGNIFICANT = 1e-3

@@ -6,13 +6,13 @@ import math
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_in_turn
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.effects.pulse_covariance import fit_memory, goodness_of_fit, memory_p_value
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 _FORGOTTEN = 1e-3
 _SIGNIFICANT = 0.01  # the better of two explanations, not the existence of one

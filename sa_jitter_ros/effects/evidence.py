@@ -2,20 +2,18 @@
 What the effects look at: pulse errors, ripple and amplitudes of the acquisitions of one record.
 
 `Evidence` is plain data that the loop gathers from the acquisitions it fits on; whatever effects
-were added before are taken out of it (`explained`). A `Finding` is what an effect makes of it.
+were added before are taken out of it (`explained`).
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
-from sa_jitter_ros.prediction.prediction import DeclaredModel
-from sa_jitter_ros.prediction.with_effects import known_errors
+from sa_jitter_ros.prediction.influence import Influence, known_errors, mean_period, Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
 
@@ -85,7 +83,7 @@ class Evidence:
     record_missing: Array
     clock: Clock
     lines: LineEvidence
-    explained: tuple[Effect, ...] = ()
+    explained: tuple[Influence, ...] = ()
     whole: 'Evidence | None' = None
 
     @property
@@ -136,27 +134,6 @@ class Evidence:
         return np.asarray(total)
 
 
-@dataclass(frozen=True)
-class Finding:
-    """
-    What an effect makes of the evidence.
-
-    `effect` with the fitted parameters, None where nothing could be fitted; `standard_errors` by
-    parameter; `p_value` of the physical evidence under "this effect is absent"; `against` says why
-    the effect is not the one, '' where nothing speaks against it; `rivals` are effects that this
-    evidence cannot tell from it, `decider` the measurement that could.
-    """
-
-    name: str
-    effect: Effect | None
-    standard_errors: Mapping[str, Any]
-    p_value: float
-    evidence: str
-    against: str = ''
-    rivals: Sequence[str] = ()
-    decider: str = ''
-
-
 def root(variance: float, error: float) -> tuple[float, float]:
     """
     Return the standard deviation of an estimated variance and its standard error.
@@ -165,8 +142,3 @@ def root(variance: float, error: float) -> tuple[float, float]:
     """
     std = math.sqrt(max(variance, 0.0))
     return std, error / (std + math.sqrt(std**2 + error)) if error else 0.0
-
-
-def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:
-    """Return the finding of an effect that is not there."""
-    return Finding(name, None, {}, p_value, reason, against=reason)

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_in_turn
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.effects.pulse_covariance import (
     fit_covariance, goodness_of_fit, memory_p_value, white)
 from sa_jitter_ros.effects.slope_test import require_tach_side
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 _HINT = 0.05  # the p value of a memory that is hardly chance, and no proof
 _DECIDER = 'more acquisitions, or longer ones'

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
+from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 _SIGNIFICANT = 1e-4
 _MOST = 1e6

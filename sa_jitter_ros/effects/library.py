@@ -5,9 +5,9 @@ from types import MappingProxyType
 from typing import Any
 
 from sa_jitter_ros.effects.registry import make_effect
+from sa_jitter_ros.prediction import prediction
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import require_orders
-from sa_jitter_ros.prediction.prediction import DeclaredModel, Prediction
-from sa_jitter_ros.prediction.with_effects import predict_with
 
 _NONE: Mapping[str, Mapping[str, Any]] = MappingProxyType({})
 
@@ -18,7 +18,7 @@ def predict(
     pulses_per_trigger: int = 0, jitter_distribution: str = 'uniform', jitter_std: float = 0.0,
     jitter_table: Sequence[float] = (), noise_std: float = 0.0, sample_rate: float = 0.0,
     angle_law: str = 'linear', effects: Mapping[str, Mapping[str, Any]] = _NONE,
-) -> Prediction:
+) -> prediction.Prediction:
     """
     Predict what keyphasor jitter does to each order of a synchronous average.
 
@@ -35,8 +35,8 @@ def predict(
 
     A gear mesh of 23 teeth, its keyphasor sampled at 10 kHz, with a clock that runs 100 ppm fast:
 
-    >>> from sa_jitter_ros.effects import predict
-    >>> result = predict(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    >>> import sa_jitter_ros as sa
+    >>> result = sa.predict(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
     ...                  orders=[23.0, 46.0], effects={'clock_skew': {'skew': 1e-4}})
     >>> result.mean_attenuation.round(3)
     array([0.983, 0.932])
@@ -53,4 +53,5 @@ def predict(
         jitter_distribution=jitter_distribution, jitter_std=jitter_std,
         jitter_table=tuple(jitter_table), noise_std=noise_std, sample_rate=sample_rate,
         angle_law=angle_law)
-    return predict_with(model, [make_effect(name, **values) for name, values in effects.items()])
+    return prediction.predict(
+        model, [make_effect(name, **values) for name, values in effects.items()])

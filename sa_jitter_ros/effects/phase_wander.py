@@ -7,12 +7,12 @@ from typing import ClassVar
 import numpy as np
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, recovered_correlation, SLOW_BAND, slow_memory)
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
 from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 _NARROW = 0.05
 _SIGNIFICANT = 1e-3

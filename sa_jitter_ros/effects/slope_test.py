@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from scipy import stats
 from scipy.linalg import toeplitz
@@ -59,9 +60,9 @@ def slope_test(evidence: Evidence) -> SlopeTest:
 
     observed = np.maximum(_smooth(np.mean(np.abs(errors) ** 2, axis=0)), 1e-300)
     lags = np.arange(count)
-    moving = toeplitz(sum((effect.pulse_autocovariance(evidence.model, lags)
-                           for effect in evidence.explained if effect.moves_vibration),
-                          np.zeros(count)))
+    moving = toeplitz(sum(
+        (effect.pulse_autocovariance(evidence.model, lags) for effect in evidence.explained
+         if isinstance(effect, Effect) and effect.moves_vibration), np.zeros(count)))
     declared = toeplitz(evidence.expected_autocovariance(lags)) - moving
     noise = np.diag(np.nan_to_num(np.mean(evidence.standard_errors**2, axis=0)))
     of_tach = np.clip(1.0 - power(moving + noise) / observed, 0.0, 1.0)

@@ -7,10 +7,10 @@ from typing import ClassVar
 import numpy as np
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, fading, ripple_of_acceleration, slow_memory)
-from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding, root
+from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
+from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError, unit_nodes
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights
 from scipy import stats
 

@@ -12,10 +12,11 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    Array, Effect, most_scenarios, parameter, Pulses, require_in_turn)
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+    absent, Array, Effect, Finding, most_scenarios, parameter, require_in_turn)
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import stats
 
 _LONGEST = 24

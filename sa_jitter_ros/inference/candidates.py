@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.evidence import absent, Evidence, Finding
+from sa_jitter_ros.effects.effect import absent, Finding
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.pulse_covariance import log_likelihood
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving, still_moving
 from sa_jitter_ros.inference.residual import ACCURACY, Residual

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect
-from sa_jitter_ros.effects.effect import mean_period
-from sa_jitter_ros.effects.evidence import Finding, SAME_SPEED
+from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.evidence import SAME_SPEED
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.scoring import Bench, Comparison
+from sa_jitter_ros.prediction.influence import mean_period
 from scipy import stats
 
 Array = NDArray[Any]

@@ -14,18 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
-from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
+from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.prediction.amplitude_distribution import (
     AmplitudeDistribution, normal_distribution)
+from sa_jitter_ros.prediction.amplitudes import component_gain, line_variance
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, GaussianAngleError, IndependentPulseJitter, joint_characteristic,
     unit_nodes)
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments, noise_line_variance
-from sa_jitter_ros.prediction.prediction import DeclaredModel
-from sa_jitter_ros.prediction.with_effects import jitter_processes, known_errors, scenario_moments
+from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses, random_processes
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments
+from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 
 Array = NDArray[Any]
 
@@ -172,16 +174,8 @@ class _Setting:
 
 def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) -> _Setting:
     model = replace(observation.model, trigger_speed=speed)
-    gain = np.ones(len(model.orders))
-    noise = np.zeros(len(model.orders))
-    for effect in effects:
-        gain = gain * effect.gain(model)
-        noise = noise + effect.line_variance(model)
-    if model.noise_std:
-        noise = noise + noise_line_variance(model.noise_std, observation.sample_rate,
-                                            model.duration)
-    return _Setting(replace(observation, model=model), effects, jitter_processes(model, effects),
-                    gain, noise)
+    return _Setting(replace(observation, model=model), effects, random_processes(model, effects),
+                    component_gain(model, effects), line_variance(model, effects))
 
 
 def _speed(item: Acquisition, model: DeclaredModel) -> float:

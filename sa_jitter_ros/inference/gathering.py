@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import radial_noise
-from sa_jitter_ros.effects.effect import Effect, mean_period, Pulses
+from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
@@ -16,7 +16,7 @@ from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.tone import find_tone
-from sa_jitter_ros.prediction.with_effects import known_errors
+from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import stats
 

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import noise_floor, without_leakage
-from sa_jitter_ros.effects.effect import mean_period
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
 from sa_jitter_ros.inference.cycle_reader import CycleReader, recover, ripple_error
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.undeclared_orders import undeclared_orders
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.influence import mean_period
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw
 from sa_jitter_ros.recordings.recording import Recording
 

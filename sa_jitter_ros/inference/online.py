@@ -12,7 +12,7 @@ from sa_jitter_ros.averaging.cycle import exact_cycles
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import RESOLUTION
 from sa_jitter_ros.inference.residual import Residual, residual
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.special import ndtr
 
 Array = NDArray[Any]

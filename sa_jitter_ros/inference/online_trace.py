@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.effect import Effect, Pulses
+from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, SignalError
@@ -23,8 +23,9 @@ from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAv
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.trace import require_acquisitions, Trace, trace_bench
+from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import noise_line_variance
-from sa_jitter_ros.prediction.prediction import DeclaredModel
 
 Array = NDArray[Any]
 

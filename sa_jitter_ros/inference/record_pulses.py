@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ModelError, RecordingError
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
 

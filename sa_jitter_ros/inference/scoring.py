@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect
-from sa_jitter_ros.effects.effect import Pulses
-from sa_jitter_ros.effects.evidence import Evidence, Finding, LineEvidence
+from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
 from sa_jitter_ros.inference.gathering import gather
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import Residual, residual, Sensitivity
+from sa_jitter_ros.prediction.influence import Pulses
 
 Array = NDArray[Any]
 

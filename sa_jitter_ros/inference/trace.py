@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.evidence import Evidence, Finding
+from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.candidates import best_of, Candidate, SIGNIFICANT, try_all

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.inference.cycle_reader import CycleReader, recover
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 FloatArray = NDArray[np.float64]
 

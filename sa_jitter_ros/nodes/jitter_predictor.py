@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.declaration import declaration_of, NODE, predictor_parameters, SHAFTS
-from sa_jitter_ros.effects import predict_with
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import encode_prediction, PREDICTION_FIELDS, PredictionMessage
 from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.prediction.prediction import DeclaredModel, Prediction
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict, Prediction
 from std_msgs.msg import Float64, Float64MultiArray
 
 
@@ -20,7 +20,7 @@ def check(values: Values) -> None:
     """Raise `SaJitterError` unless the parameters declare models that can be predicted."""
     declaration = declaration_of(values)
     for model in declaration.models.values():
-        predict_with(replace(model, orders=(max(model.orders),)), declaration.effects)
+        predict(replace(model, orders=(max(model.orders),)), declaration.effects)
 
 
 class JitterPredictor(MonitoringNode):
@@ -75,7 +75,7 @@ class JitterPredictor(MonitoringNode):
                 for shaft, model in self._declaration.models.items()}
 
     def _predict(self, models: Mapping[str, DeclaredModel]) -> None:
-        predictions = {shaft: predict_with(model, self._declaration.effects)
+        predictions = {shaft: predict(model, self._declaration.effects)
                        for shaft, model in models.items()}
         self._models = models
         self._published += 1

@@ -26,7 +26,7 @@ from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode
                                           encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name, Values
 from sa_jitter_ros.parameters import Parameter, require_shaft_names
-from sa_jitter_ros.prediction.prediction import DeclaredModel
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String
 

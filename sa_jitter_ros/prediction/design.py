@@ -4,7 +4,7 @@ Design of a monitoring system: what keyphasor rate and how many cycles an amplit
 The keyphasor rate decides the loss, 1 - |E X|, which no number of cycles cures; rate, noise and
 number of cycles decide the coefficient of variation, std|X| / E|X|. Both are those of unit
 components. The number of cycles also decides which interfering components fall into notches of the
-average (`comb`), and all of them how small a change one average shows (`detectability`).
+average (`comb`), and all of them how small a change one average shows (`detection_probability`).
 """
 
 from collections.abc import Sequence
@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.comb import Leakage, leakage
-from sa_jitter_ros.prediction.detectability import detection_probability
+from sa_jitter_ros.prediction.influence import Gain
+from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import cycle_moments
-from sa_jitter_ros.prediction.prediction import DeclaredModel, predict
+from sa_jitter_ros.prediction.prediction import predict
 from scipy.optimize import brentq
 
 Array = NDArray[Any]
@@ -219,6 +220,34 @@ def design_grid(
             at = replace(worst, keyphasor_rate=float(rates[i]), trigger_cycles=count)
             figures[:, i, k] = np.ravel(loss_and_variation(at))
     return DesignGrid(rates, cycles, *figures)
+
+
+def detection_probability(
+    model: DeclaredModel, changes: ArrayLike, false_alarm_rate: float,
+) -> Array:
+    """
+    Return the probability, shape (orders, k), that one average shows each of k relative changes.
+
+    An alarm is raised when the amplitude of an order crosses a threshold that amplitudes of the
+    unchanged component cross with the false-alarm rate: above it for a change upwards, below it
+    for one downwards. The component alone changes; noise stays. A change of 0.1 makes the
+    component 1.1 times as large. Raises ParameterError for a change that is not finite or below
+    -1 and for a false-alarm rate outside (0, 1).
+    """
+    if not 0.0 < false_alarm_rate < 1.0:
+        raise ParameterError(f'false_alarm_rate is {false_alarm_rate}: give a probability between '
+                             '0 and 1, both excluded')
+    ratios = 1.0 + np.atleast_1d(np.asarray(changes, float))
+    if not np.all(np.isfinite(ratios) & (ratios >= 0.0)):
+        raise ParameterError(f'change is {np.min(ratios) - 1.0:g}: give a finite relative change '
+                             'of at least -1 (the component vanishes)')
+    unchanged = predict(model)
+    low, high = np.hsplit(unchanged.ppf([false_alarm_rate, 1.0 - false_alarm_rate]), 2)
+    detected = []
+    for ratio in ratios:
+        changed = predict(model, [Gain(ratio)])
+        detected.append(1.0 - changed.cdf(high) if ratio >= 1.0 else changed.cdf(low))
+    return np.hstack(detected)
 
 
 def _interfering_orders(

@@ -10,7 +10,7 @@ angle error, done here by a Gauss-Legendre rule for all orders at once. Neighbou
 pulse, so lag 1 belongs in every variance.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -24,15 +24,11 @@ from sa_jitter_ros.prediction.angle_error import (
     unit_nodes,
 )
 from sa_jitter_ros.prediction.distributions import is_number
-from scipy.special import erf, sici
 
 Array = NDArray[Any]
-#: Deterministic angle errors d_k(u) in fundamental cycles: u of shape (m,) to (trigger cycles, m).
-AngleOffset = Callable[[Array], Array]
 
 NODES = 64
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
-_MOST_TURNS = 300.0
 _MOST_NOISE = 1e9
 
 
@@ -68,6 +64,14 @@ class AverageMoments:
     def covariance(self) -> Array:
         """Return Cov(Re X, Im X)."""
         return np.asarray(0.5 * np.imag(self.pseudo_variance))
+
+    def of(self, rows: Any) -> 'AverageMoments':
+        """Return the moments of some entries, as an index of the arrays picks them."""
+        return AverageMoments(self.mean[rows], self.variance[rows], self.pseudo_variance[rows])
+
+    def shifted(self, shift: ArrayLike) -> 'AverageMoments':
+        """Return the moments of X + shift."""
+        return AverageMoments(self.mean + np.asarray(shift), self.variance, self.pseudo_variance)
 
     def scaled(self, gain: ArrayLike) -> 'AverageMoments':
         """Return the moments of gain * X."""
@@ -136,110 +140,6 @@ def cycle_moments(
                         - np.abs(own) ** 2)
         pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - own**2)
     return CycleMoments(mean, np.array(variance), np.array(pseudo))
-
-
-def offset_moments(
-    orders: ArrayLike, processes: Sequence[AngleErrorProcess], trigger_cycles: int,
-    offset: AngleOffset, *, nodes: int = NODES,
-) -> AverageMoments:
-    """
-    Return the exact moments of the average with deterministic angle errors on top of random ones.
-
-    `offset(u)` returns d_k(u) in fundamental cycles, shape (trigger_cycles, u.size): clock skew,
-    target geometry, a known speed profile.
-    """
-    g = require_orders(orders)
-    require_cycles(trigger_cycles)
-    u, w = unit_nodes(nodes)
-    phasor = np.exp(2j * np.pi * g[:, None, None] * offset(u)) * w
-    plane = g[:, None, None]
-    first = joint_characteristic(processes, [g[:, None]], [u], [0])
-    mean = np.sum(phasor.mean(axis=1) * first, axis=1)
-    variance = np.zeros(g.size)
-    pseudo = np.zeros(g.size, complex)
-    for lag in range(min(correlation_length(processes) + 1, trigger_cycles)):
-        early = phasor[:, :trigger_cycles - lag].transpose(0, 2, 1)
-        late = phasor[:, lag:]
-        scale = (1.0 if lag == 0 else 2.0) / trigger_cycles**2
-        points = ([u[:, None], u], [0, lag])
-        joint = (joint_characteristic(processes, [plane, -plane], *points)
-                 - first[:, :, None] * first[:, None, :].conj())
-        variance += scale * np.real(np.sum((early @ late.conj()) * joint, axis=(1, 2)))
-        joint = (joint_characteristic(processes, [plane, plane], *points)
-                 - first[:, :, None] * first[:, None, :])
-        pseudo += scale * np.sum((early @ late) * joint, axis=(1, 2))
-    return AverageMoments(mean, variance, pseudo)
-
-
-def multi_harmonic_moments(
-    orders: ArrayLike, source_orders: ArrayLike, amplitudes: ArrayLike,
-    processes: Sequence[AngleErrorProcess], trigger_cycles: int, cycle_length: float, *,
-    nodes: int = NODES,
-) -> AverageMoments:
-    """
-    Return the moments of analysed orders of a signal of several components, leakage included.
-
-    The signal is sum_s a_s exp(j 2 pi g_s theta) with `source_orders` g_s and complex `amplitudes`
-    a_s; a trigger cycle is `cycle_length` (r) fundamental cycles long. An integer r lets a source
-    leak coherently into its neighbours, a bias that no number of cycles removes (Fig. 7). Raises
-    ModelError for components that are more than 300 turns a trigger cycle away from an order.
-    """
-    g = require_orders(orders)
-    sources = require_orders(source_orders)
-    a = np.broadcast_to(np.asarray(amplitudes, complex), sources.shape)
-    require_cycles(trigger_cycles)
-    if not cycle_length > 0.0:
-        raise ModelError(f'cycle_length is {cycle_length}: a trigger cycle lasts more than 0 '
-                         'fundamental cycles')
-    turns = cycle_length * (sources[:, None] - g)  # per trigger cycle, (source, order)
-    most = float(np.max(np.abs(turns)))
-    if most > _MOST_TURNS:
-        raise ModelError(
-            f'a source makes {most:.6g} turns a trigger cycle against an analysed order, more '
-            f'than {_MOST_TURNS:g}: so far apart nothing leaks, leave it out')
-    u, w = unit_nodes(max(nodes, math.ceil(np.pi * most) + 24))
-    shift = 2.0 * np.pi * turns
-    weight = a[:, None, None] * np.exp(1j * shift[:, :, None] * u) * w
-    steps = np.exp(1j * shift[:, :, None] * np.arange(trigger_cycles))
-    first = [joint_characteristic(processes, [s], [u], [0]) for s in sources]
-    means = np.array([steps[s].mean(axis=-1) * (weight[s] @ first[s])
-                      for s in range(sources.size)])
-    variance = np.zeros(g.size)
-    pseudo = np.zeros(g.size, complex)
-    for lag in range(min(correlation_length(processes) + 1, trigger_cycles)):
-        scale = (1.0 if lag == 0 else 2.0) / trigger_cycles**2
-        points = ([u[:, None], u], [0, lag])
-        for s, early in enumerate(sources):
-            for t, late in enumerate(sources):
-                joint = (joint_characteristic(processes, [early, -late], *points)
-                         - np.multiply.outer(first[s], first[t].conj()))
-                beat = np.sum(steps[s][:, :trigger_cycles - lag]
-                              * steps[t][:, lag:].conj(), axis=-1)
-                variance += scale * np.real(
-                    beat * np.sum((weight[s] @ joint) * weight[t].conj(), axis=-1))
-                joint = (joint_characteristic(processes, [early, late], *points)
-                         - np.multiply.outer(first[s], first[t]))
-                beat = np.sum(steps[s][:, :trigger_cycles - lag] * steps[t][:, lag:], axis=-1)
-                pseudo += scale * beat * np.sum((weight[s] @ joint) * weight[t], axis=-1)
-    return AverageMoments(means.sum(axis=0), variance, pseudo)
-
-
-def uniform_mean(spread: ArrayLike) -> Array:
-    """
-    Return the mean amplitude for uniform jitter, closed form (Eq. 38).
-
-    `spread` is the width in cycles of the order, g D > 0.
-    """
-    x = np.pi * np.asarray(spread, float)
-    si, ci = sici(2.0 * x)
-    return np.asarray((np.cos(x) * (ci - np.euler_gamma - np.log(2.0 * x)) + np.sin(x) * si)
-                      / x**2)
-
-
-def normal_mean(spread: ArrayLike) -> Array:
-    """Return the mean amplitude for normal jitter; `spread` = g sigma > 0 in cycles."""
-    s = 2.0 * np.pi * np.asarray(spread, float)
-    return np.asarray(np.exp(-0.25 * s**2) * np.sqrt(np.pi) * erf(0.5 * s) / s)
 
 
 def noise_line_variance(noise_std: float, sample_rate: float, duration: float) -> float:

@@ -7,6 +7,7 @@ of its model. The mean square is not sampled: it is exact.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 import math
 from typing import Any
 
@@ -32,12 +33,16 @@ _LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
 
 @dataclass(frozen=True)
 class SampledDistribution:
-    """The distribution of |X| by sorted draws of shape (orders, n) and an exact mean square."""
+    """The distribution of |X| by equally likely `draws` (orders, n) and an exact mean square."""
 
     draws: Array = field(repr=False)
     mean_square: Array
 
-    @property
+    @cached_property
+    def _sorted(self) -> Array:
+        return np.sort(self.draws, axis=1)
+
+    @cached_property
     def variance(self) -> Array:
         """Return Var|X| of the draws."""
         return np.asarray(np.var(self.draws, axis=1, dtype=float))
@@ -51,8 +56,12 @@ class SampledDistribution:
         """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
         y = np.atleast_2d(np.asarray(amplitude, float))
         y = np.broadcast_to(y, (self.draws.shape[0], y.shape[-1]))
-        counts = [np.searchsorted(row, at, side='right') for row, at in zip(self.draws, y)]
-        return np.where(np.isnan(y), np.nan, np.array(counts) / self.draws.shape[1])
+        if y.shape[1] == 1:  # not worth sorting
+            counts = np.count_nonzero(self.draws <= y, axis=1)[:, None]
+        else:
+            counts = np.array([np.searchsorted(row, at, side='right')
+                               for row, at in zip(self._sorted, y)])
+        return np.where(np.isnan(y), np.nan, counts / self.draws.shape[1])
 
     def ppf(self, probability: ArrayLike) -> Array:
         """
@@ -64,7 +73,8 @@ class SampledDistribution:
         position = p * (self.draws.shape[1] - 1)
         index = np.minimum(position.astype(int), self.draws.shape[1] - 2)
         part = position - index
-        return np.asarray((1.0 - part) * self.draws[:, index] + part * self.draws[:, index + 1])
+        return np.asarray((1.0 - part) * self._sorted[:, index]
+                          + part * self._sorted[:, index + 1])
 
 
 def can_be_sampled(
@@ -80,33 +90,17 @@ def can_be_sampled(
         for process in processes)
 
 
-def sampled_distribution(
-    orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, moments: AverageMoments, *,
-    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
-    known: KnownErrors | None = None,
-) -> SampledDistribution:
-    """
-    Return the distribution of averages of `trigger_cycles` cycles; parameters of `drawn_averages`.
-
-    `moments` are the exact ones with gain and noise.
-    """
-    draws = drawn_averages(orders, processes, trigger_cycles, gain=gain,
-                           line_variance=line_variance, weights=weights, known=known)
-    return SampledDistribution(np.sort(np.abs(draws), axis=1), moments.mean_square)
-
-
 def drawn_averages(
     orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
-    gain: ArrayLike = 1.0, line_variance: ArrayLike = 0.0, weights: PulseWeights = LINEAR,
-    known: KnownErrors | None = None,
-) -> Array:
+    weights: PulseWeights = LINEAR, known: KnownErrors | None = None, count: int | None = None,
+) -> tuple[Array, Array]:
     """
-    Return complex averages (order, draw) of `trigger_cycles` cycles, single precision.
+    Return complex averages (order, draw) of `trigger_cycles` cycles, and noise (draw,), E|n|^2 1.
 
-    `processes` `can_be_sampled`; `line_variance` is E|n|^2 of the noise; `weights` are those of
-    the angle law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come
-    on top of the random ones, of all N_t - 1 + weights.pulses pulses or of the average's
-    own N_t + 1.
+    Both are of single precision. `processes` `can_be_sampled`; `weights` are those of the angle
+    law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come on top of
+    the random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1.
+    `count` is how many averages to draw, by default as many as take a fraction of a second.
     """
     g = np.asarray(orders, float)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
@@ -114,10 +108,7 @@ def drawn_averages(
     bare = weights is LINEAR and not inside
     u, w = _LINEAR_RULE if weights is LINEAR else _BENT_RULE
     w = w.astype(np.float32)
-    phasors = g.size * (trigger_cycles + 3) * (1 if bare else u.size)
-    count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
-    most = min(MOST_PHASORS, LONGEST * g.size)
-    count = max(_COARSEST, min(count, _COARSEST * most // phasors))
+    count = count or _affordable(g.size * (trigger_cycles + 3) * (1 if bare else u.size), g.size)
     rng = np.random.default_rng(_SEED)
     shape = (trigger_cycles + weights.pulses - 1, count)
     errors: Array = np.zeros(shape)
@@ -133,18 +124,22 @@ def drawn_averages(
     angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
                             + sum(extra))).astype(np.float32) if not bare else errors
     swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
-    factors = np.broadcast_to(np.asarray(gain), g.shape)
-    scales = np.broadcast_to(np.sqrt(np.asarray(line_variance, float)), g.shape)
-    noise = noise[0] + 1j * noise[1]
     draws = np.empty((g.size, count), np.complex64)
-    for row, order, factor, scale in zip(draws, g, factors, scales):
+    for row, order in zip(draws, g):
         if bare:
             real, imag = cycle_amplitudes((order * errors).astype(np.float32))
         else:
             turned = np.float32(order) * angle
             real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
-        row[:] = factor * (real.mean(axis=0) + 1j * imag.mean(axis=0)) + scale * noise
-    return draws
+        row[:] = real.mean(axis=0) + 1j * imag.mean(axis=0)
+    return draws, noise[0] + 1j * noise[1]
+
+
+def _affordable(phasors: int, orders: int) -> int:
+    """Return how many averages of so many phasors are worth their time and memory."""
+    count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
+    most = min(MOST_PHASORS, LONGEST * orders)
+    return max(_COARSEST, min(count, _COARSEST * most // phasors))
 
 
 def moments_of(draws: Array) -> AverageMoments:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.prediction.with_effects import predict_with
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import LINEAR
 from sa_jitter_ros.report.expected_errors import cycle_places, lags_of, Version, versions_of, whole
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, legend_below, MEASURED, panels
@@ -233,8 +233,8 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.errorbar(counts, means, yerr=spreads, fmt='o', color=MEASURED, markersize=4, capsize=2,
                   label='of the recovered errors')
     for item in versions:
-        curve = [predict_with(replace(model, trigger_cycles=int(n), noise_std=0.0, orders=(g,)),
-                              item.effects).mean_attenuation[0] for n in counts]
+        curve = [predict(replace(model, trigger_cycles=int(n), noise_std=0.0, orders=(g,)),
+                         item.effects).mean_attenuation[0] for n in counts]
         axes.plot(counts, curve, color=item.colour, label=item.label)
     axes.set_xscale('log')
     axes.set_xticks(counts, [str(n) for n in counts])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import joint_characteristic
-from sa_jitter_ros.prediction.with_effects import jitter_processes, known_errors
+from sa_jitter_ros.prediction.influence import Influence, known_errors, random_processes
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, with_effects
 from scipy.linalg import toeplitz
 
@@ -57,7 +57,7 @@ def whole(evidence: Evidence) -> Evidence:
     return replace(evidence, errors=evidence.errors + _patterns(evidence, evidence.explained))
 
 
-def _patterns(evidence: Evidence, effects: Sequence[Effect]) -> Array:
+def _patterns(evidence: Evidence, effects: Sequence[Influence]) -> Array:
     """Return what effects know of each pulse error (acquisition, N_t + 1) in s."""
     patterns = np.zeros(evidence.errors.shape)
     for row, pulses in zip(patterns, evidence.pulses):
@@ -67,12 +67,13 @@ def _patterns(evidence: Evidence, effects: Sequence[Effect]) -> Array:
     return patterns
 
 
-def _timing(effects: Sequence[Effect]) -> tuple[Effect, ...]:
-    return tuple(effect for effect in effects
-                 if not effect.scatters and effect.name not in _NOT_IN_ERRORS)
+def _timing(effects: Sequence[Influence]) -> tuple[Effect, ...]:
+    return tuple(effect for effect in effects if isinstance(effect, Effect)
+                 and not effect.scatters and effect.name not in _NOT_IN_ERRORS)
 
 
-def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect, ...]) -> Version:
+def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Influence, ...]
+             ) -> Version:
     model = evidence.model
     count = evidence.errors.shape[1]
     patterns = _patterns(evidence, effects)
@@ -90,7 +91,7 @@ def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Effect,
     draws += rng.choice(patterns.ravel(), _DRAWS)
     u = cycle_places()
     small = 1e-2 / (max(np.sqrt(random[0]), _SMALL) * model.fundamental_frequency)
-    processes = jitter_processes(model, effects)
+    processes = random_processes(model, effects)
     first = np.abs(joint_characteristic(processes, [small], [u], [0]))
     variance = -2.0 * np.log(first) / (2.0 * np.pi * small * model.fundamental_frequency) ** 2
     path = model.weights.path(patterns, u, model.trigger_cycles)

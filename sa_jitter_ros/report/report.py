@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import parameter_ranges
-from sa_jitter_ros.effects.evidence import Finding
+from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual

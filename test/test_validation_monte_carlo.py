@@ -7,9 +7,10 @@ from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
 from sa_jitter_ros.prediction.distributions import Normal, Triangular, Uniform
-from sa_jitter_ros.prediction.moments import cycle_moments, multi_harmonic_moments
-from sa_jitter_ros.prediction.monte_carlo import AveragedSignal, monte_carlo
+from sa_jitter_ros.prediction.moments import cycle_moments
 from scipy import stats
+from validation.analytic import multi_harmonic_moments
+from validation.monte_carlo import AveragedSignal, monte_carlo
 
 
 def brute(errors, ratio, length, order, components, folded):

@@ -1,0 +1,159 @@
+"""
+What prediction asks of anything that changes an average beyond the declared jitter.
+
+An `Influence` says what it gives: random angle errors, known pulse errors, a gain, noise. What it
+does not override has no influence. Any number of them combine, because each only names its
+independent contribution to the one angle error. The effects of the package are influences that
+have parameters and can be found in measured data.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.moments import AverageMoments
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Pulses:
+    """
+    The measured trigger pulses of one average, or with them those beside that its angle law reads.
+
+    `times` (N_t + 1,) in s, NaN where nothing is known but the number of pulses; `first` counts
+    the pulses before them in the recording, missing ones too; `errors` (N_t + 1,) in s holds what
+    the grid of a clock says about each (`keyphasor_quantisation`), None where it says nothing;
+    `missing` (N_t,) is how many pulses lack within each cycle; `error_std` in s is how uncertain
+    `errors` are that were measured otherwise, `unknown_std` what they do not hold of the true
+    ones, correlated from pulse to pulse by `unknown_correlation`.
+    """
+
+    times: Array
+    first: int = 0
+    errors: Array | None = None
+    missing: Array | None = None
+    error_std: float = 0.0
+    unknown_std: float = 0.0
+    unknown_correlation: float = 0.0
+
+    @property
+    def index(self) -> Array:
+        """Return how many pulses went before each (N_t + 1,), missing ones too."""
+        lost = 0 if self.missing is None else np.concatenate(([0], np.cumsum(self.missing)))
+        return np.asarray(self.first + np.arange(len(self.times)) + lost)
+
+    def without(self, before: int, after: int) -> 'Pulses':
+        """Return all but some pulses at either end."""
+        kept = slice(before, len(self.times) - after)
+        cycles = slice(before, kept.stop - 1)
+        return replace(
+            self, times=self.times[kept], first=int(self.index[before]),
+            errors=None if self.errors is None else self.errors[kept],
+            missing=None if self.missing is None else self.missing[cycles])
+
+
+class Influence(Protocol):
+    """Something that changes an average; pulse errors are in s, measured minus true time."""
+
+    name: ClassVar[str]
+
+    @classmethod
+    def unmodelled(cls, model: DeclaredModel) -> str:
+        """Say why there is no forward model with this declared model; '' where there is one."""
+        return ''
+
+    def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
+        """
+        Return random angle errors, or random gains, that are stationary over the cycles.
+
+        None of them where they have no size: the prediction is then the one without them.
+        """
+        return ()
+
+    def scenarios(self, model: DeclaredModel) -> Array | None:
+        """
+        Return equally likely pulse errors (scenario, N_t + 1) in s of an average.
+
+        They are what is known of the pulses up to a few numbers that nobody knows in advance. None
+        where nothing is known, or all errors are 0.
+        """
+        return None
+
+    def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array | None:
+        """Return random scenarios (count, N_t + 1) in s where no few hold all, None elsewhere."""
+        return None
+
+    def exact_moments(self, model: DeclaredModel, processes: Sequence[AngleErrorProcess]
+                      ) -> AverageMoments | None:
+        """Return the moments over all scenarios with random `processes`, where they are known."""
+        return None
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """Return the pulse errors (N_t + 1,) in s of one average whose pulses were measured."""
+        return None
+
+    def gain(self, model: DeclaredModel) -> ArrayLike:
+        """Return the factor, one or (order,), complex or real, on the component alone."""
+        return 1.0
+
+    def line_variance(self, model: DeclaredModel) -> ArrayLike:
+        """Return E|n|^2, one or (order,), of what is added to each complex peak amplitude."""
+        return 0.0
+
+    def replaces_jitter(self, model: DeclaredModel) -> bool:
+        """Tell whether this takes the place of the declared jitter."""
+        return False
+
+    def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
+        """Return the autocovariance in s^2 that the random errors of the pulses show at `lags`."""
+        return np.zeros(np.shape(lags))
+
+
+@dataclass(frozen=True)
+class Gain(Influence):
+    """A known change of the components: `factor`, one or (order,), complex or real."""
+
+    name: ClassVar[str] = 'gain'
+    factor: ArrayLike
+
+    def gain(self, model: DeclaredModel) -> ArrayLike:
+        """Return the factor."""
+        return self.factor
+
+
+def require_modelled(model: DeclaredModel, influences: Sequence[Influence]) -> None:
+    """Raise ModelError where an influence has no forward model with the declared one."""
+    for item in influences:
+        reason = item.unmodelled(model)
+        if reason:
+            raise ModelError(f'{item.name}: {reason}')
+
+
+def random_processes(model: DeclaredModel, influences: Sequence[Influence]
+                     ) -> tuple[AngleErrorProcess, ...]:
+    """Return the random angle errors of declared jitter and influences."""
+    declared: tuple[AngleErrorProcess, ...] = (
+        IndependentPulseJitter(model.distribution, model.fundamental_frequency, model.weights),)
+    if any(item.replaces_jitter(model) for item in influences):
+        declared = ()
+    return (*declared, *(process for item in influences for process in item.processes(model)))
+
+
+def known_errors(model: DeclaredModel, influences: Sequence[Influence], pulses: Pulses
+                 ) -> Array | None:
+    """Return what influences know of the errors of `pulses` in s, None for nothing."""
+    found = [errors for errors in (item.pattern(model, pulses) for item in influences)
+             if errors is not None]
+    return np.asarray(np.sum(found, axis=0)) if found else None
+
+
+def mean_period(times: Array, missing: Array | None) -> float:
+    """Return the mean trigger period in s of pulses of which `missing` (interval,) lack."""
+    lost = 0 if missing is None else missing.sum()
+    return float((times[-1] - times[0]) / (len(times) - 1 + lost))
