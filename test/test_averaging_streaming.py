@@ -622,7 +622,7 @@ def test_trigger_cycle_longer_than_the_buffer_says_so():
                       shaft={'orders': (10.0,), 'trigger_cycles': 2})
     assert feed(target, machine, seconds=60.0) == []
     assert target.counts.cycles_dropped >= 25
-    assert '(raise buffer_seconds = 1 s, it is longer)' in target.take_messages()[0]
+    assert 'longer than buffer_seconds = 1 s: raise it' in target.take_messages()[0]
 
 
 def test_restarts_without_end_are_bounded():

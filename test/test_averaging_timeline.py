@@ -88,7 +88,7 @@ def test_wrong_time_is_counted_from_half_a_sample_on_and_a_new_run_from_the_tole
     assert [item.start_time for item in timeline.segments] == [0.0, 0.411]
     assert timeline.end_time == pytest.approx(0.61)
     assert timeline.epoch == 0 == timeline.counts.restarts
-    assert 'sample 400 is +0.011 s off (limit 0.01 s)' in timeline.messages[-1]
+    assert 'sample 400 differs by +0.011 s' in timeline.messages[-1]
 
 
 def test_time_that_jumps_back_over_consecutive_indices_is_another_epoch():

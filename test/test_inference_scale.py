@@ -168,7 +168,7 @@ def test_uncertain_pulse_errors_do_not_attenuate(observation, rng):
 
 def test_noise_that_passes_for_larger_jitter_is_not_corrected():
     noisy = simulated(noise=1.5, jitter=1e-6)
-    with pytest.raises(SignalError, match='align noise to itself'):
+    with pytest.raises(SignalError, match='add more error than it removes'):
         observe(noisy, replace(MODEL, keyphasor_rate=20000.0, noise_std=1.5))
 
 

@@ -441,7 +441,7 @@ def test_parameter_can_be_set_while_it_runs(bench, name, value, stored):
     ('averaging', 'median', 'one of block, sliding, exponential'),
     ('angle_law', '', 'one of linear, quadratic, spline'),
     ('interpolation', 'best', 'one of band_limited'),
-    ('pulses_per_trigger', 2, 'pulses_per_trigger is 2 of 1 pulses_per_revolution'),
+    ('pulses_per_trigger', 2, 'pulses_per_trigger is 2, more than the 1 pulses_per_revolution'),
     ('shafts', ['other'], 'read-only'),
     ('vibration_type', 'sensor_msgs/Imu', 'read-only'),
 ])

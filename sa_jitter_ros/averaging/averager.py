@@ -1,10 +1,9 @@
 """
 The library's synchronous average of arrays: at once (`average`) or block by block (`Averager`).
 
-Both stand on the stream that the node `synchronous_averager` uses and take its parameters under
-the same names, with the same defaults but three: `trigger_cycles` None averages all cycles,
-`keyphasor_rate` None is the sampling rate of the vibration, and nothing is dropped because it
-waits too long (`buffer_seconds`).
+Both use the stream of the node `synchronous_averager` and take its parameters under the same
+names. Three defaults differ: `trigger_cycles` None averages all cycles, `keyphasor_rate` None is
+the sampling rate of the vibration, and `buffer_seconds` is unlimited.
 """
 
 from collections.abc import Sequence
@@ -33,19 +32,20 @@ _SHAFT = 'shaft'
 
 class Averager:
     """
-    Synchronous averages of one shaft from vibration and pulses that come block by block.
+    Synchronous averages of one shaft from vibration and pulses in blocks.
 
     `sample_rate` (Hz) and `start_time` (s) of the first sample put the vibration on the clock of
     the pulses; `ratio` is the speed of the shaft over that of the tach shaft, `trigger_cycles` N_t
-    (None: all of an unbroken run, returned where it ends), `orders` are multiples of the shaft
-    (None: 1, 2, 3). The other keywords are the parameters of the node `synchronous_averager`.
+    (None: all of an uninterrupted run, returned where it ends), `orders` are multiples of the
+    shaft speed (None: 1, 2, 3). The other keywords are the parameters of the node
+    `synchronous_averager`.
 
-    The averages depend on the data alone: not on where it was cut, nor on whether pulses come
-    before or after their samples. An average holds consecutive trigger cycles only. NaN and
-    infinite samples are a gap; double pulses are dropped, cycles with early, late or missing
-    pulses discarded. `messages` says in words what was discarded, `counts` counts it. Samples and
-    pulses wait for each other up to `buffer_seconds`: give a limit where one of the two may stay
-    away. Raises `ParameterError` for parameters that cannot be used.
+    The averages depend on the data only: not on the sizes of the blocks, and not on whether pulses
+    come before or after their samples. An average contains consecutive trigger cycles only. NaN
+    and infinite samples are a gap; double pulses are dropped; cycles with early, late or missing
+    pulses are discarded. `messages` describes what was discarded, `counts` counts it. Samples wait
+    for their pulses, and pulses for their samples, up to `buffer_seconds`: set a limit if one of
+    the two may fail. Raises `ParameterError` for parameters that cannot be used.
 
     A shaft at 25 Hz whose 8th order has an amplitude of 2 m/s^2, in blocks of a second:
 
@@ -83,8 +83,8 @@ class Averager:
         if not buffer_seconds > 0.0:
             raise ParameterError(f'buffer_seconds is {buffer_seconds} s: give a positive time')
         if trigger_cycles is None and averaging != 'block':
-            raise ParameterError(f'averaging is {averaging!r} without trigger_cycles: say how '
-                                 'many trigger cycles the window holds')
+            raise ParameterError(f'averaging is {averaging!r} without trigger_cycles: set the '
+                                 'number of trigger cycles in the window')
         keyphasor = KeyphasorParameters(
             pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
             missing_teeth=missing_teeth, missing_pulses=missing_pulses,
@@ -109,10 +109,10 @@ class Averager:
     @property
     def counts(self) -> dict[str, int]:
         """
-        Return what was used and what was not, by the keys of the node's diagnostics.
+        Return how much data was used and discarded, by the keys of the node's diagnostics.
 
-        `trigger_cycles` were averaged; `pulses_missing_broken`, `pulses_doubles`, ... say what
-        became of the pulses (`sa_jitter_ros.pulses.validation.PulseCounts`).
+        `trigger_cycles` were averaged; `pulses_missing_broken`, `pulses_doubles`, ... count the
+        pulses by kind (`sa_jitter_ros.pulses.validation.PulseCounts`).
         """
         stream = self._stream
         return {
@@ -125,13 +125,12 @@ class Averager:
         """
         Take the next samples and pulses, either or both, and return the averages that are due.
 
-        `vibration` (channel, sample), or (sample,) for one channel, follows on the samples before;
-        `pulse_times` (pulse,) in s, in order of arrival. Raises `SignalError` for arrays that are
-        not real numbers, of another shape or of another number of channels than before; they are
-        not taken.
+        `vibration` (channel, sample), or (sample,) for one channel, continues the samples before;
+        `pulse_times` (pulse,) in s, in order of arrival. Raises `SignalError`, and takes nothing,
+        for arrays that are not real numbers or have another shape or number of channels.
         """
         if self._ended:
-            raise SignalError('the stream ended with flush: make another Averager')
+            raise SignalError('update after flush, which ends the stream: make another Averager')
         samples = None if vibration is None else self._checked(vibration)
         found = []
         if pulse_times is not None:
@@ -183,13 +182,13 @@ def average(
 
     `pulse_times` (pulse,) in s are on the clock on which the first sample is at `start_time`. The
     keywords are those of `Averager`: without `trigger_cycles` all cycles make one average, or one
-    for every unbroken run of them. What is discarded is said in a `DataWarning`. Raises
-    `ParameterError` for parameters and `SignalError` for arrays that cannot be used, also where
-    they hold fewer trigger cycles than an average needs.
+    for every uninterrupted run of them. A `DataWarning` says what is discarded. Raises
+    `ParameterError` for parameters and `SignalError` for arrays that cannot be used, also if they
+    contain fewer trigger cycles than an average needs.
 
     A gear mesh of 19 teeth on a shaft at 16.6 Hz whose keyphasor is sampled at 1 kHz. The average
-    shows less than the true amplitude of 2 m/s^2; the vibration tells by how much every pulse is
-    wrong, and without these errors the amplitude is there again:
+    shows less than the true amplitude of 2 m/s^2. The correction recovers the pulse errors from
+    the vibration, and with them the true amplitude:
 
     >>> import numpy as np
     >>> import sa_jitter_ros as sa
@@ -204,7 +203,7 @@ def average(
     (array([[1.8]]), array([[2.]]))
     >>> result.trigger_cycles, round(result.trigger_speed, 2), result.waveform.shape
     (47, 16.6, (1, 1296))
-    >>> bool(np.ptp(result.correction.pulse_errors) < 1.05 / 1e3)  # a period of the clock
+    >>> bool(np.ptp(result.correction.pulse_errors) < 1.05 / 1e3)  # a sample of the keyphasor
     True
     """
     averager = Averager(
@@ -228,7 +227,7 @@ def average(
         raise SignalError(
             f'{pulses.size} pulses and vibration from {start_time:g} s to {end:g} s make '
             f'{counts["trigger_cycles"]} whole trigger cycles{wanted}: '
-            + (f'{discarded}' if discarded else 'lower trigger_cycles, or give more pulses'))
+            + (discarded or 'lower trigger_cycles, or give more pulses'))
     if discarded:
         warnings.warn(discarded, DataWarning, stacklevel=2)
     return found
@@ -239,14 +238,15 @@ _CAUSES = {
     'pulses_non_finite': 'pulse times that are NaN or infinite',
     'pulses_doubles': 'double pulses', 'pulses_early': 'early pulses',
     'pulses_late': 'late pulses', 'pulses_missing_broken': 'missing pulses',
-    'pulses_missing_bridged': 'missing pulses that were put in evenly',
-    'pulses_out_of_order': 'pulses out of order', 'pulses_restarts': 'times that run back',
+    'pulses_missing_bridged': 'missing pulses that were interpolated',
+    'pulses_out_of_order': 'pulses out of order',
+    'pulses_restarts': 'steps back of the pulse times',
     'pulses_unlocked': 'pulses without a steady interval',
-    'pulses_relearnt': 'changes of the pulse interval within a pulse or two'}
+    'pulses_relearnt': 'changes of the pulse interval within one or two pulses'}
 
 
 def _discarded(averager: Averager) -> str:
-    """Say what an averager could not use and why, '' if it used everything."""
+    """Return what an averager could not use, and why; '' if it used everything."""
     counts = averager.counts
     causes = [f'{counts[key]} {text}' for key, text in _CAUSES.items() if counts[key]]
     if not (causes or averager.messages or counts['cycles_dropped']):

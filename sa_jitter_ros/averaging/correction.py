@@ -1,4 +1,4 @@
-"""An average with the errors of its pulses recovered from the vibration, and taken out."""
+"""The corrected average: pulse errors are recovered from the vibration and removed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,14 +13,14 @@ from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 
 FloatArray = NDArray[np.float64]
 
-_REACH = 0.02  # of a trigger cycle by which a corrected pulse may move
-# Phase in rad up to which the recovered errors may be uncertain at an order. Beyond it the noise
-# of the order itself has a say in them, and aligning noise to itself raises the amplitude.
+_REACH = 0.02  # largest correction of a pulse, a fraction of a trigger cycle
+# Largest uncertainty of the phase (rad) of an order by that of the recovered errors. Beyond it the
+# noise of the order determines the errors, and the correction would raise the amplitude of noise.
 _UNCERTAIN = 0.3
 
 
 class CorrectingAverager:
-    """A `ShaftAverager` whose averages come with their `Correction` where settings ask for it."""
+    """A `ShaftAverager` that adds the `Correction` to its averages if `correct_jitter` is set."""
 
     def __init__(self, settings: AverageSettings) -> None:
         self._shaft = ShaftAverager(settings)
@@ -28,26 +28,26 @@ class CorrectingAverager:
 
     @property
     def settings(self) -> AverageSettings:
-        """Settings in force."""
+        """Return the present settings."""
         return self._shaft.settings
 
     def reset(self) -> bool:
-        """Begin again at angle 0; returns whether an unfinished average was lost."""
+        """Begin again at angle 0; return whether an unfinished average was lost."""
         self._cycles.clear()
         return self._shaft.reset()
 
     def change(self, settings: AverageSettings) -> bool:
-        """Go on with other settings and the same angle; returns whether an average was lost."""
+        """Continue at the same angle with other settings; return whether an average was lost."""
         self._cycles.clear()
         return self._shaft.change(settings)
 
     def margin(self, period: float, rate: float) -> int:
-        """Return how many samples a cycle of `period` s at `rate` Hz needs on either side."""
+        """Return the samples that a cycle of `period` s at `rate` Hz needs on either side."""
         reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
         return self._shaft.margin(period, rate) + reach
 
     def update(self, cycle: CycleSamples) -> Average | None:
-        """Take the next trigger cycle; returns an average, corrected, when one is due."""
+        """Take the next trigger cycle; return the average and its correction when one is due."""
         average = self._shaft.update(cycle)
         if not self.settings.correct_jitter:
             return average
@@ -71,23 +71,24 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     """
     Recover the pulse errors of a block average and average its cycles again without them.
 
-    `cycles` are the trigger cycles of `raw`, `settings` those it was made with.
+    `cycles` are the trigger cycles of `raw`, `settings` its settings.
     """
     if len(cycles) < 2:
-        return _uncorrected(raw, 'one trigger cycle cannot be compared with itself: average more')
-    # By the linear law, whatever the settings: the recovery knows its error inside a cycle.
+        return _uncorrected(raw, 'pulse errors follow from the difference between trigger cycles '
+                                 'and there is one cycle: average more')
+    # The recovery is a model of the linear law, whatever law the settings have.
     grid = cycle_grid(cycles, method=settings.interpolation)
     clock = settings.keyphasor_rate or cycles[0].rate
     recovery = recover_pulse_errors(
         grid, periods=np.diff(raw.pulses), cycle_length=settings.cycle_length,
-        first_angle=raw.first_angle, also=settings.orders,
+        first_angle=raw.first_angle, additional_orders=settings.orders,
         declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
     corrected = raw
     largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
     if largest > reach:
         recovery = replace(recovery, accepted=False, errors=np.zeros_like(recovery.errors),
                            reason=f'a pulse error of {largest:.3g} s is above {reach:.3g} s, '
-                                  f'{_REACH:.0%} of a trigger cycle: validate the pulses')
+                                  f'{_REACH:.0%} of a trigger cycle: check the pulses')
     elif recovery.accepted:
         corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
     phase = np.zeros(len(raw.orders))
@@ -99,7 +100,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     with np.errstate(divide='ignore', invalid='ignore'):
         amplitude = np.abs(corrected.amplitudes)
         attenuation = np.abs(raw.amplitudes) / amplitude
-        # The noises of raw and corrected are correlated by what the signal keeps, `attenuation`.
+        # The noise of the raw and of the corrected amplitude has the correlation `attenuation`.
         error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
     return Correction(
         corrected.waveform, corrected.amplitudes, corrected.noise, recovery.errors,
@@ -108,7 +109,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
 
 
 def _uncorrected(raw: Average, reason: str) -> Correction:
-    """Return the raw average as one that could not be corrected."""
+    """Return the raw average as a correction that is not accepted."""
     unknown = np.full(raw.amplitudes.shape, np.nan)
     return Correction(
         raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
@@ -117,7 +118,7 @@ def _uncorrected(raw: Average, reason: str) -> Correction:
 
 def _average_again(raw: Average, cycles: Sequence[CycleSamples],
                    settings: AverageSettings, pulses: FloatArray) -> Average:
-    """Average the same cycles between corrected pulses."""
+    """Return the average of the same cycles between corrected pulses."""
     again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
                     trigger_cycles=raw.trigger_cycles)
     average = average_cycles(

@@ -1,10 +1,10 @@
 """
-One trigger cycle in angle: order amplitudes of the cycle and its points of the waveform.
+One trigger cycle in angle: its order amplitudes and its points of the waveform.
 
 The cycle is `r` fundamental cycles long. Its order amplitudes are integrals over the whole trigger
-cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), taken on a grid of the trigger cycle
-that is never coarser than the samples. The waveform has points at k/n of a fundamental cycle,
-wherever those fall between the pulses: a fundamental cycle that straddles a pulse is exact.
+cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), on a grid that is never coarser than
+the samples. The points of the waveform are at k/n of a fundamental cycle and independent of the
+pulses, so that a fundamental cycle with a pulse inside it is exact, too.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
-_SMALL_NUMBER = 512  # denominator of r up to which all cycles share the waveform's points
+_SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,11 @@ class CycleSamples:
     """
     The samples of one trigger cycle, with what interpolation needs on either side.
 
-    `samples` (sample, channel) of which the first is `lead` s after `start_time` (s), at `rate`
-    (Hz); `pulses` (s) are those that the angle law reads, the cycle begins at `pulses[first]`.
-    Since 1970 so many seconds have gone by that one sum of the two would round by 0.1 us. The
-    speed may ripple inside the cycle: at the fraction u the shaft is `ripple` u (1 - u) s earlier
-    than the angle law says.
+    `samples` (sample, channel) at `rate` (Hz); the first is `lead` s after `start_time` (s). These
+    are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
+    are those that the angle law uses; the cycle begins at `pulses[first]`. With a speed ripple
+    inside the cycle the shaft passes the fraction u by `ripple` u (1 - u) s earlier than the angle
+    law says.
     """
 
     samples: FloatArray
@@ -67,13 +67,13 @@ class CycleSamples:
         return float(self.pulses[self.first + 1] - self.pulses[self.first])
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
-        """Values (len(u), channel) at fractions `u` of the cycle."""
+        """Return values (len(u), channel) at fractions `u` of the cycle."""
         pulses = (self.pulses - self.start_time) - self.lead
         times = cycle_times(law, pulses, self.first, u)
         if self.ripple:
             times = times - self.ripple * u * (1.0 - u)
         positions = times * self.rate
-        # a pulse on the first or last sample may round to just outside it
+        # The position of a pulse on the first or last sample may round to just outside.
         np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
         return interpolate(self.samples, positions, method=method, cutoff=cutoff)
 
@@ -93,9 +93,12 @@ def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = L
 
 def grid_points(period: float, rate: float) -> int:
     """
-    Points per trigger cycle of `period` s that keep up with samples at `rate` Hz.
+    Return the points per trigger cycle of `period` s, at least one per sample at `rate` Hz.
 
-    On a ladder of about 6 % steps, so that cycles of nearly one length share a grid.
+    Numbers of points are in steps of about 6 %, so that cycles of similar length have one grid.
+
+    >>> grid_points(0.04, 5000.0), grid_points(0.041, 5000.0), grid_points(0.043, 5000.0)
+    (204, 216, 216)
     """
     needed = max(period * rate, 8.0)
     return math.ceil(math.pow(2.0, math.ceil(12.0 * math.log2(needed)) / 12.0))
@@ -104,9 +107,12 @@ def grid_points(period: float, rate: float) -> int:
 @lru_cache(maxsize=64)
 def exact_cycles(cycles: float) -> Fraction:
     """
-    Return r as the fraction that its decimals, or the teeth of gears, mean.
+    Return r as the exact fraction of its decimals, or of the numbers of teeth.
 
-    Angles are multiples of it: of a rounded r they would be off by a waveform point after days.
+    Angles are multiples of r: with a rounded r they drift by a waveform point in some days.
+
+    >>> exact_cycles(2.40789), exact_cycles(19 / 53)
+    (Fraction(240789, 100000), Fraction(19, 53))
     """
     share = Fraction(cycles).limit_denominator(1_000_000)
     return share if abs(float(share) - cycles) <= 1e-14 * cycles else Fraction(cycles)
@@ -114,10 +120,13 @@ def exact_cycles(cycles: float) -> Fraction:
 
 def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> int:
     """
-    Waveform points per fundamental cycle that lose none of the samples' band.
+    Return the waveform points per fundamental cycle that keep the band of the samples.
 
-    `cycles` is r. Where r is a ratio of small numbers the points fall on the same angles of every
+    `cycles` is r. If r is a ratio of small numbers, the points are at the same angles of every
     trigger cycle.
+
+    >>> choose_samples_per_revolution(1.0, 0.04, 5000.0)
+    216
     """
     needed = 1.05 * period * rate / cycles
     step = exact_cycles(cycles).denominator
@@ -128,7 +137,7 @@ def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> 
 
 
 def waveform_cutoff(points: int, cycles: float, period: float, rate: float) -> float:
-    """Band of a waveform of `points` per fundamental cycle, as a fraction of the samples' band."""
+    """Return the band of a waveform of so many `points`, as a fraction of that of the samples."""
     cutoff = points * cycles / (period * rate)
     if cutoff >= 1.0:
         return 1.0
@@ -144,10 +153,10 @@ def needed_margin(method: str, cutoff: float) -> int:
 def _order_basis(points: int, cycles: float, orders: tuple[float, ...]
                  ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
     """
-    Factors of exp(-j 2 pi g theta) on a grid of `points` steps, so that long cycles need no table.
+    Return exp(-j 2 pi g theta) on a grid of `points` steps as products of two short tables.
 
-    Point k has `fine` (order, width) at k % width times, at k // width, what the halves of
-    `coarse` (2 orders, rows + 1) hold: real and imaginary parts. The last one is that of the end.
+    The value at point k is `fine` (order, width) at k % width times `coarse` (2 orders, rows + 1)
+    at k // width, whose halves are real and imaginary parts. The third value is that at the end.
     """
     width = math.isqrt(points)
     step = -2j * np.pi * cycles / points * np.array(orders)[:, None]
@@ -159,11 +168,16 @@ def _order_basis(points: int, cycles: float, orders: tuple[float, ...]
 def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], angle: Fraction | float
             ) -> ComplexArray:
     """
-    Complex peak amplitudes (channel, order) of one trigger cycle.
+    Return the complex peak amplitudes (channel, order) of one trigger cycle.
 
-    `grid` (points + 1, channel) are its values at equal steps of angle, both ends included; it
-    begins at `angle` (fundamental cycles), to which phases refer. Trapezoidal weights, twice the
-    mean of x exp(-j 2 pi g theta).
+    `grid` (points + 1, channel) are its values at equal steps of angle, both ends included. The
+    cycle begins at `angle` (fundamental cycles); phases refer to angle 0. An amplitude is twice
+    the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
+
+    >>> theta = np.linspace(0.0, 1.0, 65)
+    >>> wave = 3.0 * np.cos(2.0 * np.pi * 4.0 * theta)[:, None]
+    >>> abs(project(wave, 1.0, (4.0, 5.0), 0)).round(6)
+    array([[3., 0.]])
     """
     points, channels, count = len(grid) - 1, grid.shape[1], len(orders)
     fine, coarse, end = _order_basis(points, cycles, orders)
@@ -175,16 +189,16 @@ def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], angle: F
     if len(rest):
         last = coarse[:count, rows:] + 1j * coarse[count:, rows:]
         total += last * (fine[:, :len(rest)] @ rest)
-    whole = math.floor(angle)  # of which integer orders make whole turns
+    whole = math.floor(angle)  # in which integer orders make whole turns
     turns = np.mod(orders, 1.0) * whole + np.array(orders) * float(angle - whole)
     return np.asarray(total.T * (2.0 / points * np.exp(-2j * np.pi * turns)))
 
 
 def first_point(angle: Fraction, points: int) -> int:
-    """Index of the first waveform point at or after an angle (fundamental cycles)."""
+    """Return the index of the first waveform point at or after an angle (fundamental cycles)."""
     return math.ceil(angle * points)
 
 
 def on_grid(points: int, cycles: float) -> bool:
-    """Whether the waveform's points fall on the same angles of every trigger cycle."""
+    """Whether the points of the waveform are at the same angles of every trigger cycle."""
     return (exact_cycles(cycles) * points).denominator == 1

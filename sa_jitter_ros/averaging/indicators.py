@@ -52,21 +52,21 @@ INDICATORS: tuple[str, ...] = (
     'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',
     'energy_ratio', 'sideband_ratio', 'sideband_level_factor')
 
-# What is this small beside the average's peak is the rounding of its Fourier transform.
+# Fraction of the peak of the average, below which a value is a rounding error.
 _ROUNDING = 1e-13
-# Far above any sensor, and its square is still far from overflow.
+# Far above the range of any sensor; its square is far from overflow.
 _LARGEST_SAMPLE = 1e100
 
 
 @dataclass(frozen=True)
 class GearSettings:
     """
-    Which lines of an average are regular.
+    Which orders of an average belong to the regular signal.
 
-    `mesh_orders` are the tooth counts on the shaft of interest (one for each gear on it; none:
-    unknown), `sidebands` the number of sideband pairs a mesh harmonic takes along, one order
-    apart, `shaft_harmonics` the number of shaft orders. Raises ParameterError on a mesh order that
-    is not a positive integer and on negative counts.
+    `mesh_orders` are the numbers of teeth on the shaft of interest (one for each gear on it; empty
+    if unknown), `sidebands` the number of pairs of sidebands of each mesh harmonic, one order
+    apart, `shaft_harmonics` the number of shaft orders. Raises ParameterError for a mesh order
+    that is not a positive integer and for negative numbers.
     """
 
     mesh_orders: Sequence[float] = ()
@@ -80,7 +80,7 @@ class GearSettings:
             if not (order >= 1.0 and order.is_integer()):
                 raise ParameterError(
                     f'mesh order {order:g} is not a positive integer: an average over one '
-                    'revolution holds whole orders only; give the tooth count of the gear')
+                    'revolution has whole orders only; give the number of teeth of the gear')
         object.__setattr__(self, 'mesh_orders', tuple(int(order) for order in mesh_orders))
         for name in ('sidebands', 'shaft_harmonics'):
             count = float(getattr(self, name))
@@ -92,12 +92,12 @@ class GearSettings:
 @dataclass(frozen=True)
 class GearLines:
     """
-    Which orders 0..n//2 of an average belong to what, as boolean masks.
+    The kinds of orders 0..n//2 of an average, as boolean masks.
 
-    `mesh` are the mesh harmonics, `shaft` the mean and the shaft harmonics that are none of them,
-    `sidebands` the neighbours of mesh harmonics that are neither. Around the mesh orders
-    themselves, `fundamentals`, lie the `fundamental_sidebands`, up to `GearSettings.sidebands`
-    orders away, and the `first_sidebands`, one order away whatever the settings.
+    `mesh` are the mesh harmonics, `shaft` the mean and the shaft harmonics that are not mesh
+    harmonics, `sidebands` the neighbours of mesh harmonics that are neither. `fundamentals` are
+    the mesh orders, `fundamental_sidebands` those up to `GearSettings.sidebands` orders from them,
+    and `first_sidebands` those one order from them, for any settings.
     """
 
     mesh: Array
@@ -111,7 +111,7 @@ class GearLines:
 @dataclass(frozen=True)
 class GearSignals:
     """
-    An average taken apart: signals of its shape (..., n) and the peak amplitudes of its lines.
+    The gear signals of an average, of its shape (..., n), and the peak amplitudes of its orders.
 
     `amplitudes` (..., n//2 + 1) is indexed by order and by the masks of `lines`.
     """
@@ -125,9 +125,9 @@ class GearSignals:
 
 def gear_lines(settings: GearSettings, points: int) -> GearLines:
     """
-    Return the lines of an average of so many points.
+    Return the kinds of orders of an average with so many points.
 
-    Raises ParameterError on a mesh order at or above the Nyquist order, half the points.
+    Raises ParameterError for a mesh order at or above the Nyquist order, half the points.
     """
     for mesh_order in settings.mesh_orders:
         if 2 * mesh_order >= points:
@@ -155,22 +155,30 @@ def gear_lines(settings: GearSettings, points: int) -> GearLines:
 
 def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     """
-    Take a synchronous average over one revolution, (..., n), apart into its gear signals.
+    Return the gear signals of a synchronous average over one revolution, (..., n).
 
-    Raises SignalError on samples that are not finite and on an average that is empty or has one
-    point, ParameterError on a mesh order at or above the Nyquist order n/2.
+    Raises SignalError for samples that are not finite and for an average that is empty or has one
+    point, ParameterError for a mesh order at or above the Nyquist order n/2.
+
+    >>> angle = np.arange(256) / 256
+    >>> average = np.cos(2.0 * np.pi * 19.0 * angle) + 0.1 * np.cos(2.0 * np.pi * 7.0 * angle)
+    >>> signals = separate(average, GearSettings(mesh_orders=[19]))
+    >>> float(signals.regular.std().round(3)), float(signals.difference.std().round(3))
+    (0.707, 0.071)
+    >>> float(signals.amplitudes[7].round(3))
+    0.1
     """
     samples = np.asarray(average, float)
     if samples.size == 0 or samples.ndim == 0 or samples.shape[-1] < 2:
         raise SignalError(f'average of shape {samples.shape}: its last dimension is the angle and '
-                          'needs 2 points or more, the others 1 or more')
+                          'must have 2 points or more, the others 1 or more')
     if not np.all(np.abs(samples) < _LARGEST_SAMPLE):
         raise SignalError(f'average with samples that are not finite or not below '
-                          f'{_LARGEST_SAMPLE:g}: leave such averages out')
+                          f'{_LARGEST_SAMPLE:g}: leave this average out')
     points = samples.shape[-1]
     lines = gear_lines(settings, points)
     spectrum = np.fft.rfft(samples)
-    # The mean and the Nyquist line of even n have no mirror image that holds half their amplitude.
+    # Of the mean, and of the Nyquist order of even n, there is no negative frequency.
     weight = np.full(spectrum.shape[-1], 2.0 / points)
     weight[0] = 1.0 / points
     if points % 2 == 0:
@@ -186,10 +194,10 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
 @dataclass(frozen=True)
 class ConditionIndicators:
     """
-    Indicators in the fixed order of `names`: `values` is (..., indicator), NaN where undefined.
+    Condition indicators in the order of `names`: `values` (..., indicator), NaN where undefined.
 
     The leading dimensions are the average's: (channel, indicator) or (average, channel,
-    indicator). `averages` is the number of averages that na4 knows.
+    indicator). `averages` is the number of averages on which na4 is based.
     """
 
     values: Array
@@ -203,9 +211,9 @@ class ConditionIndicators:
 
 class RunningIndicators:
     """
-    Condition indicators of average after average; na4 remembers the residual's mean variance.
+    Condition indicators of one average after another, with the history that na4 needs.
 
-    The result after every update is that of `condition_indicators` on all averages so far.
+    The result after each update equals that of `condition_indicators` for all averages so far.
     """
 
     def __init__(self, settings: GearSettings | None = None) -> None:
@@ -218,21 +226,21 @@ class RunningIndicators:
         """
         Take the next average, (channels, n).
 
-        Raises SignalError and ParameterError as `condition_indicators` does, and SignalError when
-        the number of channels changes; a refused average leaves the history as it was.
+        Raises SignalError and ParameterError as `condition_indicators` does, and SignalError if
+        the number of channels changes. After an error the history is unchanged.
         """
         samples = np.asarray(average, float)
         count = self._latest.averages
         if samples.ndim != 2 or (count > 0 and samples.shape[0] != self._variance_sum.size):
             expected = self._variance_sum.size if count else 'any number of'
             raise SignalError(f'average of shape {samples.shape}: expected {expected} channels x '
-                              'points; start anew when the channels change')
+                              'points; make new RunningIndicators when the channels change')
         values, self._variance_sum = _indicators(
             samples[None], self._settings, count, self._variance_sum if count else np.zeros(()))
         self._latest = ConditionIndicators(values[0], count + 1)
 
     def get(self) -> ConditionIndicators:
-        """Return the indicators of the latest average; none, of no channel, before the first."""
+        """Return the indicators of the latest average; before the first one, of no channel."""
         return self._latest
 
 
@@ -240,12 +248,22 @@ def condition_indicators(
     average: ArrayLike, settings: GearSettings | None = None,
 ) -> ConditionIndicators:
     """
-    Return the condition indicators of one average or of a whole history of averages.
+    Return the condition indicators of one average or of a history of averages.
 
-    `average` is (channels, n), or (averages, channels, n) from the oldest to the latest; na4 of an
-    average knows it and those before it, so that of a single one is the kurtosis of its residual.
-    Raises SignalError on another shape or on samples that are not finite, ParameterError on a mesh
+    `average` is (channels, n), or (averages, channels, n) from the oldest to the latest. na4 uses
+    an average and those before it; of a single average it is the kurtosis of the residual signal.
+    Raises SignalError for another shape or samples that are not finite, ParameterError for a mesh
     order at or above the Nyquist order n/2.
+
+    A sine has the kurtosis 1.5. A pulse in one place of the revolution, as of a damaged tooth,
+    raises the indicators of the difference signal:
+
+    >>> angle = np.arange(512) / 512
+    >>> healthy = np.cos(2.0 * np.pi * 19.0 * angle)
+    >>> damaged = healthy + 0.2 * np.exp(-(((angle - 0.5) / 0.01) ** 2))
+    >>> indicators = condition_indicators([healthy, damaged], GearSettings(mesh_orders=[19]))
+    >>> indicators['kurtosis'].round(2), indicators['fm4'].round(1)
+    (array([1.5, 1.5]), array([ nan, 37.4]))
     """
     samples = np.asarray(average, float)
     if samples.ndim not in (2, 3):

@@ -1,20 +1,21 @@
 """
 Fit of pulse errors to the resampled trigger cycles: model, least squares, uncertainty.
 
-A trigger cycle resampled between two wrong pulses reads the vibration `s` at a wrong angle,
+A trigger cycle that is resampled between two wrong pulses contains the vibration `s` at wrong
+angles,
 
     x_k(u) = s(theta_k(u) + (1 - u) eps_k + u eps_{k+1} + u (1 - u) ripple_k) + noise,
 
 with `theta_k(u) = first_angle + r (k + u)` (Camerini et al. 2019, Eq. 16; the last term, a speed
-that ripples faster than the trigger, is not in the paper). Every order of `s` is thus a carrier
-times a factor that varies slowly with `u`: a polynomial, fixed by its values at a few Gauss nodes.
-Carriers times polynomials are the same in all cycles, so that one orthonormal basis of them
-compresses every cycle to a short vector in which white noise stays white, the phase model stays
-exact, and the leakage between orders is part of the model, whatever the cycle_length.
+ripple faster than the trigger rate, is not in the paper). Every order of `s` is thus a carrier
+times a factor that varies slowly with `u`: a polynomial, given by its values at a few Gauss nodes.
+Carriers times polynomials are the same in all cycles. One orthonormal basis of them compresses
+every cycle to a short vector, in which white noise remains white and the phase model exact. The
+leakage between orders is part of the model for every cycle length.
 
-Amplitudes, noise and errors are estimated in turn. A pulse shares cycles with its two neighbours
-only, so that the normal matrix is tridiagonal: a Gauss-Newton step, the standard errors and a
-search on a grid all take time in proportion to the number of pulses.
+Amplitudes, noise and errors are estimated in turn. Only neighbouring pulses have a cycle in
+common, so that the normal matrix is tridiagonal: the time of a Gauss-Newton step, of the standard
+errors and of a search on a grid is proportional to the number of pulses.
 """
 
 from collections.abc import Sequence
@@ -34,13 +35,13 @@ _MOST_NODES = 20
 _ITERATIONS = 25
 # Grid points in a turn of the highest order, and the reach of the grid in widths of the jitter.
 _SCAN_POINTS, _SCAN_REACH = 16, 1.8
-# What resampling and the model get wrong of a cycle, as a share of it.
+# Error of resampling and model, as a fraction of the cycle.
 _FLOOR = 2e-4
 
 
 def nodes_for(swing: float) -> int:
     """
-    Count the nodes that follow a phase which turns by up to `swing` turns over a cycle.
+    Return the number of nodes for a phase that changes by up to `swing` turns over a cycle.
 
     The error of interpolation of exp(j a x) on [-1, 1], a = pi swing, is 2 (a/2)^n / n!.
     """
@@ -52,7 +53,7 @@ def nodes_for(swing: float) -> int:
 
 
 def real_parts(values: ComplexArray) -> FloatArray:
-    """Stack amplitudes (order, channel) as `Response` takes them: real above imaginary parts."""
+    """Return amplitudes (order, channel) in the form of `Response`: real, then imaginary parts."""
     return np.concatenate((values.real, values.imag))
 
 
@@ -61,7 +62,7 @@ class Response:
     """
     Compressed cycles of unit orders: matrices (cycle, dimension, 2 orders) for `real_parts`.
 
-    `signal` is the orders themselves, `late` the orders weighted with u, `middle` with u (1 - u).
+    `signal` are the orders, `late` the orders weighted with u, `middle` with u (1 - u).
     """
 
     signal: FloatArray
@@ -75,9 +76,9 @@ class CompressedCycles:
     Trigger cycles as coefficients in an orthonormal basis around their orders.
 
     `coefficients` (cycle, dimension, channel); `blocks` (order,) is the first dimension that was
-    added for an order; `mixing[i]` (dimension, node) takes the complex values of order i at its
-    `nodes[i]` to coefficients (the real part); `start` (cycle, order) are the angles of the orders
-    where the cycles start, in turns.
+    added for an order. The real part of `mixing[i]` (dimension, node) times the complex values of
+    order i at its `nodes[i]` are coefficients; `start` (cycle, order) are the angles of the orders
+    at the start of the cycles, in turns.
     """
 
     coefficients: FloatArray
@@ -89,12 +90,12 @@ class CompressedCycles:
 
     @property
     def sizes(self) -> NDArray[np.intp]:
-        """Dimensions of every order's block."""
+        """Return the number of dimensions of each order."""
         return np.diff(np.append(self.blocks, self.coefficients.shape[1]))
 
     def response(self, errors: FloatArray, ripple: FloatArray,
                  chosen: Sequence[int] | NDArray[np.intp]) -> Response:
-        """Response of the `chosen` orders to pulse `errors` and `ripple` in fundamental cycles."""
+        """Return the response of `chosen` orders to `errors`, `ripple` in fundamental cycles."""
         count, half = len(ripple), len(chosen)
         shape = (3, count, self.coefficients.shape[1], 2 * half)
         out = np.zeros(shape)
@@ -115,12 +116,11 @@ class CompressedCycles:
 def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, orders: FloatArray,
              spread: float) -> CompressedCycles:
     """
-    Compress `samples` (sample, cycle, channel) of trigger cycles.
+    Compress `samples` (sample, cycle, channel) of trigger cycles; sample i is at u = i / samples.
 
-    Sample i is at u = i / len(samples).
-
-    `spread` is the largest difference to follow between errors of neighbouring pulses, in
-    fundamental cycles. The mean of every cycle is left out, and with it offset and drift.
+    `spread` is the largest difference between the errors of neighbouring pulses, in fundamental
+    cycles, that the nodes must represent. The mean of every cycle, with offset and drift, is
+    removed.
     """
     _, count, channels = samples.shape
     u = np.arange(len(samples)) / len(samples)
@@ -132,7 +132,7 @@ def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, or
         columns += [wave.real, -wave.imag]
     basis, triangle = qr(np.concatenate(columns, axis=1), mode='economic', overwrite_a=True,
                          check_finite=False)
-    basis, triangle = basis[:, 1:], triangle[1:, 1:]  # what is orthogonal to a constant
+    basis, triangle = basis[:, 1:], triangle[1:, 1:]  # the part orthogonal to a constant
     widths = np.array([len(x) for x in nodes])
     ends = 2 * np.cumsum(widths)
     mixing = tuple(triangle[:end, end - 2 * w:end - w] - 1j * triangle[:end, end - w:end]
@@ -145,9 +145,9 @@ def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, or
 
 def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
-    Return Gauss nodes in [0, 1] and the polynomials (u, node) that are 1 at one of them each.
+    Return Gauss nodes in [0, 1] and the polynomials (u, node) that are 1 at one node each.
 
-    Gauss quadrature is exact for what these are made of: products of Legendre polynomials.
+    They are sums of Legendre polynomials, for whose products Gauss quadrature is exact.
     """
     x, weight = legendre.leggauss(count)
     sizes = np.arange(count) + 0.5
@@ -156,7 +156,7 @@ def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
-    """Amplitudes (order, channel) that fit all cycles best (`Response.signal`)."""
+    """Return the amplitudes (order, channel) that fit all cycles best (`Response.signal`)."""
     f = signal.reshape(-1, signal.shape[2])
     parts = np.linalg.lstsq(f.T @ f, f.T @ coefficients.reshape(len(f), -1), rcond=None)[0]
     half = len(parts) // 2
@@ -164,7 +164,7 @@ def least_squares(signal: FloatArray, coefficients: FloatArray) -> ComplexArray:
 
 
 def deviations(signal: FloatArray, residual: FloatArray) -> ComplexArray:
-    """Deviation of every cycle's amplitude (cycle, order, channel) that a residual amounts to."""
+    """Return the deviation of amplitudes (cycle, order, channel) that a residual means."""
     parts = np.matmul(signal.transpose(0, 2, 1), residual)
     parts /= np.sum(signal * signal, axis=1)[:, :, None]
     half = signal.shape[2] // 2
@@ -174,12 +174,10 @@ def deviations(signal: FloatArray, residual: FloatArray) -> ComplexArray:
 @dataclass(frozen=True)
 class PulseErrorFit:
     """
-    What was fitted, in fundamental cycles.
+    Result of a fit: `errors` (pulse,), their `standard_errors` and `ripple` (cycle,).
 
-    `errors` (pulse,) with their `standard_errors`, `ripple` (cycle,).
-
-    `amplitudes` (order, channel) are those without the errors, `noise` (order, channel) the
-    standard deviation of one cycle's complex amplitude.
+    These are in fundamental cycles. `amplitudes` (order, channel) are those without the errors,
+    `noise` (order, channel) the standard deviation of the complex amplitude of one cycle.
     """
 
     errors: FloatArray
@@ -194,9 +192,9 @@ class PulseErrorFit:
 @dataclass(frozen=True)
 class PulseErrorProblem:
     """
-    Fit of the `chosen` orders of `model`; all others are left to the noise.
+    Fit of the `chosen` orders of `model`; all others count as noise.
 
-    An order tells of the errors in those channels only where it is `significant` (order, channel).
+    An order is used only in the channels where it is `significant` (order, channel).
     """
 
     model: CompressedCycles
@@ -205,7 +203,7 @@ class PulseErrorProblem:
     with_ripple: bool
 
     def solve(self, errors: FloatArray, *, expected: float) -> PulseErrorFit:
-        """Gauss-Newton from `errors`, with a prior of standard deviation `expected`."""
+        """Fit by Gauss-Newton from `errors` on, with a prior of standard deviation `expected`."""
         model, orders = self.model, self.model.orders[self.chosen]
         count, _, channels = model.coefficients.shape
         ripple = np.zeros(count)
@@ -226,7 +224,7 @@ class PulseErrorProblem:
             first *= weight
             last *= weight
             residual *= weight
-            if self.with_ripple:  # eliminated from the equations of its cycle
+            if self.with_ripple:  # eliminate the ripple from the equations of its cycle
                 middle = response.middle @ slope * weight
                 size = np.sqrt(_dot(middle, middle))
                 middle /= size[:, None, None]
@@ -256,10 +254,10 @@ class PulseErrorProblem:
 
     def scan(self, width: float) -> FloatArray:
         """
-        Errors on a grid that match the cycles best, however many turns of an order they make.
+        Return the errors on a grid that fit the cycles best, even over several turns of an order.
 
-        Neighbouring pulses share a cycle and no others do, so that dynamic programming finds the
-        best sequence of all; it starts Gauss-Newton in the right valley. `width` is that of the
+        Only neighbouring pulses have a cycle in common, so that dynamic programming finds the best
+        of all sequences. Gauss-Newton then starts near the global optimum. `width` is that of the
         expected errors.
         """
         model, count = self.model, len(self.model.coefficients)
@@ -292,22 +290,22 @@ class PulseErrorProblem:
     def _variance(self, residual: FloatArray, fitted: FloatArray, share: FloatArray
                   ) -> FloatArray:
         """
-        Noise variance of one dimension (order, channel): the median over the cycles.
+        Return the noise variance of one dimension (order, channel), from the median over cycles.
 
-        `share` is each one's part of the information; the fit of the errors has taken as much of
-        one dimension a cycle from its residual.
+        `share` is the fraction of the information that an order and channel has; the fit of the
+        errors removes this fraction of one dimension per cycle from its residual.
         """
         count, size = len(residual), self.model.sizes[:, None]
         power = np.median(np.add.reduceat(residual**2, self.model.blocks, axis=1), axis=0)
         free = size - share * (2.0 if self.with_ripple else 1.0) - 2.0 / count
         variance = power / free / (1.0 - 2.0 / (9.0 * free)) ** 3  # median of chi-squared
-        # Neither resampling nor the model is exact.
+        # Resampling and model are not exact.
         floor = _FLOOR**2 * np.mean(np.sum(fitted**2, axis=1), axis=0) / size
         return np.asarray(np.maximum(np.maximum(variance, floor), np.finfo(float).tiny))
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Inner product in every cycle."""
+    """Return the inner product in every cycle."""
     return np.asarray(np.einsum('kdc,kdc->k', a, b))
 
 
@@ -316,7 +314,7 @@ def _solve(diagonal: FloatArray, beside: FloatArray, right: FloatArray) -> Float
 
 
 def _standard_errors(diagonal: FloatArray, beside: FloatArray) -> FloatArray:
-    """Return standard errors from a tridiagonal normal matrix, the errors' mean being 0."""
+    """Return standard errors from a tridiagonal normal matrix, for errors with mean 0."""
     count = len(diagonal)
     down, up = diagonal.copy(), diagonal.copy()  # pivots of elimination from either end
     square = beside**2

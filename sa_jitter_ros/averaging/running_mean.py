@@ -1,8 +1,8 @@
 """
 Running means of arrays: block, sliding and exponential.
 
-Each takes one array per cycle with `update` and gives `mean` and `standard_error`; memory does not
-grow with the number of cycles (a sliding mean keeps its window). Undefined values are NaN.
+Each takes one array per cycle with `update` and returns `mean` and `standard_error`. Memory does
+not grow with the number of cycles (a sliding mean keeps its window). Undefined values are NaN.
 
 >>> mean = BlockMean()
 >>> for value in (1.0, 2.0, 6.0):
@@ -28,7 +28,7 @@ def _power(values: Array) -> FloatArray:
 
 
 class RunningMean(Protocol):
-    """What the three have in common."""
+    """The interface of the three means."""
 
     @property
     def count(self) -> int:
@@ -43,7 +43,7 @@ class RunningMean(Protocol):
 
     @property
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean, from the scatter of what was taken."""
+        """Standard error of the mean, from the scatter of the arrays."""
 
 
 class BlockMean:
@@ -66,7 +66,7 @@ class BlockMean:
         self._squares += _power(step) * (1.0 - 1.0 / self.count)
 
     def merge(self, other: 'BlockMean') -> None:
-        """Take all that another mean has taken."""
+        """Add all arrays of another mean."""
         if not other.count:
             return
         if not self.count:
@@ -94,12 +94,19 @@ class BlockMean:
 
 class SlidingMean:
     """
-    Mean of the latest arrays; the caller says which are out of the window.
+    Mean of the latest arrays; the caller drops the oldest ones with `forget`.
 
-    The window is two heaps: arrays that came last, and sums of older ones, each with all that came
-    between it and the first heap. To forget the oldest is to drop its sum. When there is none left
-    the first heap is summed up from behind, so that an array is added twice in all, whatever the
-    length of the window, nothing is ever subtracted, and rounding does not build up.
+    The window consists of the latest arrays and of means of the older ones, each from one of these
+    to the newest of them. To forget the oldest array is to drop its mean. When there are no more
+    means, they are computed anew from the latest arrays, backwards. Each array is thus added twice
+    for any length of the window, and nothing is subtracted, so that rounding errors do not add up.
+
+    >>> mean = SlidingMean()
+    >>> for value in (1.0, 2.0, 6.0):
+    ...     mean.update(np.array([value]))
+    >>> mean.forget(1)
+    >>> mean.mean, mean.count
+    (array([4.]), 2)
     """
 
     def __init__(self) -> None:
@@ -113,7 +120,7 @@ class SlidingMean:
         return len(self._latest) + len(self._older)
 
     def update(self, values: Array) -> None:
-        """Take one more array, which must stay as it is."""
+        """Take one more array, which must not be changed later."""
         self._latest.append(values)
         self._sum.update(values)
 
@@ -125,7 +132,7 @@ class SlidingMean:
             self._older.pop()
 
     def _turn(self) -> None:
-        """Sum up the latest arrays from behind."""
+        """Compute the means of the latest arrays, backwards from the newest."""
         while self._latest:
             block = BlockMean()
             block.update(self._latest.pop())
@@ -156,9 +163,15 @@ class ExponentialMean:
     """
     Exponentially weighted mean with the noise reduction of `cycles` equal weights.
 
-    The weight of a new array is 2 / (cycles + 1), for which white noise has the variance
-    1 / cycles of one array's; until that many have come it is the plain mean. Where it became
-    undefined, the next defined value starts it anew.
+    The weight of a new array is 2 / (cycles + 1). The mean of white noise then has 1 / cycles of
+    the variance of one array. At the start the mean is that of all arrays. After a NaN the mean
+    starts again at the next defined value.
+
+    >>> mean = ExponentialMean(3.0)
+    >>> for value in (1.0, 3.0, 6.0):
+    ...     mean.update(np.array([value]))
+    >>> mean.mean  # (1 + 3) / 2, then half of the difference to 6 more
+    array([4.])
     """
 
     def __init__(self, cycles: float) -> None:

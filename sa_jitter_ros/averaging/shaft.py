@@ -1,8 +1,8 @@
 """
 The synchronous average of one shaft, cycle by cycle.
 
-Feed it the samples of consecutive trigger cycles; it returns an average whenever one is due. What
-it holds is bounded by the settings, and its result depends on the cycles alone.
+It takes the samples of consecutive trigger cycles and returns an average whenever one is due. The
+settings limit its memory.
 """
 
 from collections import deque
@@ -27,7 +27,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 class ShaftAverager:
-    """Averages trigger cycles of one shaft: `update` per cycle, `reset` where they break off."""
+    """Averages trigger cycles of one shaft: `update` per cycle, `reset` after an interruption."""
 
     def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
         self.settings = settings
@@ -38,7 +38,7 @@ class ShaftAverager:
         self._start()
 
     def reset(self) -> bool:
-        """Begin again at angle 0; returns whether an unfinished average was lost."""
+        """Begin again at angle 0; return whether an unfinished average was lost."""
         lost = self.settings.averaging == 'block' and self._counted > 0
         self._cycle = 0
         self._start()
@@ -53,7 +53,7 @@ class ShaftAverager:
         return average
 
     def change(self, settings: AverageSettings) -> bool:
-        """Go on with other settings and the same angle; returns whether an average was lost."""
+        """Continue at the same angle with other settings; return whether an average was lost."""
         lost = self.settings.averaging == 'block' and self._counted > 0
         if settings.cycle_length != self.settings.cycle_length:
             self._cycle = 0
@@ -63,16 +63,16 @@ class ShaftAverager:
         return lost
 
     def margin(self, period: float, rate: float) -> int:
-        """Return how many samples a cycle of `period` s at `rate` Hz needs on either side."""
+        """Return the samples that a cycle of `period` s at `rate` Hz needs on either side."""
         points = self._points or self._chosen(period, rate)
         return needed_margin(self.settings.interpolation,
                              waveform_cutoff(points, self.settings.cycle_length, period, rate))
 
     def update(self, cycle: CycleSamples) -> Average | None:
         """
-        Take the next trigger cycle; returns an average when one is due.
+        Take the next trigger cycle; return an average when one is due.
 
-        Raises `SignalError` when the shaft itself turns faster than the samples can follow.
+        Raises `SignalError` if the shaft frequency is not below half the sampling rate.
         """
         settings = self.settings
         if settings.cycle_length / cycle.period >= cycle.rate / 2.0:
@@ -104,11 +104,11 @@ class ShaftAverager:
         return average
 
     def _angle(self, cycle: int) -> Fraction:
-        """Angle (fundamental cycles) at which a trigger cycle begins."""
+        """Return the angle (fundamental cycles) at which a trigger cycle begins."""
         return exact_cycles(self.settings.cycle_length) * cycle
 
     def beyond_nyquist(self, period: float, rate: float) -> NDArray[np.bool_]:
-        """Which orders are at or above half the sampling rate."""
+        """Return which orders are at or above half the sampling rate."""
         return np.asarray(np.array(self.settings.orders) * self.settings.cycle_length / period
                           >= rate / 2.0)
 
@@ -120,15 +120,15 @@ class ShaftAverager:
     def _choose_grid(self, cycle: CycleSamples) -> None:
         if self.settings.samples_per_revolution:
             return
-        # A waveform keeps its length as long as it is neither coarser than the samples nor twice
-        # as fine: subscribers like one shape.
+        # Subscribers need one shape: the waveform keeps its length while it is neither coarser
+        # than the samples nor more than twice as fine.
         needed = cycle.period * cycle.rate / self.settings.cycle_length
         if not needed <= self._points <= 2.2 * needed:
             self._points = self._chosen(cycle.period, cycle.rate)
 
     def _resample(self, cycle: CycleSamples, angle: Fraction
                   ) -> tuple[FloatArray, int, FloatArray]:
-        """Grid of the trigger cycle, both ends included; first waveform point, and the points."""
+        """Return the grid of a cycle with both ends, its first waveform point, and its points."""
         r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
         cutoff = waveform_cutoff(n, r, cycle.period, cycle.rate)
         if on_grid(n, r) and cutoff == 1.0:
@@ -154,11 +154,11 @@ class ShaftAverager:
         self._pulses: deque[float] = deque(maxlen=settings.trigger_cycles + 1)
         self._wave: FloatArray = np.empty((0, 0))
         self._next_point = 0
-        self._full = False  # all points of the waveform are there, but not its end
+        self._full = False  # the waveform has all points, but its end is not reached
         self._first_whole = 0
 
     def _remember(self, amplitudes: ComplexArray) -> None:
-        """Put a cycle's amplitudes behind those of the window, in memory that is never reused."""
+        """Append the amplitudes of a cycle to those of the window, in memory never reused."""
         if self._end == len(self._amplitudes):
             kept = min(self._counted, self.settings.trigger_cycles - 1)
             room = np.empty((max(2 * kept, 16), *amplitudes.shape), np.complex128)
@@ -169,7 +169,7 @@ class ShaftAverager:
         self._end += 1
 
     def _window(self) -> ComplexArray:
-        """Amplitudes (cycle, channel, order) of the latest N_t cycles, which must stay as is."""
+        """Return the amplitudes (cycle, channel, order) of the latest N_t cycles, read-only."""
         count = min(self._counted, self.settings.trigger_cycles)
         window = self._amplitudes[self._end - count:self._end]
         window.flags.writeable = False
@@ -187,7 +187,7 @@ class ShaftAverager:
         self._next_point = math.ceil(angle) * self._points
 
     def _add_points(self, first: int, points: FloatArray, end: Fraction) -> None:
-        """Put points into their fundamental cycle; the mean takes one that is whole at `end`."""
+        """Put points into their fundamental cycle; add it to the mean if it is whole at `end`."""
         if len(self._wave) != self._points:
             self._wave = np.full((self._points, points.shape[1]), np.nan)
         if self._full:
@@ -209,11 +209,11 @@ class ShaftAverager:
         if not self._wave_mean.count:
             self._first_whole = self._next_point // self._points - 1
         self._wave_mean.update(self._wave)
-        if self.settings.averaging == 'sliding':  # keeps what it is given
+        if self.settings.averaging == 'sliding':  # which keeps the array
             self._wave = np.empty_like(self._wave)
 
     def _slide(self) -> None:
-        """Forget what has left a sliding window."""
+        """Drop the cycles that are no longer in a sliding window."""
         if not isinstance(self._wave_mean, SlidingMean):
             return
         assert isinstance(self._amplitude_mean, SlidingMean)
@@ -248,7 +248,7 @@ class ShaftAverager:
         return average
 
     def _estimated_noise(self) -> FloatArray:
-        """Noise of the mean; of a window that slides anew when an eighth of it is."""
+        """Return the noise of the mean; in a sliding window, from every eighth of it on, anew."""
         if self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
             amplitudes = self._window()
@@ -261,9 +261,9 @@ class ShaftAverager:
 def average_cycles(cycles: Iterable[CycleSamples], settings: AverageSettings, *,
                    first_cycle: int = 0) -> Average:
     """
-    Return the block average of all of these trigger cycles, the first of which has a number.
+    Return the block average of trigger cycles, as many as `settings.trigger_cycles`.
 
-    The angle is 0 where cycle 0 begins. `settings` with as many `trigger_cycles` as are given.
+    `first_cycle` is the number of the first one; the angle is 0 where cycle 0 begins.
     """
     shaft = ShaftAverager(settings, first_cycle=first_cycle)
     average = None

@@ -1,14 +1,13 @@
 """
 Which orders of a channel are synchronous: coherent from cycle to cycle, and above the noise.
 
-Pulse errors that are known already are taken out of the phases first, so that an order which
-jitter has averaged away is still seen. `LineSearch` finds where to look, cheaply;
-`significant_orders` tests.
+Pulse errors that are already known are first removed from the phases, so that orders which jitter
+attenuates completely are found, too. `LineSearch` finds candidates quickly, `significant_orders`
+tests them.
 
-One average cannot tell everything: random vibration that rings on for many cycles, from a
-resonance right at an order, is nearly as coherent as the order would be, and passes more often
-than the level of the test says (with a quality factor of 500 at order 19, in 7 % of averages of
-100 cycles).
+The test has a limit. Random vibration of a lightly damped resonance exactly at an order is nearly
+as coherent from cycle to cycle as the order, and passes the test more often than its level says
+(with a quality factor of 500 at order 19, in 7 % of averages of 100 cycles).
 """
 
 from collections.abc import Sequence
@@ -26,11 +25,11 @@ from scipy.ndimage import median_filter
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-# Chance that noise alone, in all orders and channels together, passes for a synchronous order.
+# Probability that noise alone passes as a synchronous order in any of the orders and channels.
 _FALSE_ALARM = 1e-3
 # Share of an order's power that must be coherent from cycle to cycle.
 _COHERENCE = 0.15
-# More cycles than these show no order that could tell anything of a single pulse.
+# Orders that need more cycles than these to be found are too weak to show the error of a pulse.
 _SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
@@ -40,10 +39,9 @@ _CLEAR = 100.0  # times the power of the orders around
 @dataclass(frozen=True)
 class LineSearch:
     """
-    Hann-windowed spectra (line, cycle, channel) of some consecutive cycles.
+    Hann-windowed spectra (line, cycle, channel) of some consecutive cycles from `first` on.
 
-    They begin with cycle `first`; `orders` are those below 0.4 of the sampling rate: the integer
-    ones and others that are known to be there.
+    `orders` are the integer and the additional ones below 0.4 of the sampling rate.
     """
 
     spectra: ComplexArray
@@ -52,12 +50,12 @@ class LineSearch:
     first: int
 
     @classmethod
-    def of(cls, samples: FloatArray, cycle_length: float, also: Sequence[float] = ()
+    def of(cls, samples: FloatArray, cycle_length: float, additional_orders: Sequence[float] = ()
            ) -> 'LineSearch':
         """
         Prepare the search in `samples` (sample, cycle, channel) of trigger cycles.
 
-        `also` are orders to look at beside the integer ones.
+        `additional_orders` are searched besides the integer ones.
         """
         points, count, _ = samples.shape
         first = max(count - _SEARCHED_CYCLES, 0) // 2
@@ -67,23 +65,22 @@ class LineSearch:
         # A taper over the cycles keeps strong orders from showing at their neighbours.
         spectra = rfft(part * np.multiply.outer(window, _taper(part.shape[1]))[:, :, None], axis=0)
         top = 0.4 * points / cycle_length
-        others = [g for g in also if 0.0 < g <= top]
+        others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
         return cls(spectra, orders, cycle_length, first)
 
     def strongest(self, errors: FloatArray, most: int, *, below: float
                   ) -> tuple[FloatArray, FloatArray]:
         """
-        Return the orders up to `below` that stand out most, best first, and those that do clearly.
+        Return the `most` strongest orders up to `below`, strongest first, and the clear ones.
 
-        They are at most `most`; `errors` (pulse,) of the average, in fundamental cycles, are taken
-        out of the phases.
+        `errors` (pulse,) of the average, in fundamental cycles, are removed from the phases.
         """
         g = self.orders[self.orders <= below]
         if not len(g):
             return g, g
         power = self.power(errors, g)
-        # Mirrored, not repeated: of copies of itself order 1 could not stand out.
+        # With repeated values at the border order 1 could not exceed its background.
         background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='reflect')
         contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
         best = np.argsort(-contrast)[:most]
@@ -91,10 +88,10 @@ class LineSearch:
 
     def gain(self, errors: FloatArray, orders: FloatArray) -> float:
         """
-        Return how the power of some `orders` changes when `errors` (pulse,) are taken out.
+        Return the power of some `orders` without `errors` (pulse,) over their power with them.
 
-        Orders are weighted by their square, as what they tell of the errors. Errors that the
-        pulses have can but raise it; 1 where there is no order.
+        Orders are weighted by their square, as in the fit of the errors. True pulse errors can
+        only give a value above 1; without orders it is 1.
         """
         before, after = (self.power(item, orders, tapered=False)
                          for item in (0.0 * errors, errors))
@@ -128,13 +125,13 @@ def _taper(count: int) -> FloatArray:
 def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: int,
                        least: FloatArray) -> NDArray[np.bool_]:
     """
-    Tell which orders (row) stand above the noise in which channels (column).
+    Return which orders (row) are above the noise in which channels (column).
 
-    The mean amplitude over the cycles, with pulse `errors` taken out, against its scatter: an F
-    test whose level is shared by `tests` orders and all channels. Amplitudes below `least`
-    (channel,) are not significant. A lightly damped resonance rings on from cycle to cycle: its
-    scatter counts with its autocorrelation. That is seen in phase with the mean, where errors of
-    the pulses, which may be correlated as well, do not show to first order.
+    An F test compares the mean amplitude over the cycles, without pulse `errors`, with its
+    scatter. Its level is divided by `tests` orders and all channels. Amplitudes below `least`
+    (channel,) are not significant. The response of a lightly damped resonance is correlated from
+    cycle to cycle, so that its scatter counts with its autocorrelation. This is measured in phase
+    with the mean, where pulse errors, which may be correlated too, have no effect to first order.
     """
     count, _, channels = model.coefficients.shape
     everything = np.arange(len(model.orders))
@@ -152,7 +149,7 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
 
 
 def _long_run_variance(series: FloatArray) -> FloatArray:
-    """Count times the variance of a mean over the first axis (Newey and West 1987)."""
+    """Return count times the variance of the mean over the first axis (Newey and West 1987)."""
     count = len(series)
     lags = count // 4
     total = np.sum(series**2, axis=0)

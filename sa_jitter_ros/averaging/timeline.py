@@ -23,7 +23,7 @@ _KEPT = 200  # spans that are remembered
 
 @dataclass(frozen=True)
 class SampleClock:
-    """Times of a run of samples: that of the first one, and on from there by index over rate."""
+    """Sample times of a run: `time` (s) of sample `index`, and `rate` (Hz) from there on."""
 
     time: float
     index: int
@@ -36,18 +36,18 @@ class SampleClock:
 
 class Segment:
     """
-    Consecutive finite samples on one clock; grows at the end, is trimmed at the start.
+    Consecutive finite samples on one clock, added at the end and removed at the start.
 
-    `epoch` counts how often time ran back before it; `closed` tells that no sample will follow.
-    Every sample is accounted for once: `use` tells that it was averaged, `trim` returns how many
-    were not.
+    `epoch` is how often time ran back before this segment; `closed` means that no sample follows.
+    Every sample is counted once: `use` marks it as averaged, `trim` returns how many samples were
+    removed without being averaged.
     """
 
     def __init__(self, clock: SampleClock, epoch: int, index: int, samples: FloatArray) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
         self._data = np.ascontiguousarray(samples.T)
         self._begin, self._end = 0, len(self._data)
-        self._index = self._settled = index  # samples before the latter are accounted for
+        self._index = self._settled = index  # samples before `_settled` are counted
         self._begins_run = index == clock.index
 
     @property
@@ -94,9 +94,10 @@ class Segment:
 
     def use(self, low: float, high: float) -> int:
         """
-        Take the samples between two positions as averaged; return how many before them were not.
+        Mark the samples between two positions as averaged; return how many before them were not.
 
-        What comes before the first averaged cycle of a run is not counted: its pulses begin there.
+        Samples before the first averaged cycle of a run are not counted, because there are no
+        pulses before it.
         """
         first, end = (self.index + math.ceil(at - 1e-6) for at in (low, high))
         passed = 0 if self._begins_run else max(first - self._settled, 0)
@@ -105,7 +106,7 @@ class Segment:
         return passed
 
     def trim(self, index: int) -> int:
-        """Forget the samples before `index`; return how many of them were not averaged."""
+        """Remove the samples before `index`; return how many of them were not averaged."""
         end = min(max(index, self.index), self.end_index)
         unused = max(end - self._settled, 0)
         self._begin += end - self.index
@@ -116,17 +117,18 @@ class Segment:
 @dataclass
 class SampleLedger:
     """
-    Account of the samples of one run that are not used, by their index.
+    Counts the samples of one run that are not used, each once, by their index.
 
-    A sample that the index leaves out is lost, unless it came before and was dropped. One that
-    comes after it was counted as lost is not dropped, too. The latest spans only are remembered.
+    A sample in a gap of the index is lost, unless it was received earlier and dropped. A sample
+    that arrives after it was counted as lost is not counted as dropped. Only the latest spans are
+    kept.
     """
 
     _lost: list[Span] = field(default_factory=list)
     _dropped: list[Span] = field(default_factory=list)
 
     def lose(self, span: Span) -> int:
-        """Take that the index leaves out a span; return how many samples are lost."""
+        """Record a gap of the index; return how many samples are lost."""
         left = [span]
         for dropped in self._dropped:
             left = _without(left, dropped)
@@ -134,14 +136,14 @@ class SampleLedger:
         return _size(left)
 
     def drop(self, span: Span) -> int:
-        """Take that samples came and are not used; return how many of them were not lost."""
+        """Record samples that are not used; return how many of them were not counted as lost."""
         before, self._lost = _size(self._lost), _without(self._lost, span)
         self._dropped = [*self._dropped, span][-_KEPT:]
         return span[1] - span[0] - (before - _size(self._lost))
 
 
 def _without(spans: list[Span], gone: Span) -> list[Span]:
-    """Return what is left of spans."""
+    """Return the spans without the indices in `gone`."""
     pieces = (piece for first, end in spans
               for piece in ((first, min(end, gone[0])), (max(first, gone[1]), end)))
     return [(first, end) for first, end in pieces if first < end]
@@ -154,10 +156,10 @@ def _size(spans: list[Span]) -> int:
 @dataclass
 class TimelineCounts:
     """
-    What happened to the samples so far.
+    Counts of samples and blocks so far.
 
-    `samples_dropped` were received and entered no average, `samples_lost` are those that the jumps
-    of the index (`gaps`) left out, be it that they come too late. None is counted as both.
+    `samples_dropped` were received and are in no average. `samples_lost` are missing in the index
+    (`gaps` counts the places) or arrived too late. No sample is counted as both.
     """
 
     samples_dropped: int = 0
@@ -171,7 +173,7 @@ class TimelineCounts:
 
 
 def _alike(layout: tuple[int, float] | None, other: tuple[int, float]) -> bool:
-    """Whether channels are as many and rates (Hz) equal to rounding."""
+    """Whether the number of channels is the same, and the rate (Hz) within rounding."""
     return (layout is not None and layout[0] == other[0]
             and math.isclose(layout[1], other[1], rel_tol=SAME_RATE))
 
@@ -181,10 +183,19 @@ class VibrationTimeline:
     """
     Takes blocks in any order of arrival and keeps `segments` of consecutive samples.
 
-    A header time more than half a sample off the clock of its run is counted. A block that is off
-    by more than `time_tolerance` (s), lies wholly before the last one's start or contradicts the
-    last one's samples is held back: if the next block continues it, it begins a new run, otherwise
-    it is dropped. A new run from before the old one's end is a restart; `epoch` counts those.
+    A block time that differs from the clock of its run by more than half a sample is counted. A
+    block waits for the next one if its time differs by more than `time_tolerance` (s), if it lies
+    completely before the start of the last block, or if its samples contradict those of the last
+    block. If the next block continues it, it begins a new run, otherwise it is dropped. A new run
+    that begins before the end of the old one is a restart; `epoch` counts these.
+
+    >>> timeline = VibrationTimeline()
+    >>> timeline.add(SampleBlock(np.zeros((1, 100)), 0.0, 100.0, 0))
+    >>> timeline.add(SampleBlock(np.zeros((1, 50)), 1.5, 100.0, 150))
+    >>> [(segment.index, segment.end_index) for segment in timeline.segments]
+    [(0, 100), (150, 200)]
+    >>> timeline.counts.gaps, timeline.counts.samples_lost, timeline.messages
+    (1, 50, ['samples 100 to 149 are missing'])
     """
 
     time_tolerance: float = 0.01
@@ -197,7 +208,7 @@ class VibrationTimeline:
     _suspect: SampleBlock | None = None
     _odd: tuple[int, float] | None = None
     _clock: SampleClock | None = None
-    _gap: tuple[int, int] = (0, 0)  # first index left out, and next one that came
+    _gap: tuple[int, int] = (0, 0)  # first index that is missing, and the next received one
     _ledger: SampleLedger = field(default_factory=SampleLedger)
 
     @property
@@ -236,14 +247,14 @@ class VibrationTimeline:
             self._continue(block)
 
     def close(self) -> None:
-        """Take that no block follows."""
+        """End the stream: no block follows."""
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
             self._drop(suspect, 'are repeated or out of order')
         self._close()
 
     def release(self, epoch: int, before: float) -> None:
-        """Forget the samples before the time `before` (s) of `epoch`; count those not averaged."""
+        """Drop the samples before the time `before` (s) of `epoch`; count those not averaged."""
         for segment in self.segments:
             if segment.epoch < epoch:
                 self.counts.samples_dropped += segment.trim(segment.end_index)
@@ -253,7 +264,7 @@ class VibrationTimeline:
         self._tidy()
 
     def take(self) -> list[tuple[int, SampleBlock]]:
-        """Take all samples out: their epoch, and segment by segment what was held."""
+        """Remove and return all samples, segment by segment, each with its epoch."""
         taken = [(item.epoch, SampleBlock(item.samples.T, item.start_time, item.clock.rate,
                                           item.index))
                  for item in self.segments if len(item.samples)]
@@ -264,10 +275,10 @@ class VibrationTimeline:
 
     def epoch_near(self, time: float, earliest: int) -> int:
         """
-        Epoch, of those from `earliest` on, whose held samples are nearest to a time (s).
+        Return the epoch, from `earliest` on, whose samples are nearest to a time (s).
 
-        Of two that overlap it is the earlier one, and beyond its end for as long as they overlap:
-        the last samples before a restart may be lost.
+        Of two overlapping epochs it is the earlier one. It counts as longer by the overlap,
+        because the last samples before a restart may be lost.
         """
         found, away, following = max(earliest, self.epoch), np.inf, np.inf
         for epoch in sorted({item.epoch for item in self.segments}, reverse=True):
@@ -302,7 +313,8 @@ class VibrationTimeline:
         """Whether the source changed its layout for good; raises `SignalError` on a bad block."""
         samples = block.samples
         if samples.ndim != 2 or samples.size == 0:
-            raise SignalError(f'block of shape {samples.shape}: send channel x sample, not empty')
+            raise SignalError(f'block of shape {samples.shape}: send channel x sample, at least '
+                              'one of each')
         if not (np.isfinite(block.start_time) and np.isfinite(block.sample_rate)
                 and block.sample_rate > 0.0):
             raise SignalError(f'block at {block.start_time} s with {block.sample_rate} Hz: send a '
@@ -311,7 +323,7 @@ class VibrationTimeline:
         if self.layout is None or _alike(self.layout, layout):
             self._odd = None
             return False
-        # One odd block is a fault; a second one in a row is a source that changed.
+        # One block of another layout is a fault; a second one means that the source changed.
         if _alike(self._odd, layout):
             self._odd = None
             return True
@@ -326,7 +338,7 @@ class VibrationTimeline:
                 and abs(following.start_time - expected) <= self.time_tolerance)
 
     def _doubtful(self, block: SampleBlock) -> bool:
-        """Whether a block must wait for the next one to tell what it is."""
+        """Whether only the next block can show if this one belongs to the run."""
         assert self._last is not None
         assert self._clock is not None
         last = self._last
@@ -336,10 +348,11 @@ class VibrationTimeline:
         if abs(deviation) > self.time_tolerance:
             self.counts.clock_deviation += 1
             self.messages.append(
-                f'time of sample {block.index} is {deviation:+.6g} s off (limit '
-                f'{self.time_tolerance:g} s): new run if the next block continues it')
+                f'time of sample {block.index} differs by {deviation:+.6g} s from the clock of '
+                f'the run (limit {self.time_tolerance:g} s): a new run begins if the next block '
+                'continues it')
             return True
-        # Other samples under the same indices are those of a source that started again.
+        # Other samples with the same indices are those of a source that restarted.
         start, end = max(block.index, last.index), min(block.end_index, last.end_index)
         return start < end and not np.array_equal(
             block.samples[:, start - block.index:end - block.index],
@@ -363,7 +376,7 @@ class VibrationTimeline:
                                  f'{block.index}')
         elif self.layout and not _alike(self.layout, (len(block.samples), block.sample_rate)):
             self.counts.gaps += 1
-            self.messages.append(f'source goes on at {block.start_time:.6f} s with '
+            self.messages.append(f'source continues at {block.start_time:.6f} s with '
                                  f'{len(block.samples)} channels at {block.sample_rate:g} Hz')
         self._clock = SampleClock(block.start_time, block.index, block.sample_rate)
         self._gap, self._ledger = (0, 0), SampleLedger()
@@ -371,7 +384,7 @@ class VibrationTimeline:
         self._last = block
 
     def _forget_jump_ahead(self, block: SampleBlock) -> None:
-        """Drop what a wrong jump ahead brought, which a block in the gap before it gives away."""
+        """Drop samples beyond a gap of the index that was wrong: a block in the gap shows it."""
         first, end = self._gap
         if self._clock is not None and first <= block.index < end and abs(
                 block.start_time - self._clock.time_of(block.index)) <= self.time_tolerance:
@@ -396,7 +409,7 @@ class VibrationTimeline:
             self.counts.samples_lost += self._ledger.lose(self._gap)
             self.messages.append(f'samples {expected} to {block.index - 1} are missing')
             self._close()
-        # a block that overlaps what was received adds its new part only
+        # Of a block that overlaps the samples before, only the new part is added.
         start = max(expected, block.index)
         self._store(block.samples[:, start - block.index:], start)
         self._last = block
@@ -406,7 +419,7 @@ class VibrationTimeline:
             self.segments[-1].closed = True
 
     def _store(self, samples: FloatArray, index: int) -> None:
-        """Keep the finite samples; a non-finite one leaves a gap."""
+        """Keep the finite samples; others are a gap."""
         assert self._clock is not None
         every = np.isfinite(samples)
         if every.all():

@@ -67,11 +67,11 @@ class CycleReader:
 
 
 def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows: tuple[int, ...],
-            *, with_ripple: bool, also: ArrayLike = ()) -> PulseErrorRecovery:
+            *, with_ripple: bool, additional_orders: ArrayLike = ()) -> PulseErrorRecovery:
     """
     Recover pulse errors from the channels `rows`, of the declared size or larger.
 
-    Of declared and integer orders, and those in `also`.
+    The orders used are the declared, the integer and the `additional_orders`.
     """
     periods = np.diff(pulses)
     grid = cycle_grid(reader.cycles(pulses), method=reader.method)[:, :, list(rows)]
@@ -80,7 +80,7 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
     def attempt(expected: float) -> PulseErrorRecovery:
         return recover_pulse_errors(
             grid, periods=periods, cycle_length=model.cycle_length,
-            also=(*model.orders, *np.ravel(also)),
+            additional_orders=(*model.orders, *np.ravel(additional_orders)),
             declared_standard_deviation=expected * declared, with_ripple=with_ripple)
 
     found = attempt(1.0)

@@ -176,7 +176,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
         found = [item for item in found if item.recovered]
         if not found:
             raise SignalError('the pulse errors cannot be recovered from the vibration: '
-                              f'{reason}; give reference_pulse_times or orders above the noise')
+                              f'{reason}, or give reference_pulse_times')
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, declared_speed,
@@ -228,7 +228,7 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
     errors = []
     for item in observation.acquisitions:
         recovery = recover(reader, item.bridged, observation.model, rows, with_ripple=False,
-                           also=observation.sources)
+                           additional_orders=observation.sources)
         errors.append(recovery.errors[item.number] if recovery.accepted
                       else np.full(item.times.size, np.nan))
     return np.array(errors)
@@ -286,10 +286,11 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
     missing = pulses.missing[first:first + count]
     here = slice(pulses.number[first], pulses.number[first + count] + 1)
     fixed, keep = pulses.bridged[here], numbered(missing)
-    recovery = recover(reader, fixed, model, rows, with_ripple=True, also=sources)
+    recovery = recover(reader, fixed, model, rows, with_ripple=True, additional_orders=sources)
     with_ripple = recovery.accepted and not missing.any()
     if not recovery.accepted:
-        recovery = recover(reader, fixed, model, rows, with_ripple=False, also=sources)
+        recovery = recover(reader, fixed, model, rows, with_ripple=False,
+                           additional_orders=sources)
     errors = np.full(times.size, np.nan)
     standard_errors, ripple = errors.copy(), np.full(count, np.nan)
     bend_error = float('nan')
