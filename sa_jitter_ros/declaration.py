@@ -139,6 +139,9 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     try:
         shafts = SHAFTS.convert(values.get(SHAFTS.name, SHAFTS.default))
         known = {item.name: item for item in predictor_parameters(shafts, values)}
+        if values and not known.keys() & values.keys():
+            raise ModelError(f'none of {", ".join(values)} is a parameter of {NODE}: give the '
+                             f'parameter file of {NODE}')
         converted = {name: known[name].convert(_as_rcl_reads(value, known[name]))
                      for name, value in values.items() if name in known}
         if not converted.get('sample_rate'):

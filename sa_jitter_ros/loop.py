@@ -1,8 +1,8 @@
 """
-The loop as one function: recordings of a machine and its declared model in, a report out.
+The loop off line: from recordings of a machine and its declared model to a report.
 
-It observes every acquisition, compares the observed attenuation with the predicted one and, where
-a significant residual remains, names the effect that the declared model lacks.
+It compares the observed with the predicted attenuation of all acquisitions and finds the effects
+that the declared model lacks if the residual is significant.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ import warnings
 
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.errors import ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import Trace, trace
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -35,9 +35,9 @@ _SAME_RATIO = 1e-5  # six digits, as people write them
 @dataclass(frozen=True)
 class Loop:
     """
-    What `close_loop` found; as text, a summary.
+    Result of `close_loop`; `str` makes a summary of it.
 
-    `traces` holds the arrays behind the report, by the name of the shaft.
+    `traces` are the arrays behind the report, by the name of the shaft.
     """
 
     traces: Mapping[str, Trace]
@@ -45,7 +45,7 @@ class Loop:
 
     @cached_property
     def shafts(self) -> Mapping[str, Mapping[str, Any]]:
-        """Return the report of each shaft by its name; an undefined number is None."""
+        """Return the report of each shaft by its name; undefined numbers are None."""
         return {shaft: report(trace, recordings=self.recordings)
                 for shaft, trace in self.traces.items()}
 
@@ -54,8 +54,8 @@ class Loop:
         """
         Return the content of `report.json`.
 
-        With one shaft it is the report of that shaft; with several it holds their common `verdict`
-        and the `shafts`, a report for each.
+        With one shaft it is the report of that shaft; with several it has a common `verdict` and
+        `shafts`, the report of each.
         """
         if len(self.shafts) == 1:
             return next(iter(self.shafts.values()))
@@ -63,11 +63,11 @@ class Loop:
 
     @property
     def verdict(self) -> str:
-        """Return `none`, `traced` or `unexplained`; of several shafts, the one that is last."""
+        """Return `none`, `traced` or `unexplained`; with several shafts the last that occurs."""
         return max((trace.verdict for trace in self.traces.values()), key=_VERDICTS.index)
 
     def __str__(self) -> str:
-        """Return the reports in a few lines."""
+        """Return a summary in a few lines."""
         if len(self.shafts) == 1:
             return summary(self.report)
         return '\n'.join(f'shaft {shaft}\n{summary(content)}'
@@ -77,9 +77,9 @@ class Loop:
         """
         Write `report.json`, `report.html` and the figures as PNG: all of them or none.
 
-        With several shafts these files are in a folder for each, named after the shaft; the
-        `report.json` and `report.html` beside these folders are those of all shafts. Loads
-        matplotlib. Raises OSError where the folder cannot be written.
+        With several shafts these files are in one folder per shaft; `report.json` and
+        `report.html` beside these folders cover all shafts. Loads matplotlib. Raises OSError if
+        the folder cannot be written.
         """
         from sa_jitter_ros.report.html_report import files_of_all, report_files
 
@@ -90,7 +90,7 @@ class Loop:
 
 
 def write_files(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> None:
-    """Write files, by their path in the folder: they are complete before one gets its name."""
+    """Write files by their path in a folder: first under temporary names, then rename all."""
     Path(folder).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder, prefix='.close_loop.') as temporary:
         for name, content in files.items():
@@ -104,17 +104,17 @@ def write_files(folder: str | os.PathLike[str], files: Mapping[str, bytes]) -> N
 def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                names: Sequence[str] = (), progress: Callable[[str], None] | None = None) -> Loop:
     """
-    Find what the declared jitter model lacks in recordings of one machine.
+    Find the effects that the declared jitter model of a machine lacks, from its recordings.
 
     `recordings` is one path or `Recording`, or several. `declared` is the path of a ROS parameter
     file of `jitter_predictor`, a `DeclaredModel`, or a mapping of the keywords of `predict`, with
-    `effects` as a mapping of names to parameters; a parameter file may declare several `shafts`,
-    which are judged one by one. A `sample_rate` that it does not give is that of
-    the first recording. The report calls the recordings by their `names`: without these, by path
-    or description. `progress` is called with one line of text for every step.
+    `effects` as a mapping of names to parameters. A parameter file may declare several `shafts`;
+    each gets a report. An undeclared `sample_rate` is that of the first recording. `names` are the
+    names of the recordings in the report, else their paths or descriptions. `progress` is
+    called with one line of text for every step.
 
-    Raises RecordingError, ModelError or SignalError where the recordings cannot be read, do not
-    fit the declared model, or hold no order above the noise.
+    Raises RecordingError, ModelError or SignalError if the recordings cannot be read, do not
+    match the declared model, or contain no order above the noise.
 
     >>> from sa_jitter_ros.recordings.recording import ArraySource, Recording
     >>> from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
@@ -129,7 +129,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     >>> found.verdict, [effect['name'] for effect in found.report['missing_effects']]
     ('traced', ['excess_jitter'])
     """
-    say = progress or (lambda text: None)
+    show = progress or (lambda text: None)
     if isinstance(recordings, (str, os.PathLike, Recording)):
         recordings = [recordings]
     if not recordings:
@@ -144,22 +144,25 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     traces = {}
     for shaft, model in models.items():
         if len(models) > 1:
-            say(f'shaft {shaft}')
+            show(f'shaft {shaft}')
         observations: list[Observation] = []
         for name, recording in zip(names, opened):
-            say(f'observing {name}')
-            observations.append(observe(
-                recording, model,
-                sources=observations[0].sources.tolist() if observations else ()))
-            say(f'{len(observations[-1].acquisitions)} acquisitions of {model.trigger_cycles} '
-                'trigger cycles')
+            show(f'reading {name}')
+            try:
+                observations.append(observe(
+                    recording, model,
+                    sources=observations[0].sources.tolist() if observations else ()))
+            except SaJitterError as error:
+                raise type(error)(f'{name}: {error}') from error
+            show(f'{len(observations[-1].acquisitions)} acquisitions of {model.trigger_cycles} '
+                 'trigger cycles')
         traces[shaft] = trace(observations, opened, declared=declaration.effects,
                               progress=progress)
     return Loop(traces, names)
 
 
 def _for_several(recording: Recording, models: Mapping[str, DeclaredModel]) -> Recording:
-    """Return a recording whose ratio, which is that of one shaft, binds none of several."""
+    """Return a recording without its ratio, which is that of one shaft only."""
     ratios = [model.ratio for model in models.values()]
     if recording.ratio != 1.0 and not any(
             math.isclose(recording.ratio, ratio, rel_tol=_SAME_RATIO) for ratio in ratios):
@@ -169,23 +172,23 @@ def _for_several(recording: Recording, models: Mapping[str, DeclaredModel]) -> R
 
 
 def _name(number: int, source: Source) -> str:
-    """Return what a report calls a recording: its path or description, else its number."""
+    """Return the name of a recording in a report: path or description, else its number."""
     if isinstance(source, Recording):
         return source.description or f'recording {number}'
     return os.fspath(source)
 
 
 def _declaration(declared: Declared, sample_rate: float) -> Declaration:
-    """Return model and effects, whichever way they were declared; raises SaJitterError."""
+    """Return models and effects, declared in any of the forms; raises SaJitterError."""
     if isinstance(declared, Declaration):
         return declared
     if isinstance(declared, DeclaredModel):
         return Declaration({_SHAFT: declared}, ())
     if not isinstance(declared, Mapping):
         found = read_declaration(Path(declared), sample_rate=sample_rate)
-        for name in found.unknown:
-            warnings.warn(f'{os.fspath(declared)}: {name} is not a parameter of jitter_predictor '
-                          'and is ignored', stacklevel=3)
+        if found.unknown:
+            warnings.warn(f'{os.fspath(declared)}: ignored, because jitter_predictor has no such '
+                          f'parameters: {", ".join(found.unknown)}', stacklevel=3)
         return found
     known = {item.name for item in fields(DeclaredModel)}
     for name in declared.keys() - known - {'effects'}:

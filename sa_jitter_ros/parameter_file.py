@@ -16,21 +16,23 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     """
     Read the parameters of a node, nested names joined by dots; the last section wins.
 
-    Sections may be headed by the node's name, with or without slash and namespace, `*` or `**`.
-    No tag makes an object; aliases are refused, as rcl does. Raises ParameterError, in one line,
-    for a file that is missing, too large, nested too deep, or has no parameters of the node.
+    The key of a section is the node's name, with or without slash and namespace, `*` or `**`. YAML
+    tags create no objects; aliases are refused, as in rcl. Raises ParameterError, in one line, for
+    a file that is missing, too large, nested too deep, or without parameters of the node.
     """
     try:
         size = path.stat().st_size
         if size > _LARGEST_FILE:
-            raise ParameterError(f'{size} bytes is no parameter file: give at most '
+            raise ParameterError(f'{size} bytes are too many for a parameter file: give at most '
                                  f'{_LARGEST_FILE}')
         text = path.read_text(encoding='utf-8')
         _check_structure(text)
         content = yaml.load(text, _LOADER)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
-    except Exception as error:  # tags whose text does not fit raise whatever comes
+    except OSError as error:
+        raise ParameterError(f'{path}: {error.strerror or error}') from error
+    except Exception as error:  # malformed tags raise exceptions of many types
         raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
     sections = [section for name, section in _sections(content, '')
                 if name.rsplit('/', 1)[-1] in (node, '*', '**')]
@@ -41,18 +43,19 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
 
 
 def one_line(error: Exception) -> str:
-    """Return what an error says, which may quote the file, in one line that can be read."""
+    """Return the text of an error, which may quote a file, as one line of limited length."""
     text = ' '.join(str(error).split())
     return text if len(text) <= 300 else f'{text[:300]} ...'
 
 
 def _check_structure(text: str) -> None:
-    """Raise ParameterError for what would take unbounded time or memory to load."""
+    """Raise ParameterError for a text that may need unlimited time or memory."""
     depth = 0
     for event in yaml.parse(text, _LOADER):
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
-            raise ParameterError(f'line {line}: aliases are not read: write the value out')
+            raise ParameterError(f'line {line}: YAML aliases are not supported: write the value '
+                                 'itself')
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1
         elif isinstance(event, yaml.CollectionEndEvent):
@@ -62,7 +65,7 @@ def _check_structure(text: str) -> None:
 
 
 def _sections(content: Any, name: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:
-    """Iterate over all sections of parameters with the node names above them."""
+    """Iterate over the sections of parameters with the names of their nodes."""
     for key, value in content.items() if isinstance(content, Mapping) else ():
         if key == 'ros__parameters' and isinstance(value, Mapping):
             yield name, value

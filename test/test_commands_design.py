@@ -49,7 +49,7 @@ def test_the_table_is_what_the_library_chooses(tmp_path, capsys, name):
                      sample_rate=5e4)
     assert settings(text) == (found.keyphasor_rate, found.trigger_cycles)
     assert 'chosen for a loss of at most 0.03' in text
-    assert 'broken' not in text
+    assert 'exceeded' not in text
     np.testing.assert_allclose(
         rows(text)[:, :3], np.transpose([found.orders, found.loss, found.variation]), atol=6e-6)
     assert output.read_bytes().startswith(b'\x89PNG')
@@ -64,7 +64,7 @@ def test_given_settings_are_assessed(tmp_path, capsys):
     expected = designed(**KEYWORDS, keyphasor_rate=5000.0, trigger_cycles=41)
     np.testing.assert_allclose(rows(text)[:, 1], expected.loss, atol=6e-6)
     assert text.count('(given)') == 2
-    assert text.count('broken') == 2
+    assert text.count('exceeded') == 2
     assert '41 revolutions of the tach shaft, 0.988 s' in text
     svg = output.read_text(encoding='utf-8')
     assert svg.count('<path') > 20
@@ -90,8 +90,8 @@ def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, 
         re.MULTILINE)
     np.testing.assert_allclose(np.array([line[1:] for line in printed], float),
                                np.column_stack([left.share, left.waveform_share]), atol=6e-6)
-    best, shares = (np.array(re.search(rf'^{name} +(.*)$', text.split('leave least')[1],
-                                       re.MULTILINE)[1].split(), float)
+    table = text.split('with the smallest shares')[1]
+    best, shares = (np.array(re.search(rf'^{name} +(.*)$', table, re.MULTILINE)[1].split(), float)
                     for name in ('trigger cycles', 'largest share'))
     assert best.tolist() == left.best(5).tolist()
     np.testing.assert_allclose(shares, [left.largest_share[count - left.candidates[0]]
@@ -137,7 +137,7 @@ def test_the_figure_bears_orders_without_iso_lines_and_pulses_that_could_swap(
     ([*BENCH, '--trigger-cycles', 'few'], "invalid int value: 'few'"),
     ([*BENCH, '--noise-std', '1'], 'set sample_rate'),
     ([*BENCH, '--jitter-distribution', 'cauchy'], "invalid choice: 'cauchy'"),
-    ([*BENCH, '--output', 'design.doc'], '--output design.doc: end the name in .png'),
+    ([*BENCH, '--output', 'design.doc'], '--output design.doc: give a file that ends in .png'),
     ([*BENCH, '--output', '/nowhere/design.png'], 'No such file'),
 ])
 def test_bad_input_is_one_line_and_status_2(capsys, arguments, message):

@@ -79,9 +79,10 @@ LAUGHS = 'a: &a [lol, lol]\n' + ''.join(
     f'{new}: &{new} [{", ".join([f"*{old}"] * 9)}]\n'
     for old, new in zip('abcdefghi', 'bcdefghij'))
 HOSTILE = {
-    'billion laughs': (LAUGHS + HEAD + 'orders: *j', 'line 2: aliases are not read'),
-    'merge keys': ('a: &a {x: 1}\nb: {<<: [*a, *a]}\n', 'aliases are not read'),
-    'endless': ('jitter_predictor:\n  ros__parameters: &a\n    x: *a\n', 'aliases are not read'),
+    'billion laughs': (LAUGHS + HEAD + 'orders: *j', 'line 2: YAML aliases are not supported'),
+    'merge keys': ('a: &a {x: 1}\nb: {<<: [*a, *a]}\n', 'aliases are not supported'),
+    'endless': ('jitter_predictor:\n  ros__parameters: &a\n    x: *a\n',
+                'aliases are not supported'),
     'deep lists': (HEAD + 'orders: ' + '[' * 100_000, 'nested deeper than 20 levels'),
     'deep maps': (HEAD + 'a: ' + '{a: ' * 300 + '1' + '}' * 300, 'nested deeper than 20 levels'),
     'object': (HEAD + 'orders: !!python/object/apply:os.system [touch ran]', 'constructor'),
@@ -100,7 +101,7 @@ HOSTILE = {
     'another node': ('tach_detector:\n  ros__parameters: {x: 1}', 'no ros__parameters of jitter'),
     'no map': ('jitter_predictor:\n  ros__parameters: 3', 'no ros__parameters of jitter'),
     'two documents': ('a: 1\n---\nb: 2', 'another document'),
-    'long': ('#' * (1 << 20) + '\n', 'is no parameter file'),
+    'long': ('#' * (1 << 20) + '\n', 'too many for a parameter file'),
     'no text': ('\0\1', 'control characters|special characters'),
 }
 
@@ -128,7 +129,7 @@ def test_the_last_section_wins_and_names_are_joined(tmp_path):
 def test_what_is_no_file(tmp_path, make):
     path = tmp_path / 'model.yaml'
     make(path)
-    with pytest.raises(ParameterError, match='cannot be read as YAML'):
+    with pytest.raises(ParameterError, match=r'model\.yaml: (No such file|Is a directory)'):
         read_parameters(path, 'node')
 
 

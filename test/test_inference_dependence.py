@@ -175,6 +175,6 @@ def test_report_says_what_the_residual_changes_with(pickup):
     assert 'what is left changes' in summary(content)
     assert 'what is left changes' in verdict_sentence(content)
     page = html(content, (), {})
-    assert 'What the residual changes with' in page
+    assert 'Dependence of the residual' in page
     assert '<td>trigger cycles</td>' in page
     assert report(replace(pickup, dependences_after=()))['remains'] == ''

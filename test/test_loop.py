@@ -51,7 +51,7 @@ def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, 
     np.savez(path, vibration=recording.read(), sample_rate=RATE, pulse_times=recording.pulse_times)
     declared.write_text(FILE)
     model = DeclaredModel(**{**KEYWORDS, 'orders': (8.0, 16.0, 24.0), 'sample_rate': RATE})
-    with pytest.warns(UserWarning, match='pinoin is not a parameter of jitter_predictor'):
+    with pytest.warns(UserWarning, match='has no such parameters: pinoin'):
         second = close_loop(path, declared)
     third = close_loop([str(path)], model, names=['rig'])
     for loop_found, name in ((found, 'recording 1'), (second, str(path)), (third, 'rig')):

@@ -144,7 +144,7 @@ def test_sentence_says_what_was_found_and_what_it_was_worth(traces):
     std = effect['parameters']['std']
     assert verdict_sentence(content).startswith(
         f'The declared model lacks excess_jitter (std = {std["value"]:.4g} ± '
-        f'{std["standard_error"]:.2g} s): with it the held-out error goes from '
+        f'{std["standard_error"]:.2g} s). With it the held-out error goes from '
         f'{content["error_before"]["rms"]:.4g} to {content["error_after"]["rms"]:.4g}')
 
 

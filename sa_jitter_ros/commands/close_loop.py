@@ -1,9 +1,9 @@
 """
-Command `close_loop`: find what the declared jitter model lacks in recordings of a machine.
+Command `close_loop`: find which effects the declared jitter model of a machine lacks.
 
-Observes the attenuation of every acquisition, compares it with what the declared model predicts
-and, where more than chance is left, names the effect that makes it. Errors are those of
-acquisitions that the fit has not seen.
+It compares the attenuation that recordings show with the one that the declared model predicts. If
+the residual is significant, it finds the effect that causes it. Errors are those of acquisitions
+that were not used for fitting.
 """
 
 import argparse
@@ -35,21 +35,21 @@ def make_parser() -> Parser:
 
 def run(options: argparse.Namespace) -> Loop:
     """Close the loop on the recordings; raises SaJitterError."""
-    def say(text: str) -> None:
+    def show(text: str) -> None:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
     recordings = [read(path, **read_options(options)) for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
-    for name in declaration.unknown:
-        print(f'close_loop: {options.declared}: {name} is no parameter of jitter_predictor, '
-              'ignored', file=sys.stderr)
+    if declaration.unknown:
+        print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
+              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
     return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
-                      progress=say)
+                      progress=show)
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Close the loop off line; returns the exit status."""
+    """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)
     try:
         found = run(options)

@@ -1,4 +1,4 @@
-"""What the demo does with a recording: how to average it, and what to declare for it."""
+"""How the demo averages a recording, and the model that it declares for it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,19 +13,19 @@ from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
 
-LOOK = 10.0  # s of a recording that are looked at before it is played
-ORDERS = 6
-AVERAGES = 8  # that a recording should give
+FIRST_SECONDS = 10.0  # part of a recording from which its plan is made
+ORDERS = 6  # orders to show if the recording names none
+AVERAGES = 8  # averages to make of a recording
 
 
 @dataclass(frozen=True)
 class Plan:
     """
-    How a source is played, averaged and predicted.
+    How signals are played, averaged and predicted.
 
-    `source` is the node that plays it, with `source_parameters`; `seconds` it lasts, `speed` of
-    the tach shaft and `keyphasor_rate` in Hz; `pulses_per_trigger` is 0 for all of a revolution;
-    `waveform` tells that pulses come from a tach waveform; `note` is a remark for the user.
+    `source` is the node that plays them, with `source_parameters`, for `seconds`. `speed` of the
+    tach shaft and `keyphasor_rate` are in Hz; `pulses_per_trigger` is 0 for all pulses of a
+    revolution. `waveform` is true if the pulses come from a tach waveform; `note` is for the user.
     """
 
     source: str
@@ -43,6 +43,11 @@ class Plan:
     waveform: bool = False
     pulses_per_trigger: int = 0
     note: str = ''
+
+    @property
+    def unit_label(self) -> str:
+        """Unit of the vibration in brackets, empty if it is unknown."""
+        return f'[{self.unit}]' if self.unit and self.unit != 'unknown' else ''
 
 
 _SPEED, _RATIO, _CLOCK, _SECONDS = 16.6, 2.40789, 3000.0, 20.0
@@ -62,28 +67,29 @@ SIMULATED = Plan(
 def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,
                    parameters: Mapping[str, object] | None = None) -> Plan:
     """
-    Look at the first seconds of a recording.
+    Return the plan for a recording, from its first seconds.
 
-    `parameters` are those with which `recording_player` opens its file, at `path`, as it is opened
-    here. With `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if
-    the keyphasor had been sampled so. Raises `RecordingError` if the recording cannot be used.
+    `path` and `parameters` are those with which `recording_player` opens the recording. With
+    `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if the
+    keyphasor had been sampled with it. Raises `RecordingError` if the recording cannot be used.
     """
     first, pulses = _first_seconds(recording)
     triggers = _keyphasor(recording).validator().update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
     if len(cycles) < 4:
         raise RecordingError(f'{len(pulses)} pulses give {len(cycles)} trigger cycles in '
-                             f'the first {LOOK:g} s: at least 4 are needed')
+                             f'the first {FIRST_SECONDS:g} s: at least 4 are needed; check '
+                             'pulses_per_revolution, or the threshold of the tach waveform')
     period = float(np.median(cycles))
     trigger_cycles = int(np.clip(recording.duration / period // AVERAGES, 2, 100))
     waveform = recording.pulse_times is None and recording.tach is not None
     if keyphasor_rate and waveform:
-        raise RecordingError('a tach waveform has the rate at which it was sampled: leave '
-                             '--keyphasor-rate out')
+        raise RecordingError('--keyphasor-rate rounds recorded pulse times, but the recording has '
+                             'a tach waveform: leave --keyphasor-rate out')
     rate = keyphasor_rate or recording.tach_rate or recording.sample_rate
     note = '' if keyphasor_rate or recording.tach_rate else (
-        'the recording does not say at which rate the keyphasor was sampled: that of the '
-        'vibration is assumed')
+        'the recording does not contain the sampling rate of the keyphasor (tach_rate): the '
+        'sampling rate of the vibration is assumed; --keyphasor-rate sets another one')
     return Plan(
         source='recording_player',
         source_parameters={'recording': str(path), 'keyphasor_rate': keyphasor_rate,
@@ -103,14 +109,14 @@ def _keyphasor(recording: Recording) -> KeyphasorParameters:
 
 
 def _first_seconds(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Vibration and pulse times of the first seconds."""
-    samples = next(recording.blocks(round(LOOK * recording.sample_rate)))
+    """Return vibration and pulse times of the first seconds."""
+    samples = next(recording.blocks(round(FIRST_SECONDS * recording.sample_rate)))
     return samples, recording.keyphasor_pulses(duration=samples.shape[1] / recording.sample_rate)
 
 
 def _strongest_orders(recording: Recording, samples: FloatArray, pulses: FloatArray,
                       trigger_cycles: int) -> tuple[float, ...]:
-    """Orders that stand out most in the first average."""
+    """Return the orders with the largest amplitudes in the first average."""
     averages = Averager(
         recording.sample_rate, start_time=recording.start_time, ratio=recording.ratio,
         pulses_per_revolution=recording.pulses_per_revolution,

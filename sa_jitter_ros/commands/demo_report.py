@@ -1,11 +1,10 @@
-"""What the demo ends with: a table of the orders, and two figures."""
+"""The result of the demo: a table of the orders and two figures."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ RAW, CORRECTED, MEASURED = 'tab:red', 'tab:blue', 'black'
 
 
 def amplitude_rows(amplitudes: Sequence[AverageMessage]) -> tuple[FloatArray, NDArray[Any]]:
-    """Tables (average, order, field) of every order on its strongest channel, and the channels."""
+    """Return (average, order, field) of each order on its strongest channel; the channels."""
     table = np.stack([item.values for item in amplitudes])  # average, channel, order, field
     channels = np.argmax(np.nanmean(table[..., 1], axis=0), axis=0)
     return table[:, channels, np.arange(table.shape[2])], channels
@@ -26,9 +25,9 @@ def amplitude_rows(amplitudes: Sequence[AverageMessage]) -> tuple[FloatArray, ND
 
 def text_table(plan: Plan, amplitudes: Sequence[AverageMessage],
                prediction: PredictionMessage | None) -> str:
-    """Table of the orders: measured amplitude, attenuation, and what was predicted."""
+    """Return a table of the orders: amplitude, attenuation, predicted attenuation."""
     rows, channels = amplitude_rows(amplitudes)
-    unit = f' [{plan.unit}]' if plan.unit and plan.unit != 'unknown' else ''
+    unit = f' {plan.unit_label}' if plan.unit_label else ''
     names = [plan.channels[int(channel)] for channel in channels]
     width = max(12, *map(len, names))
     lines = [f'{"order":>8} {"channel":>{width}} {"amplitude" + unit:>16} {"corrected":>10} '
@@ -44,7 +43,7 @@ def text_table(plan: Plan, amplitudes: Sequence[AverageMessage],
 
 
 def _mean(values: FloatArray) -> float:
-    """Mean without NaN; NaN where there is nothing else."""
+    """Return the mean of all values except NaN, NaN if there is none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else float('nan')
 
@@ -60,12 +59,12 @@ def draw_waveform(plan: Plan, raw: AverageMessage, error: AverageMessage | None,
         if error is not None:
             axes.fill_between(angle, raw.values[channel] - 2.0 * error.values[channel],
                               raw.values[channel] + 2.0 * error.values[channel], color=RAW,
-                              alpha=0.25, linewidth=0.0, label='± 2 standard errors')
-        axes.plot(angle, raw.values[channel], color=RAW, linewidth=0.8, label='average')
+                              alpha=0.25, linewidth=0.0, label='raw, ± 2 standard errors')
+        axes.plot(angle, raw.values[channel], color=RAW, linewidth=0.8, label='raw')
         if corrected is not None:
             axes.plot(angle, corrected.values[channel], color=CORRECTED, linewidth=0.8,
-                      label='with corrected pulses')
-        axes.set_ylabel(f'{plan.channels[channel]}\n{_unit(plan)}')
+                      label='corrected')
+        axes.set_ylabel(f'{plan.channels[channel]}\n{plan.unit_label or "[unit unknown]"}')
         axes.margins(x=0.0)
     panels[0].set_title(f'{plan.title}: average of {raw.header.fundamental_cycles} revolutions, '
                         f'tach shaft at {raw.header.mean_trigger_speed:.4g} Hz', fontsize='medium')
@@ -81,14 +80,14 @@ def draw_orders(plan: Plan, amplitudes: Sequence[AverageMessage],
     figure = Figure(figsize=(9.0, 6.2), layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)
     position = np.arange(rows.shape[1])
-    _stems(top, position - 0.08, rows[..., 1], RAW, 'measured')
+    _stems(top, position - 0.08, rows[..., 1], RAW, 'raw')
     if np.isfinite(rows[..., 3]).any():
-        _stems(top, position + 0.08, rows[..., 3], CORRECTED, 'with corrected pulses')
+        _stems(top, position + 0.08, rows[..., 3], CORRECTED, 'corrected')
     top.set_yscale('log')
-    top.set_ylabel(f'amplitude {_unit(plan)}')
+    top.set_ylabel(f'amplitude {plan.unit_label or "[unit unknown]"}')
     top.legend(fontsize='small')
     top.set_title(f'{plan.title}: {len(amplitudes)} averages of {plan.trigger_cycles} trigger '
-                  'cycles, every order on its strongest channel', fontsize='medium')
+                  'cycles, each order on its strongest channel', fontsize='medium')
     if prediction is not None:
         low, high = prediction.values[:, 4], prediction.values[:, 6]
         bottom.bar(position, high - low, bottom=low, width=0.6, color='tab:gray', alpha=0.35,
@@ -99,28 +98,23 @@ def draw_orders(plan: Plan, amplitudes: Sequence[AverageMessage],
     for i in position:
         bottom.plot(np.full(len(measured), i), measured[:, i], 'o', color=MEASURED,
                     markersize=3.0, alpha=0.6,
-                    label='measured, one average each' if i == 0 else None)
+                    label='measured, single averages' if i == 0 else None)
     bottom.use_sticky_edges = False
     bottom.margins(y=0.08)
-    bottom.set_ylabel('attenuation\n(1: nothing lost)')
+    bottom.set_ylabel('attenuation\n(1: no loss)')
     bottom.set_xticks(position, [f'{order:g}' for order in rows[0, :, 0]])
-    bottom.set_xlabel('order [multiples of the shaft]')
+    bottom.set_xlabel('order (multiple of the shaft speed)')
     bottom.legend(fontsize='small', loc='lower left')
     _save(figure, path)
 
 
 def _stems(axes: Axes, position: NDArray[Any], values: FloatArray, color: str, label: str) -> None:
-    """Mean of each order as a stem's head, the scatter over averages as its bar."""
+    """Draw the mean of each order, and the scatter of the averages as its bar."""
     mean, spread = np.nanmean(values, axis=0), np.nanstd(values, axis=0)
     axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,
-                  markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter over averages')
-
-
-def _unit(plan: Plan) -> str:
-    return f'[{plan.unit}]' if plan.unit and plan.unit != 'unknown' else '[unit unknown]'
+                  markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter of the averages')
 
 
 def _save(figure: Figure, path: Path) -> None:
-    FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

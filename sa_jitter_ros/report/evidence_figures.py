@@ -1,4 +1,4 @@
-"""Figures of the evidence: pulse errors, the trigger cycle, amplitudes; expected and observed."""
+"""Figures of the evidence: pulse errors, trigger cycle and amplitudes, expected and observed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,15 +19,15 @@ Array = NDArray[Any]
 
 _MICRO = 1e6
 _MOST_POINTS = 3000
-_STEPS = 16  # places in a trigger cycle
+_STEPS = 16  # positions in a trigger cycle
 
 
 def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
-    """Draw the pulse errors: time, distribution, autocorrelation, clock, origin, steadiness."""
+    """Draw the pulse errors over time, their distribution, autocorrelation, clock and origin."""
     evidence, versions = whole(evidence), versions_of(evidence, effects)
     figure, axes = panels(8, columns=4)
     _over_time(axes[0], evidence, versions[-1])
-    _law(axes[1], evidence, versions)
+    _distribution(axes[1], evidence, versions)
     _autocorrelation(axes[2], evidence, versions)
     _return_map(axes[3], evidence)
     _lattice(axes[4], evidence)
@@ -53,31 +53,31 @@ def amplitudes(evidence: Evidence, channel_names: Sequence[str]) -> Figure:
     figure, axes = panels(3, columns=3)
     strongest = np.argsort(lines.radial_noise)[:4]
     names = [f'order {lines.order[k]:g}, {channel_names[lines.channel[k]]}' for k in strongest]
-    moves = lines.radial[..., strongest]
-    cycles = moves.shape[1]
-    for move, name in zip(moves.reshape(-1, len(names)).T, names):
-        axes[0].plot(move, linewidth=0.6, alpha=0.8, label=name)
+    changes = lines.radial[..., strongest]
+    cycles = changes.shape[1]
+    for change, name in zip(changes.reshape(-1, len(names)).T, names):
+        axes[0].plot(change, linewidth=0.6, alpha=0.8, label=name)
     axes[0].set(title='cycle by cycle', xlabel='trigger cycle of the fitted acquisitions',
-                ylabel='amplitude over its level, less 1')
+                ylabel='relative change of the amplitude')
     legend_below(axes[0])
     for other in range(1, len(names)):
-        axes[1].plot(_thinned(moves[..., 0]), _thinned(moves[..., other]), '.', markersize=2,
+        axes[1].plot(_thinned(changes[..., 0]), _thinned(changes[..., other]), '.', markersize=2,
                      color=f'C{other}', label=names[other])
-    axes[1].set(title='correlation between lines', xlabel=f'less 1: {names[0]}',
-                ylabel='less 1: other lines')
+    axes[1].set(title='correlation between lines', xlabel=f'relative change, {names[0]}',
+                ylabel='relative change, other lines')
     if len(names) > 1:
         legend_below(axes[1])
-    power = np.mean(np.abs(np.fft.rfft(moves, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
+    power = np.mean(np.abs(np.fft.rfft(changes, axis=1)[:, 1:]) ** 2, axis=0) * 2.0 / cycles
     axes[2].semilogy(np.fft.rfftfreq(cycles)[1:], power, linewidth=0.9)
-    axes[2].set(title='spectrum', xlabel='frequency in cycles per trigger cycle',
-                ylabel='density')
+    axes[2].set(title='spectrum', xlabel='frequency / trigger rate',
+                ylabel='spectral density')
     return figure
 
 
 # --- panels of pulse errors ----------------------------------------------------------------------
 
 def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
-    """Draw the errors over the length of an acquisition: what they have in common is a trend."""
+    """Draw the errors over an acquisition; their mean shows a common trend."""
     times = evidence.times - evidence.times[:, :1]
     for row in range(min(len(times), 8)):
         axes.plot(times[row], _MICRO * evidence.errors[row], color='0.7', linewidth=0.6,
@@ -86,13 +86,13 @@ def _over_time(axes: Axes, evidence: Evidence, version: Version) -> None:
               label='mean of all')
     if version.patterns.any():
         axes.plot(times[0], _MICRO * version.patterns[0], color=version.colour, linewidth=0.9,
-                  label='known part, first acquisition')
+                  label='deterministic part, first acquisition')
     axes.set(title='over an acquisition', xlabel='time since its start [s]',
              ylabel='pulse error [µs]')
     legend_below(axes)
 
 
-def _law(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+def _distribution(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
     """Draw the histogram of the errors and the expected distributions."""
     errors = _MICRO * evidence.errors.ravel()
     top = max(np.abs(errors).max(), *(_MICRO * np.quantile(np.abs(item.draws), 0.999)
@@ -123,79 +123,80 @@ def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]
 
 
 def _return_map(axes: Axes, evidence: Evidence) -> None:
-    """Draw each error over the one before: a cloud, an ellipse, lines or spots."""
+    """Draw each error over the one before, which shows correlation and quantisation."""
     errors = _MICRO * evidence.errors
     axes.plot(_thinned(errors[:, :-1]), _thinned(errors[:, 1:]), '.', color=MEASURED, markersize=2)
-    axes.set(title='from pulse to pulse', xlabel='pulse error [µs]',
+    axes.set(title='successive pulses', xlabel='pulse error [µs]',
              ylabel='error of the next pulse [µs]')
 
 
 def _lattice(axes: Axes, evidence: Evidence) -> None:
-    """Draw the errors against the ticks of a clock: that of the pulse times, else the declared."""
+    """Draw the errors over the ticks of the clock of the pulse times, else of the declared one."""
     errors = _MICRO * evidence.errors
-    known = [pulses.errors for pulses in evidence.pulses if pulses.errors is not None]
-    if len(known) == len(errors):
-        grid = np.array(known)
+    imposed = [pulses.errors for pulses in evidence.pulses if pulses.errors is not None]
+    if len(imposed) == len(errors):
+        grid = np.array(imposed)
         grid = _MICRO * (grid - grid.mean(axis=1, keepdims=True))
         axes.plot(_thinned(grid), _thinned(errors), '.', color=MEASURED, markersize=2)
         axes.plot(*2 * [[grid.min(), grid.max()]], color=AFTER, linewidth=0.9, label='slope 1')
         axes.set(title=f'clock of the pulse times, {evidence.clock.rate:.6g} Hz',
-                 xlabel='error that its ticks impose [µs]', ylabel='recovered pulse error [µs]')
+                 xlabel='error due to its ticks [µs]', ylabel='recovered pulse error [µs]')
         legend_below(axes)
         return
     rate = evidence.model.keyphasor_rate
     ticks = ((evidence.times - evidence.errors) * rate) % 1.0
     axes.plot(_thinned(ticks), _thinned(errors), '.', color=MEASURED, markersize=2)
-    axes.set(title=f'declared clock, {rate:.6g} Hz', xlabel='pulse time x clock mod 1',
+    axes.set(title=f'declared clock, {rate:.6g} Hz', xlabel='pulse time × clock rate, modulo 1',
              ylabel='pulse error [µs]')
 
 
 def _origin(axes: Axes, evidence: Evidence) -> None:
-    """Draw whether the measured pulse times follow the recovered errors."""
+    """Draw pulse times over recovered errors: only errors of the tach are in both."""
     x = _MICRO * np.diff(evidence.errors, 2, axis=1)
     y = np.diff(evidence.times, 2, axis=1)
     half = 0.5 * evidence.period
     y = _MICRO * ((y + half) % (2.0 * half) - half)
     axes.plot(_thinned(x), _thinned(y), '.', color=MEASURED, markersize=2)
     ends = np.array([x.min(), x.max()])
-    axes.plot(ends, ends, color=AFTER, linewidth=0.9, label='error of the tach')
-    axes.plot(ends, 0.0 * ends, color=BEFORE, linewidth=0.9, label='motion of the vibration side')
-    axes.set(title='origin: second differences', xlabel='of the pulse errors [µs]',
-             ylabel='of the pulse times [µs]')
+    axes.plot(ends, ends, color=AFTER, linewidth=0.9, label='expected: error of the tach')
+    axes.plot(ends, 0.0 * ends, color=BEFORE, linewidth=0.9, label='expected: motion of the shaft')
+    axes.set(title='origin of the errors',
+             xlabel='second difference of the pulse errors [µs]',
+             ylabel='second difference of\nthe pulse times [µs]')
     legend_below(axes)
 
 
 def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
-    """Draw the size of the errors over the record."""
+    """Draw the RMS of the errors over the record."""
     size = np.sqrt(np.mean(evidence.errors**2, axis=1))
     axes.plot(evidence.times.mean(axis=1), _MICRO * size, 'o', markersize=3, color=MEASURED,
               label='acquisitions')
     for item in versions:
         axes.axhline(_MICRO * item.std, color=item.colour, linewidth=0.9, label=item.label)
-    axes.set(title='size over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
+    axes.set(title='over the record', xlabel='time [s]', ylabel='RMS pulse error [µs]')
     axes.set_ylim(bottom=0.0)
     legend_below(axes)
 
 
 def _intervals(axes: Axes, evidence: Evidence) -> None:
-    """Draw how long the pulse intervals are."""
+    """Draw the histogram of the pulse intervals."""
     intervals = np.diff(evidence.record_times)
     axes.hist(intervals / np.median(intervals), 60, color='0.6')
     axes.set_yscale('log')
     axes.set_ylim(bottom=0.5)
-    axes.set(title='pulse intervals', xlabel='interval over their median', ylabel='number')
+    axes.set(title='pulse intervals', xlabel='interval / median interval', ylabel='number')
 
 
 # --- panels of the trigger cycle -----------------------------------------------------------------
 
 def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
-    """Draw the RMS angle error over the trigger cycle: large at its ends or in the middle."""
+    """Draw the RMS angle error over the trigger cycle."""
     u = cycle_places()
     for item in versions:
         axes.plot(u, _MICRO * item.profile, color=item.colour, label=item.label)
     size = np.sqrt(np.mean(_angle_errors(evidence, u) ** 2, axis=(0, 1)))
     axes.plot(u, _MICRO * size, color=MEASURED, linewidth=0.0, marker='.', label='recovered')
-    axes.set(title='over the trigger cycle', xlabel='u, position in the trigger cycle',
+    axes.set(title='over the trigger cycle', xlabel='position in the trigger cycle, u',
              ylabel='RMS angle error [µs]')
     axes.set_ylim(bottom=0.0)
     legend_below(axes)
@@ -203,9 +204,9 @@ def _profile(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> Non
 
 def _angle_errors(evidence: Evidence, u: Array) -> Array:
     """
-    Return the angle error (acquisition, cycle, u) in s: pulse errors and ripple.
+    Return the angle error (acquisition, cycle, u) in s, from pulse errors and speed ripple.
 
-    The ripple is that between lines from pulse to pulse, part of which other laws follow.
+    The ripple is relative to the linear angle law; the other laws follow part of it.
     """
     cycles = evidence.errors.shape[1] - 1
     late = evidence.times - evidence.times[:, :1] - evidence.period * np.arange(cycles + 1)
@@ -216,7 +217,7 @@ def _angle_errors(evidence: Evidence, u: Array) -> Array:
 
 
 def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
-    """Draw the attenuation that the pulse errors make in averages of fewer cycles."""
+    """Draw the attenuation by the pulse errors in averages of fewer cycles."""
     model = evidence.model
     counts = np.unique(np.geomspace(1, model.trigger_cycles, 7).astype(int))
     path = _angle_errors(evidence, np.arange(_STEPS) / _STEPS + 0.5 / _STEPS)
@@ -231,7 +232,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
         means.append(each.mean())
         spreads.append(each.std(ddof=1) / np.sqrt(len(each)))
     axes.errorbar(counts, means, yerr=spreads, fmt='o', color=MEASURED, markersize=4, capsize=2,
-                  label='of the recovered errors')
+                  label='by the recovered errors')
     for item in versions:
         curve = [predict(replace(model, trigger_cycles=int(n), noise_std=0.0, orders=(g,)),
                          item.effects).mean_attenuation[0] for n in counts]
@@ -239,13 +240,13 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.set_xscale('log')
     axes.set_xticks(counts, [str(n) for n in counts])
     axes.set_xticks([], minor=True)
-    axes.set(title=f'order {g:g} over the number of cycles', xlabel='averaged trigger cycles',
+    axes.set(title=f'order {g:g} over the number of cycles', xlabel='trigger cycles in an average',
              ylabel='attenuation')
     legend_below(axes)
 
 
 def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
-    """Draw the mean error over the pulse index, folded by the target or a few pulses."""
+    """Draw the mean error of each mark of the target, or of each of a few pulses."""
     model = evidence.model
     step = model.pulses_per_trigger or model.pulses_per_revolution
     angles = [effect.values['pulse_angles'] for effect in version.effects
@@ -254,17 +255,18 @@ def _folded(axes: Axes, evidence: Evidence, version: Version) -> None:
     period = marks // int(np.gcd(marks, step)) if marks > 1 else 12
     period = min(period, evidence.errors.shape[1])
     index = np.array([pulses.index for pulses in evidence.pulses]) % period
-    places = np.unique(index)
-    mean = np.array([evidence.errors[index == k].mean() for k in places])
+    positions = np.unique(index)
+    mean = np.array([evidence.errors[index == k].mean() for k in positions])
     error = np.array([evidence.errors[index == k].std() / np.sqrt((index == k).sum())
-                      for k in places])
-    axes.errorbar(places, _MICRO * mean, yerr=_MICRO * error, fmt='o', color=MEASURED, capsize=2,
-                  markersize=4, label='recovered, mean')
+                      for k in positions])
+    axes.errorbar(positions, _MICRO * mean, yerr=_MICRO * error, fmt='o', color=MEASURED,
+                  capsize=2, markersize=4, label='recovered, mean')
     if angles:
-        known = np.array([version.patterns[index == k].mean() for k in places])
-        axes.plot(places, _MICRO * known, color=version.colour, marker='_', label=version.label)
+        expected = np.array([version.patterns[index == k].mean() for k in positions])
+        axes.plot(positions, _MICRO * expected, color=version.colour, marker='_',
+                  label=version.label)
     axes.axhline(0.0, color='0.4', linewidth=0.8)
-    axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse mod {period}',
+    axes.set(title=f'folded by {period} pulses', xlabel=f'trigger pulse, modulo {period}',
              ylabel='pulse error [µs]')
     legend_below(axes)
 

@@ -1,4 +1,4 @@
-"""What a model expects of the pulse errors that the evidence shows."""
+"""Pulse errors that a model expects, to compare with the recovered ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,20 +16,21 @@ from scipy.linalg import toeplitz
 Array = NDArray[Any]
 
 _MOST_LAGS = 25
-_SMALL = 1e-5  # s, an error that a small coefficient of the characteristic function is for
+_SMALL = 1e-5  # s; sets the step at which the characteristic function gives a variance
 _DRAWS, _SEED = 20_000, 3
-# Effects that recovered errors do not show: gaps are repaired first, samples come as they are.
+# Effects that are not in the recovered errors: they concern gaps and samples, not pulse times.
 _NOT_IN_ERRORS = ('missing_pulses', 'interpolation_loss')
 
 
 @dataclass(frozen=True)
 class Version:
     """
-    What one model expects of the pulse errors; times in s.
+    The pulse errors that one model expects; times in s.
 
-    `effects` are those that pulse errors show; `autocovariance` (lag,) is that of errors of mean 0
-    in each acquisition, `std` their size, `draws` some of them, `profile` (u,) the RMS angle error
-    over the trigger cycle, `patterns` (acquisition, N_t + 1) what is known of each pulse.
+    `effects` are those that are visible in pulse errors. `autocovariance` (lag,) and `std` are
+    those of errors whose mean is 0 in each acquisition, `draws` are random errors, `profile` (u,)
+    is the RMS angle error over the trigger cycle, and `patterns` (acquisition, N_t + 1) is the
+    deterministic part of each error.
     """
 
     label: str
@@ -43,7 +44,7 @@ class Version:
 
 
 def versions_of(evidence: Evidence, effects: Sequence[Effect]) -> list[Version]:
-    """Return what declared model and, if there are any, added effects expect."""
+    """Return the expectation of the declared model and, if effects were added, of both."""
     declared = evidence.explained
     found = [_version('declared model', BEFORE, evidence, declared)]
     if effects:
@@ -53,12 +54,12 @@ def versions_of(evidence: Evidence, effects: Sequence[Effect]) -> list[Version]:
 
 
 def whole(evidence: Evidence) -> Evidence:
-    """Return the evidence with what declared effects know of the errors put back into them."""
+    """Return the evidence with the errors that the declared effects explain."""
     return replace(evidence, errors=evidence.errors + _patterns(evidence, evidence.explained))
 
 
 def _patterns(evidence: Evidence, effects: Sequence[Influence]) -> Array:
-    """Return what effects know of each pulse error (acquisition, N_t + 1) in s."""
+    """Return the deterministic part (acquisition, N_t + 1) of the errors in s."""
     patterns = np.zeros(evidence.errors.shape)
     for row, pulses in zip(patterns, evidence.pulses):
         known = known_errors(evidence.model, _timing(effects), pulses)
@@ -107,10 +108,10 @@ def _noise(evidence: Evidence) -> float:
 
 
 def lags_of(evidence: Evidence) -> int:
-    """Return how many lags of the autocovariance are worth showing."""
+    """Return the number of lags of the autocovariance to show."""
     return min(_MOST_LAGS + 1, int(evidence.errors.shape[1]) // 2 + 1)
 
 
 def cycle_places() -> Array:
-    """Return places in a trigger cycle (u,)."""
+    """Return the positions u in a trigger cycle that are shown."""
     return np.linspace(0.0, 1.0, 41)

@@ -65,16 +65,16 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
     effects = _effects(trace)
     drawn: Sequence[tuple[str, str, str, Callable[..., Figure]]] = (
         ('pulse_errors', 'Pulse errors',
-         'Pulse errors (measured minus true time) of the fitted acquisitions, with no effect '
-         'removed, and what the declared model and the report expect.',
+         'Recovered pulse errors (measured minus true time) of the fitted acquisitions, and those '
+         'that the declared model expects, without and with the added effects.',
          evidence_figures.pulse_errors),
         ('trigger_cycle', 'Inside the trigger cycle, and over the number of cycles',
-         'How the angle error is spread over the trigger cycle, how the attenuation changes with '
-         'the number of averaged cycles, and how the pulse errors repeat with the pulse index.',
+         'Angle error over the trigger cycle, attenuation over the number of averaged cycles, and '
+         'mean pulse error over the pulse index.',
          evidence_figures.trigger_cycle),
         ('amplitudes', 'Amplitudes of the lines',
-         'How the amplitudes vary from cycle to cycle after the pulse errors are removed: '
-         'timing does not cause these variations.',
+         'Amplitudes of the strongest lines from cycle to cycle, after correction of the pulse '
+         'errors: these variations are not due to timing.',
          lambda evidence, _: evidence_figures.amplitudes(
              evidence, trace.observation.channel_names)))
     for name, title, caption, draw in drawn:

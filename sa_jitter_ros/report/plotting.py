@@ -1,4 +1,4 @@
-"""Colours and panels that the figures of a report share."""
+"""Colours, panels and legends that the figures of a report share."""
 
 from collections.abc import Sequence
 
@@ -9,12 +9,12 @@ BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
 
 
 def with_effects(names: Sequence[str]) -> str:
-    """Return the label of a prediction with these effects, short enough for a panel."""
+    """Return a short label of a prediction with these effects."""
     return f'with {names[0]}' if len(names) == 1 else f'with {len(names)} effects'
 
 
 def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` panels in rows of `columns`, without the state of pyplot."""
+    """Return a figure with `count` panels in rows of `columns`."""
     rows = -(-count // columns)
     figure = Figure(figsize=(3.6 * columns, 3.1 * rows), layout='constrained')
     axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
@@ -27,6 +27,6 @@ def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
 
 
 def legend_below(axes: Axes) -> None:
-    """Add the legend below a panel, where it hides no data."""
+    """Add the legend below a panel, where it does not hide data."""
     axes.legend(fontsize='x-small', loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2,
                 frameon=False)
