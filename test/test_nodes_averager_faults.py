@@ -179,7 +179,7 @@ def corrected(ros_graph):
                 b.send(topic, message)
         b.settle()
     found = [(item, checker.check(item.amplitude, item.waveform)) for item in inbox.take()]
-    assert inbox.left == 0
+    assert inbox.incomplete == 0
     return [(item, place) for item, place in found
             if check_correction('shaft', item, place, settings)]
 

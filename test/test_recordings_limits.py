@@ -44,7 +44,7 @@ def test_compressed_bags_are_read(tmp_path, mode, storage):
 
 def test_bags_of_compressed_messages_are_refused(tmp_path):
     path, _ = written(tmp_path / 'bag', Mode.MESSAGE, Storage.SQLITE3)
-    with pytest.raises(RecordingError, match='message by message: convert it'):
+    with pytest.raises(RecordingError, match='compressed one by one: convert'):
         read(path)
 
 
@@ -112,9 +112,9 @@ def test_only_recording_errors_come_out(compressed, place, piece):
 
 @pytest.mark.parametrize(('content', 'says'), [
     (mcap(BOMB), 'more than 200 times as many'),
-    (mcap(frame([(0, 1, b'x')]), index=(1, 10)), 'chunks that are not there'),
-    (mcap(frame([(0, 1, b'x')]), index=(0, 5000)), 'chunks that are not there'),
-    (mcap(b'no frame'), 'begins no zstd frame'),
+    (mcap(frame([(0, 1, b'x')]), index=(1, 10)), 'chunks that do not exist'),
+    (mcap(frame([(0, 1, b'x')]), index=(0, 5000)), 'chunks that do not exist'),
+    (mcap(b'no frame'), 'no zstd frame at byte'),
     (mcap(frame([(2, 1 << 20, b'')])), 'cannot be read'),
 ])
 def test_broken_bags(tmp_path, content, says):

@@ -1,8 +1,8 @@
 """
 Recordings in rosbag2 folders, `.mcap` and `.db3` files: the package's input topics.
 
-Read through the pure-Python `rosbags` library; no ROS is needed. Topics are known by the last part
-of their name (`/rig/vibration` is a `vibration`); a channel map can name others.
+The pure-Python library `rosbags` reads them, without ROS. The last part of its name tells what a
+topic is (`/rig/vibration` is `vibration`); a channel map can name others.
 """
 
 from collections.abc import Iterator
@@ -38,7 +38,7 @@ _FILL = 65_536
 
 @dataclass(frozen=True)
 class _Extent:
-    """What a topic holds in all."""
+    """The samples of a topic: how many, at which rate, from when on."""
 
     channels: int
     samples: int
@@ -50,7 +50,7 @@ class _Extent:
 
 @dataclass(frozen=True)
 class BagSource:
-    """The samples of one topic; lost ones are NaN, repeated ones are left out."""
+    """The samples of one topic; lost ones are NaN, repeated ones are skipped."""
 
     path: Path
     topic: str
@@ -79,16 +79,16 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
         Entries that start with '/' name topics for `vibration` and `tach`, others
         channels (`x`, `y`, `z` of an Imu).
     sample_rate
-        Of messages that do not carry it (Float32MultiArray, Imu, no header), Hz.
+        Of messages that do not contain it (Float32MultiArray, Imu, no header), Hz.
     keyphasor
-        `source` of the TimeReference messages to take, '' for the first seen.
+        `source` of the TimeReference messages to use, '' for that of the first message.
 
     Raises
     ------
     RecordingError
-        If `rosbags` is missing, the bag is broken, has no vibration, or its samples are not of one
-        run (index or clock jump back, rate or channels change, the stamps of an Imu run at another
-        rate).
+        If `rosbags` is missing, the bag is broken, has no vibration, or has samples of more than
+        one run (index or clock jump back, rate or channels change, the stamps of an Imu have
+        another rate).
 
     """
     topics = [entry for entry in channel_map.vibration if entry.startswith('/')]
@@ -127,7 +127,7 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
 
 
 class _Run:
-    """Makes a continuous stream of one run's blocks and counts what that took."""
+    """Makes a continuous stream of the blocks of one run; counts lost and repeated samples."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
@@ -142,7 +142,7 @@ class _Run:
             missing = block.index - first.index - self.received
             if missing > min(MAX_GAP * block.sample_rate, MAX_LOST / max(len(block.samples), 1)):
                 raise RecordingError(
-                    f'{self.topic}: {missing} samples are missing before index {block.index}: '
+                    f'{self.topic}: {missing} samples are missing before index {block.index}, '
                     f'more than {MAX_GAP:g} s or {MAX_LOST} values; split the bag')
             for start in range(0, missing, _FILL):
                 yield np.full((len(block.samples), min(_FILL, missing - start)), np.nan)
@@ -155,7 +155,7 @@ class _Run:
     def remarks(self) -> tuple[str, ...]:
         """Return what was repaired, one sentence each."""
         counts = ((self.lost, 'lost samples are NaN'),
-                  (self.repeated, 'repeated samples left out'))
+                  (self.repeated, 'repeated samples were skipped'))
         return tuple(f'{self.topic}: {count} {text}' for count, text in counts if count)
 
     def _check(self, first: SampleBlock, block: SampleBlock) -> None:
@@ -177,7 +177,7 @@ class _Run:
 
 @contextmanager
 def _reader(path: Path) -> Iterator[Any]:
-    """Open a bag; `rosbags` must not make code of the message definitions that it holds."""
+    """Open a bag; `rosbags` must not compile the message definitions in it."""
     try:
         from rosbags.rosbag2 import Reader
     except ImportError as error:
@@ -186,8 +186,8 @@ def _reader(path: Path) -> Iterator[Any]:
     check_bag(path)
     with Reader(path) as reader:
         if reader.compression_mode == 'message':
-            raise RecordingError('compressed message by message: convert it with ros2 bag convert '
-                                 'to compression of files, or to none')
+            raise RecordingError('messages are compressed one by one: convert the bag with ros2 '
+                                 'bag convert to compressed files, or to no compression')
         yield reader
 
 
@@ -196,21 +196,21 @@ def _find_topic(reader: Any, asked: str, role: str, types: tuple[str, ...]) -> s
     found = [name for name, info in reader.topics.items() if info.msgtype in types and (
         name == asked if asked else name.rsplit('/', 1)[-1] == role)]
     if asked and not found:
-        raise RecordingError(f'topic {asked} is not in the bag with a type of {", ".join(types)}; '
-                             f'there are {", ".join(sorted(reader.topics))}')
+        raise RecordingError(f'no topic {asked} with a type of {", ".join(types)}: choose from '
+                             f'{", ".join(sorted(reader.topics))}')
     if len(found) > 1:
-        raise RecordingError(f'several topics are called {role}: {", ".join(sorted(found))}; name '
-                             'one in the channel map or record one machine in a bag')
+        raise RecordingError(f'several topics are named {role}: {", ".join(sorted(found))}; name '
+                             'one in the channel map, or record one machine per bag')
     return found[0] if found else ''
 
 
 def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
-    """Read a topic through once and return what it holds."""
+    """Read a topic once and return the extent of its samples."""
     run = _Run(topic)
     for _ in run.continuous(_blocks(reader, topic, sample_rate)):
         pass
     if run.first is None:
-        raise RecordingError(f'{topic}: holds no messages')
+        raise RecordingError(f'{topic} has no messages: record the topic')
     imu = reader.topics[topic].msgtype == IMU
     return _Extent(len(run.first.samples), run.received, run.first.sample_rate,
                    run.first.start_time, imu, run.remarks())
@@ -226,14 +226,14 @@ def _messages(reader: Any, topic: str) -> Iterator[Any]:
     connections = [item for item in reader.connections if item.topic == topic]
     for item in connections:
         if item.digest not in ('', _types().hash_rihs01(item.msgtype)):
-            raise RecordingError(f'{topic}: its {item.msgtype} is not that of ROS 2; record the '
-                                 'standard message')
+            raise RecordingError(f'{topic}: its {item.msgtype} differs from that of ROS 2: record '
+                                 'the standard message')
     for connection, _, data in reader.messages(connections=connections):
         yield _types().deserialize_cdr(data, connection.msgtype)
 
 
 def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[SampleBlock]:
-    """Iterate over the sample blocks of a topic as its messages hold them."""
+    """Iterate over the sample blocks of a topic, one per message."""
     decoder = SampleDecoder(reader.topics[topic].msgtype.replace('/msg/', '/'),
                             sample_rate=sample_rate or 0.0, imu_axis=_IMU_AXES)
     for message in _messages(reader, topic):
@@ -247,7 +247,7 @@ def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[Samp
 
 @contextmanager
 def _message_errors(topic: str) -> Iterator[None]:
-    """Turn what is wrong with a message into what is wrong with the recording."""
+    """Raise the error of a message as that of the recording."""
     try:
         yield
     except MessageError as error:
@@ -255,7 +255,7 @@ def _message_errors(topic: str) -> Iterator[None]:
 
 
 def _pulses(reader: Any, topic: str, keyphasor: str) -> tuple[FloatArray, tuple[str, ...]]:
-    """Return the pulse times in order and what had to be left out or moved."""
+    """Return the pulse times in order, and remarks on what was skipped or sorted."""
     pieces: list[FloatArray] = []
     chosen, others, count = keyphasor, 0, 0
     for message in _messages(reader, topic):
@@ -270,9 +270,9 @@ def _pulses(reader: Any, topic: str, keyphasor: str) -> tuple[FloatArray, tuple[
                 pieces.append(decode_pulse_array(message))
         count += pieces[-1].size
         if count > MAX_PULSES:
-            raise RecordingError(f'{topic}: more than {MAX_PULSES} pulses')
+            raise RecordingError(f'{topic}: more than {MAX_PULSES} pulses: split the bag')
     times = np.concatenate(pieces) if pieces else np.empty(0)
     late = int(np.count_nonzero(np.diff(times) < 0))
-    counts = ((others, f'pulses of other keyphasors than {chosen!r} left out'),
-              (late, 'pulses that came late put in order'))
+    counts = ((others, f'pulses of other keyphasors than {chosen!r} were skipped'),
+              (late, 'pulses that arrived late were sorted'))
     return np.sort(times), tuple(f'{topic}: {n} {text}' for n, text in counts if n)

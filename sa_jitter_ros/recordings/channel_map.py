@@ -1,4 +1,4 @@
-"""Which channels of a file are vibration and which one is the tach."""
+"""Channel maps: which channels of a file are vibration, and which one is the tach waveform."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,12 @@ class ChannelMap:
     tach
         Channel that is the sampled keyphasor waveform; '' for none.
     time
-        Column of a `.csv` that holds the sample times in s; '' for one named `time` or `t`.
+        Column of a `.csv` with the sample times in s; '' for one named `time` or `t`.
+
+    Examples
+    --------
+    >>> ChannelMap(tach='2').roles(['x', 'y', 'speed'])
+    ((0, 1), 2)
 
     """
 
@@ -57,11 +62,12 @@ class ChannelMap:
         if not rows:
             rows = tuple(row for row in range(len(names)) if row != tach)
         if not rows:
-            raise RecordingError(f'the only channel, {self.tach}, is the tach: no vibration left')
+            raise RecordingError(f'the only channel, {self.tach}, is the tach: name a channel of '
+                                 'vibration')
         return rows, tach
 
     def named(self, names: Sequence[str]) -> 'ChannelMap':
-        """Return this map with every channel given by its name among `names`."""
+        """Return this map with the names of channels in place of their numbers."""
         def name(entry: str) -> str:
             return names[find_channel(names, entry)] if entry else ''
         return ChannelMap(tuple(map(name, self.vibration)), name(self.tach), name(self.time))
@@ -82,9 +88,9 @@ class ChannelMap:
 
 
 def find_channel(names: Sequence[str], entry: str) -> int:
-    """Return the number of the channel called `entry`, or numbered so if none is called so."""
+    """Return the number of the channel with the name `entry`, else with that number."""
     if entry in names:
         return list(names).index(entry)
     if entry.isdecimal() and int(entry) < len(names):
         return int(entry)
-    raise RecordingError(f'no channel {entry!r}: there are {", ".join(names)}')
+    raise RecordingError(f'no channel {entry!r}: choose from {", ".join(names)}')

@@ -2,7 +2,7 @@
 Recordings in `.csv` files: one row a sample, read in blocks.
 
 Fields are separated by comma, semicolon or tab; with semicolons a comma is a decimal point. A
-first row that is not numeric names the columns, otherwise they are called 0, 1, ...
+first row that is not numeric has the names of the columns, otherwise these are 0, 1, ...
 """
 
 from collections.abc import Iterator
@@ -26,8 +26,8 @@ class CsvSource:
     """
     The columns of a `.csv` file that are samples.
 
-    With a time column (`times`, its number) every block checks that its samples lie within half a
-    sample period of their place.
+    With a time column (`times`, its number) each sample must be within half a sample period of its
+    time by rate and row number.
     """
 
     path: Path
@@ -65,16 +65,16 @@ class CsvSource:
         if astray.size:
             row = int(astray[0])
             raise RecordingError(
-                f'row {start + row}: time {times[row]} s is no sample of a steady '
-                f'{self.sample_rate:g} Hz from {self.start_time} s; split the file at its gaps')
+                f'row {start + row}: time {times[row]} s does not fit a constant rate of '
+                f'{self.sample_rate:g} Hz from {self.start_time} s: split the file at its gaps')
 
 
 def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
     """
-    Open a `.csv` file; columns that the map leaves out need not be numeric.
+    Open a `.csv` file; only the columns of the channel map must be numeric.
 
-    The sampling rate is `sample_rate`, which the times must agree with to half a sample, or their
-    mean rate without it. Raises RecordingError if there is neither, or a row is not numeric.
+    The sampling rate is `sample_rate`, with which the times must agree within half a sample, else
+    the mean rate of the times. Raises RecordingError if there is neither, or a row is not numeric.
     """
     with recording_errors(path):
         with _open(path) as file:
@@ -91,13 +91,15 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             wanted.add(channel_map.tach)
         columns = tuple(k for k, name in enumerate(names) if name in wanted)
         if not columns:
-            raise RecordingError(f'columns {", ".join(names)} hold no vibration')
+            raise RecordingError(f'no column of vibration among {", ".join(names)}: name it with '
+                                 'vibration_channels')
         times = names.index(time) if time else None
         samples, start_time, end_time = _extent(path, delimiter, has_header, times)
         rate = sample_rate
         if times is not None and samples > 1:
             if not end_time > start_time:
-                raise RecordingError(f'time runs from {start_time} to {end_time} s: must increase')
+                raise RecordingError(f'time runs from {start_time} to {end_time} s: sort the rows '
+                                     'by time')
             rate = (samples - 1) / (end_time - start_time)
             if sample_rate is not None:  # times are rounded, so it is the better of the two
                 if not abs((end_time - start_time) * sample_rate - (samples - 1)) < 1.0:
@@ -107,7 +109,7 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
         if rate is None:
             raise RecordingError(
                 f'no time column among {", ".join(names)}: give its name as time_column, '
-                'or the sample_rate')
+                'or give the sample_rate')
         source = CsvSource(path, delimiter, has_header, columns, samples, times, start_time, rate)
         return channel_map.select(Recording(
             source, rate, start_time=start_time,
@@ -119,19 +121,20 @@ def _open(path: Path) -> TextIO:
 
 
 def _rows(file: TextIO, delimiter: str, has_header: bool) -> Iterator[str]:
-    """Iterate over the rows that hold data, with decimal points."""
+    """Iterate over the rows with data, with decimal points."""
     if has_header:
         file.readline(MAX_LINE)
     while line := file.readline(MAX_LINE):
         if not line.endswith('\n') and len(line) >= MAX_LINE:
-            raise RecordingError(f'a line is longer than {MAX_LINE} characters: is it a table?')
+            raise RecordingError(f'a line is longer than {MAX_LINE} characters: give a table with '
+                                 'one sample per row')
         if not line.isspace():
             yield line.replace(',', '.') if delimiter == ';' else line
 
 
 def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
            start: int) -> FloatArray:
-    """Parse rows into `row` x `column`; none left gives an empty array."""
+    """Return rows as `row` x `column`, without rows an empty array."""
     held = list(lines)
     if not held:
         return np.empty((0, len(columns)))

@@ -1,4 +1,4 @@
-"""The named fields that `.npz` and `.mat` recordings share, from raw arrays to a `Recording`."""
+"""The fields of `.npz` and `.mat` recordings: from named arrays to a `Recording`."""
 
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -9,20 +9,20 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.pulses.detection import counter_pulses
 from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
 
-MAX_SAMPLE_BYTES = 1 << 40
-MAX_PULSE_BYTES = 8 * MAX_PULSES
+_MAX_SAMPLE_BYTES = 1 << 40
+_MAX_PULSE_BYTES = 8 * MAX_PULSES
 MAX_FIELD_BYTES = 1 << 20
 
 RawArray = NDArray[Any]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
-PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
+_PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
 
 
 def size_limit(name: str) -> int:
     """Return the largest size in bytes that the field `name` may have in a file."""
     if name in SAMPLE_FIELDS:
-        return MAX_SAMPLE_BYTES
-    return MAX_PULSE_BYTES if name in PULSE_FIELDS else MAX_FIELD_BYTES
+        return _MAX_SAMPLE_BYTES
+    return _MAX_PULSE_BYTES if name in _PULSE_FIELDS else MAX_FIELD_BYTES
 
 
 def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray], *,
@@ -30,14 +30,14 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     """
     Build a recording from named arrays.
 
-    A two-dimensional `tach` has a row for every row of `vibration`: then each row is a separate
-    acquisition, and `acquisition` picks one. `tach_count`, a revolution counter sampled at
-    `tach_rate`, stands for as many pulses as it increases by.
+    If `tach` has several rows, one for every row of `vibration`, each row is a separate
+    acquisition, and `acquisition` selects one. `tach_count` is a revolution counter sampled at
+    `tach_rate`; each increase by 1 is a pulse.
 
     Parameters
     ----------
     names
-        The fields that the file holds; unknown ones are ignored.
+        The fields of the file; unknown ones are ignored.
     load
         Returns the array of a name.
     acquisition
@@ -50,10 +50,18 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     RecordingError
         If a needed field is missing or one has the wrong type, shape or value.
 
+    Examples
+    --------
+    >>> arrays = {'vibration': np.zeros((2, 1000)), 'tach_count': np.arange(1000) // 40}
+    >>> recording = recording_from_fields(arrays, arrays.__getitem__, acquisition=0,
+    ...                                   given={'sample_rate': 1e3, 'tach_rate': 1e3})
+    >>> recording.channels, recording.pulse_times[:3]
+    (2, array([0.04, 0.08, 0.12]))
+
     """
     if 'vibration' not in names:
         raise RecordingError(
-            f'no vibration among {sorted(names)}: needs vibration (channel x sample)')
+            f'no vibration among the fields {sorted(names)}: add vibration, channel x sample')
     if 'sample_rate' not in {*names, *given}:
         raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz to the '
                              'file, or give sample_rate')
@@ -71,7 +79,7 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
         acquisitions = len(tach)
     if not 0 <= acquisition < acquisitions:
         raise RecordingError(
-            f'acquisition {acquisition}: the file holds {acquisitions}, numbered from 0')
+            f'acquisition {acquisition}: the file has {acquisitions}, numbered from 0')
     if acquisitions > 1:
         row = slice(acquisition, acquisition + 1)
         vibration, tach = vibration[row], None if tach is None else tach[row]
@@ -95,7 +103,7 @@ def converted_fields(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _real(name: str, array: RawArray) -> RawArray:
     if array.dtype.kind not in 'fiub':
-        raise RecordingError(f'{name} of type {array.dtype}: must be real numbers')
+        raise RecordingError(f'{name} of type {array.dtype}: give real numbers')
     return array
 
 
@@ -104,7 +112,7 @@ def _samples(name: str, array: RawArray) -> RawArray:
     if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 1):
         array = array.reshape(1, -1)
     if array.ndim != 2:
-        raise RecordingError(f'{name} of shape {array.shape}: must be channel x sample')
+        raise RecordingError(f'{name} of shape {array.shape}: give channel x sample')
     if array.shape[0] > array.shape[1]:
         raise RecordingError(
             f'{name} of shape {array.shape}: more channels than samples; store channel x sample '
@@ -114,20 +122,20 @@ def _samples(name: str, array: RawArray) -> RawArray:
 
 def _vector(name: str, array: RawArray) -> FloatArray:
     if array.size != max(array.shape, default=1):
-        raise RecordingError(f'{name} of shape {array.shape}: must be one row of numbers')
+        raise RecordingError(f'{name} of shape {array.shape}: give one row of numbers')
     return np.array(_real(name, array), dtype=np.float64).reshape(-1)
 
 
 def _number(name: str, array: RawArray) -> float:
     if array.size != 1:
-        raise RecordingError(f'{name} of shape {array.shape}: must be a single number')
+        raise RecordingError(f'{name} of shape {array.shape}: give a single number')
     return float(_real(name, array).reshape(-1)[0])
 
 
 def _count(name: str, array: RawArray) -> int:
     value = _number(name, array)
     if not (value == np.floor(value) and 1 <= value < 2**31):
-        raise RecordingError(f'{name} {value}: must be a whole number, at least 1')
+        raise RecordingError(f'{name} {value}: give a whole number, at least 1')
     return int(value)
 
 
@@ -135,26 +143,28 @@ def _strings(name: str, array: RawArray) -> tuple[str, ...]:
     if array.dtype.kind == 'S':
         array = np.char.decode(array, 'utf-8', 'replace')
     if array.dtype.kind != 'U':
-        raise RecordingError(f'{name} of type {array.dtype}: must be text')
+        raise RecordingError(f'{name} of type {array.dtype}: give text')
     return tuple(item.strip() for item in array.reshape(-1).tolist())
 
 
 def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatArray:
-    """Pulse times (s) of a revolution counter; where it falls it was reset."""
+    """Return the pulse times (s) of a revolution counter; a decrease is a reset."""
     values = _samples('tach_count', counter)
     if len(values) != 1:
-        raise RecordingError(f'tach_count of shape {counter.shape}: must be one row')
+        raise RecordingError(f'tach_count of shape {counter.shape}: give one row')
     counts = values[0].astype(np.float64)
     if not np.all((counts == np.floor(counts)) & (abs(counts) < 2.0**53)):
-        raise RecordingError('tach_count holds fractions, NaN or more than 2^53: must be counts')
+        raise RecordingError('tach_count contains fractions, NaN or values above 2^53: give '
+                             'counts')
     rises = np.maximum(np.diff(counts), 0.0)
     if rises.sum() > MAX_PULSES:
-        raise RecordingError(f'tach_count counts {rises.sum():.0f} pulses: at most {MAX_PULSES}')
+        raise RecordingError(f'tach_count counts {rises.sum():.0f} pulses: at most {MAX_PULSES} '
+                             'are read; split the recording')
     return counter_pulses(np.append(0.0, np.cumsum(rises)).astype(np.int64),
                           start_time=start_time, sample_rate=rate)
 
 
-# The fields that are not samples, each with what makes a value of `Recording` from its array.
+# The fields that are not samples, each with its conversion from an array.
 CONVERTED: Mapping[str, Callable[[str, RawArray], Any]] = {
     'sample_rate': _number, 'tach_rate': _number, 'start_time': _number, 'ratio': _number,
     'pulses_per_revolution': _count, 'pulses_per_trigger': _count,

@@ -1,13 +1,13 @@
 """
-Limits of what is taken in, live or from a file.
+Limits of input values, from messages or files, and of the unpacked size of files.
 
-No machine has times, rates or samples beyond them: their squares, products and periods would
-overflow. A file that unpacks to far more than it holds is no measurement either.
+Times, rates and samples beyond the limits do not occur on machines, and their squares, products
+and periods would overflow. A file that unpacks to far more than its size is not a measurement.
 
-How large a compressed bag becomes is found without unpacking it. Chunks of an MCAP file (its
-specification, "Records") and whole files may be compressed with zstd (RFC 8878, section 3.1.1),
-whose blocks hold at most 128 kB each, so that counting blocks bounds what they unpack to, whatever
-sizes are stated. (LZ4 cannot inflate more than 255-fold.)
+The unpacked size of a compressed bag is limited without unpacking it. Chunks of an MCAP file (its
+specification, "Records") and whole files may be compressed with zstd (RFC 8878, section 3.1.1).
+A zstd block holds at most 128 kB, so that the number of blocks limits the unpacked size, whatever
+sizes the file states. (LZ4 unpacks to 255 times its size at most.)
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 MAX_TIME = 1e15  # s, as 30 million years
 MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
-MAX_INFLATION = 200  # size over packed size; of measured signals it is below 10
+MAX_INFLATION = 200  # unpacked over packed size; of measured signals it is below 10
 _BLOCK = 1 << 17
 _MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50
 _REPEATED, _COMPRESSED = 1, 2
@@ -43,12 +43,12 @@ def check_times(name: str, times: float | FloatArray, error: type[SaJitterError]
     values = np.atleast_1d(times)
     wrong = values[np.isfinite(values) & (np.abs(values) > MAX_TIME)]
     if wrong.size:
-        raise error(f'{name} is {wrong[0]} s: must be within {MAX_TIME:g} s of 0; count seconds '
-                    'from the start of the measurement or of the epoch')
+        raise error(f'{name} is {wrong[0]} s: must be within {MAX_TIME:g} s of 0; give seconds '
+                    'since the start of the measurement or since 1970')
 
 
 def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
-    """Raise `error` for finite samples beyond the limits; NaN and infinity are a gap."""
+    """Raise `error` for finite samples beyond the limit; NaN and infinity are a gap."""
     if not samples.size:
         return
     peak = max(float(samples.max()), -float(samples.min()))
@@ -56,12 +56,12 @@ def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
         return
     wrong = samples[np.isfinite(samples) & (np.abs(samples) > MAX_SAMPLE)]  # NaN has no order
     if wrong.size:
-        raise error(f'sample of {wrong[0]}: must be within {MAX_SAMPLE:g} of 0; send it in the '
-                    'unit of the sensor')
+        raise error(f'sample of {wrong[0]}: must be within {MAX_SAMPLE:g} of 0; check the '
+                    'unit and the scale')
 
 
 def check_inflation(name: str, packed: int, size: int, remedy: str) -> None:
-    """Raise RecordingError if so many `packed` bytes unpack to a `size` that no signal has."""
+    """Raise RecordingError if `packed` bytes unpack to a `size` that no measurement has."""
     if size > max(IN_MEMORY_BYTES, MAX_INFLATION * packed):
         raise RecordingError(f'{name}: {packed} bytes unpack to {size}, more than '
                              f'{MAX_INFLATION} times as many, which no measured signal does: '
@@ -69,7 +69,7 @@ def check_inflation(name: str, packed: int, size: int, remedy: str) -> None:
 
 
 def check_bag(path: Path) -> None:
-    """Raise RecordingError if a bag's file or folder holds what unpacks to far more."""
+    """Raise RecordingError if a file of a bag unpacks to a size that no measurement has."""
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if file.suffix == '.mcap':
             with open(file, 'rb') as stream:
@@ -86,9 +86,9 @@ def _unpack(stream: BinaryIO, layout: str) -> tuple[int, ...]:
 
 def _zstd_chunks(stream: BinaryIO) -> Iterator[tuple[int, int]]:
     """
-    Iterate over places and sizes of the data of an MCAP file's zstd chunks.
+    Iterate over positions and sizes of the zstd chunks in an MCAP file.
 
-    The summary must name these chunks and no others: a reader goes by the summary.
+    The summary must list no other chunks, because a reader uses the summary.
     """
     places, chunks, named, summary = set(), set(), set(), 0
     stream.seek(8)
@@ -113,11 +113,12 @@ def _zstd_chunks(stream: BinaryIO) -> Iterator[tuple[int, int]]:
             summary, = _unpack(stream, '<Q')
         stream.seek(start + size)
     if not named <= chunks or summary not in places | {0}:
-        raise RecordingError('the summary names chunks that are not there: it is broken')
+        raise RecordingError('the summary lists chunks that do not exist: the file is broken; '
+                             'recover it with mcap recover')
 
 
 def _check_zstd(stream: BinaryIO, start: int, stop: int) -> None:
-    """Raise RecordingError if the zstd frames from `start` to `stop` may inflate too much."""
+    """Raise RecordingError if the zstd frames from `start` to `stop` may unpack to too much."""
     total, at = 0, start
     while at < stop:
         stream.seek(at)
@@ -126,7 +127,7 @@ def _check_zstd(stream: BinaryIO, start: int, stop: int) -> None:
             at += 8 + _unpack(stream, '<I')[0]
             continue
         if magic != _MAGIC:
-            raise RecordingError(f'byte {at} begins no zstd frame: it is broken')
+            raise RecordingError(f'no zstd frame at byte {at}: the file is broken')
         descriptor, = _unpack(stream, '<B')
         single = descriptor >> 5 & 1
         at += 6 - single + (0, 1, 2, 4)[descriptor & 3] + (single, 2, 4, 8)[descriptor >> 6]

@@ -1,15 +1,14 @@
 """
 Recordings in MATLAB `.mat` files of version 5 to 7, read with bounded memory.
 
-Only what a recording can hold is parsed (numbers, text, cells of text), from a map of the file; a
-compressed variable is unpacked once into an unnamed temporary file. Format: MathWorks, MAT-File
-Format, chapter 1.
+Only numbers, text and cells of text are parsed, from a map of the file. A compressed variable is
+unpacked once into an unnamed temporary file. Format: MathWorks, MAT-File Format, chapter 1.
 
-scipy.io.loadmat is not used because a broken file can end the process: scipy 1.17.1 crashed
-(SIGSEGV) on 39 of 20 000 small files in which one to four places had been overwritten, cut or
-inserted, because it looks up type numbers of a tag without a check. A guard would have to walk all
-tags, also those of compressed variables, and that walk is most of this module. loadmat also holds
-whole variables in memory.
+scipy.io.loadmat is not used for two reasons. A broken file can end the process: scipy 1.17.1
+crashed (SIGSEGV, SIGBUS) on 23 of 4000 small files in which one to four places were overwritten,
+cut or inserted, because it does not check the type numbers of tags. A check in front of it would
+have to walk all tags, also those of compressed variables, and this walk is most of this module.
+Second, loadmat reads whole variables into memory, with no limit of their unpacked size.
 """
 
 from collections.abc import Iterator, Mapping
@@ -42,7 +41,7 @@ _HEAD, _STEP = 4096, 1 << 20
 
 @dataclass(frozen=True)
 class _Element:
-    """A tagged piece of the file: its type and where its bytes lie."""
+    """A tagged piece of the file: its type and the positions of its bytes."""
 
     kind: int
     start: int
@@ -51,7 +50,7 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Matrix:
-    """The head of a variable and where its content starts."""
+    """The head of a variable and the position of its content."""
 
     name: str
     kind: int
@@ -81,7 +80,7 @@ def _byte_order(head: bytes) -> str:
         raise RecordingError("MATLAB version 7.3 (HDF5) is not read; save it with '-v7', or as "
                              '.npz if a variable is larger than 2 GB')
     if len(head) < 128 or head[126:128] not in (b'IM', b'MI'):
-        raise RecordingError("is no MATLAB file of version 5 to 7; save it with '-v7'")
+        raise RecordingError("is not a MATLAB file of version 5 to 7: save it with '-v7'")
     return '<' if head[126:128] == b'IM' else '>'
 
 
@@ -92,7 +91,7 @@ class _Reader:
         self._order = order
 
     def variables(self, whole: Buffer) -> Iterator[tuple[str, RawArray]]:
-        """Iterate over the names and arrays of those variables that belong to a recording."""
+        """Iterate over names and arrays of the variables that are fields of a recording."""
         start = 128
         while start + 8 <= len(whole):
             element = self._element(whole, start, len(whole))
@@ -120,7 +119,7 @@ class _Reader:
             begin = start + 8
         if limit is not None and (begin + size > limit or (begin == start + 4 and size > 4)):
             raise RecordingError(f'an element of {size} bytes at byte {start} does not end inside '
-                                 'the file: it is truncated or broken')
+                                 'the file: the file is truncated or broken; copy it again')
         return _Element(kind, begin, begin + size)
 
     def _after(self, element: _Element, start: int) -> int:
@@ -154,14 +153,14 @@ class _Reader:
         if matrix.kind == _CHAR:
             return self._text(data, matrix)
         if matrix.kind not in _NUMERIC:
-            raise RecordingError(f'{matrix.name}: must be real numbers or text (class '
-                                 f'{matrix.kind} is neither)')
+            raise RecordingError(f'{matrix.name} has class {matrix.kind}: give real '
+                                 'numbers or text')
         part = self._element(data, matrix.content, matrix.stop)
         dtype = np.dtype(self._order + _NUMBERS[part.kind])
         count = prod(matrix.shape)
         if count * dtype.itemsize != part.stop - part.start:
             raise RecordingError(f'{matrix.name} of shape {matrix.shape} does not fit '
-                                 f'{part.stop - part.start} bytes of {dtype}')
+                                 f'{part.stop - part.start} bytes of {dtype}: the file is broken')
         array = np.frombuffer(data, dtype, count, part.start) if count else np.empty(0)
         return array.reshape(matrix.shape, order='F')
 
@@ -172,7 +171,7 @@ class _Reader:
             element = self._element(data, at, matrix.stop)
             cell = self._matrix(data, element)
             if cell.kind != _CHAR:
-                raise RecordingError(f'{matrix.name}: a cell of it is no text')
+                raise RecordingError(f'{matrix.name} has a cell that is not text: give text only')
             yield ''.join(self._text(data, cell).tolist())
             at = self._after(element, at)
 
@@ -206,7 +205,8 @@ def _inflate(whole: Buffer, element: _Element, size: int) -> Buffer:
             left -= len(data)
             spool.write(data)
         if left > 0:
-            raise RecordingError(f'a compressed variable lacks {left} of {size} bytes')
+            raise RecordingError(f'{left} of {size} bytes of a compressed variable are missing: '
+                                 'the file is truncated or broken; copy it again')
         if size > IN_MEMORY_BYTES:
             spool.flush()
             return mmap.mmap(spool.fileno(), 0, access=mmap.ACCESS_READ)

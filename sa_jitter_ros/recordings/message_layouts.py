@@ -1,8 +1,8 @@
 """
-The layouts of the input messages: the one place where they become arrays, live and from bags.
+The layouts of the input messages, which are decoded here to arrays, live and from bags.
 
-Messages are known by their fields alone, so that those of rclpy and those of `rosbags` are
-decoded by the same rules. What does not follow a layout raises `MessageError`.
+Only the fields of a message are used, so that messages of rclpy and of `rosbags` are decoded by
+the same rules. A message with another layout raises `MessageError`.
 """
 
 from collections.abc import Callable
@@ -22,11 +22,16 @@ FLOAT32 = 'std_msgs/Float32MultiArray'
 IMU = 'sensor_msgs/Imu'
 TIME_REFERENCE = 'sensor_msgs/TimeReference'
 INDEX_BASE = 1 << 24  # largest power of two below which every integer is a float32
-_LARGEST = 1 << 32  # elements, of an empty array as well: numpy knows no larger shapes
+_LARGEST = 1 << 32  # elements, also of the shape of an empty array: a limit of numpy
 TIME_TOLERANCE = 0.01  # s; a clock that jumps back by more starts a new run
-LOSS = 0.75  # samples later than the clock that is followed: more than jitter of 0.7 brings
-FOLLOW = 0.05  # share of a deviation that the clock takes over: at 3 % of another rate it lags 0.6
-EVIDENCE = 13.0  # of lateness, in variances: white jitter brings as much once in 1e8 stamps
+# Of `StampCounter`: delay against the clock, in samples, that jitter of 0.7 samples does not
+# cause.
+_LOSS = 0.75
+# Fraction of a deviation by which the clock is corrected: at a rate 3 % off it lags by 0.6
+# samples.
+_FOLLOW = 0.05
+# Sum of delays, in variances, that white jitter causes once in 1e8 stamps.
+_EVIDENCE = 13.0
 
 
 def decode_array(message: Any, labels: tuple[str, ...],
@@ -34,26 +39,33 @@ def decode_array(message: Any, labels: tuple[str, ...],
     """
     Decode a MultiArray.
 
-    Returns header elements, values shaped as the layout says, names of the last dimension.
-    Raises `MessageError` where label, number of dimensions, size or offset do not fit.
+    Returns header elements, values in the shape of the layout, names of the last dimension.
+    Raises `MessageError` if labels, number of dimensions, size or offset do not fit.
+
+    >>> from types import SimpleNamespace as Message
+    >>> dims = [Message(label='channel', size=1), Message(label='sample', size=2)]
+    >>> message = Message(layout=Message(dim=dims, data_offset=1), data=[7.0, 0.1, 0.2])
+    >>> decode_array(message, ('channel', 'sample'), header_size=1)
+    (array([7.]), array([[0.1, 0.2]]), ())
     """
     layout, data = message.layout, np.asarray(message.data)
     got = tuple(dim.label.split(':', 1)[0] for dim in layout.dim)
     if len(got) != len(labels) or any(a not in ('', b) for a, b in zip(got, labels)):
         raise MessageError(f'dimensions {list(got)} received, {list(labels)} expected: '
-                           'label layout.dim as the interface says')
+                           'label layout.dim with the expected names')
     shape = tuple(dim.size for dim in layout.dim)
     if layout.data_offset != header_size:
         raise MessageError(f'data_offset {layout.data_offset} received, {header_size} expected: '
-                           'put exactly that many header elements in front')
+                           'put exactly that many header elements in front of the array')
     if math.prod(shape) != data.size - header_size or math.prod(filter(None, shape)) > _LARGEST:
         raise MessageError(
             f'layout {"x".join(map(str, shape))} behind {header_size} header elements does not '
-            f'fit {data.size} elements: send the size that the layout says')
+            f'fit {data.size} elements: make layout and data agree')
     label = layout.dim[-1].label if layout.dim else ''
     names = tuple(label.split(':', 1)[1].split(',')) if ':' in label else ()
     if names and len(names) != shape[-1]:
-        raise MessageError(f'{len(names)} names for {shape[-1]} elements in "{label}"')
+        raise MessageError(f'{len(names)} names for {shape[-1]} elements in "{label}": give a '
+                           'name for each element, or none')
     return data[:header_size].astype(np.float64), data[header_size:].reshape(shape), names
 
 
@@ -65,12 +77,17 @@ def whole(name: str, value: float) -> int:
 
 
 def decode_time(seconds: int, nanoseconds: int) -> float:
-    """Seconds of a ROS time; negative `seconds` are legal."""
+    """Return the time (s) of a ROS time; negative `seconds` are allowed."""
     return seconds + 1e-9 * nanoseconds
 
 
 def encode_time(time: float) -> tuple[int, int]:
-    """Seconds and nanoseconds of a ROS time; `MessageError` where its int32 cannot hold it."""
+    """
+    Return seconds and nanoseconds of a ROS time; `MessageError` beyond the range of its int32.
+
+    >>> encode_time(-0.25), decode_time(-1, 750_000_000)
+    ((-1, 750000000), -0.25)
+    """
     if math.isfinite(time):
         second = math.floor(time)
         carry, nanosecond = divmod(round((time - second) * 1e9), 10**9)
@@ -81,13 +98,13 @@ def encode_time(time: float) -> tuple[int, int]:
 
 
 def decode_pulse_reference(message: Any) -> tuple[FloatArray, str]:
-    """Pulse time (1,) in s and the keyphasor's name."""
+    """Return the pulse time (1,) in s and the name of the keyphasor."""
     stamp = message.time_ref
     return np.array([decode_time(stamp.sec, stamp.nanosec)]), str(message.source)
 
 
 def decode_pulse_array(message: Any) -> FloatArray:
-    """Pulse times (n,) in s."""
+    """Return the pulse times (n,) in s."""
     if not message.layout.dim and message.layout.data_offset == 0:
         times = np.array(message.data, dtype=np.float64)
     else:
@@ -98,13 +115,17 @@ def decode_pulse_array(message: Any) -> FloatArray:
 
 class StampCounter:
     """
-    Counts samples by their stamps; a loss is a lasting step of the stamps by whole samples.
+    Counts samples by their stamps; a lasting step of the stamps by whole samples is a loss.
 
-    The stamps are compared with a clock that follows them slowly, so that a source whose rate is
-    up to 3 % off `sample_rate` (Hz) loses nothing, and neither does jitter of up to 0.7 samples,
-    as the next stamp comes early. Where stamps are steady, a loss is seen at once; where they are
-    noisy, it takes the evidence of some stamps (Page's test), and the gap stands that much later.
-    `restarts` counts jumps back, from which on samples are counted anew.
+    The stamps are compared with a clock that follows them slowly. A rate that differs from
+    `sample_rate` (Hz) by up to 3 % is therefore no loss, and neither is jitter of up to 0.7
+    samples, because the next stamp is early. With steady stamps a loss is found at once. With
+    noisy stamps it takes several stamps (Page's test), and the gap is placed later by as many
+    samples. `restarts` counts jumps back, after which samples are counted from 0 again.
+
+    >>> counter = StampCounter(100.0)
+    >>> [counter.index(time) for time in (0.0, 0.01, 0.02, 0.05, 0.06)]
+    [0, 1, 2, 5, 6]
     """
 
     def __init__(self, sample_rate: float) -> None:
@@ -126,14 +147,14 @@ class StampCounter:
             self.restarts += 1
             self._start(time)
         late = (time - self._expected) * self._rate
-        self._surplus = max(0.0, self._surplus + late - LOSS)
+        self._surplus = max(0.0, self._surplus + late - _LOSS)
         self._doubtful = self._doubtful + 1 if self._surplus else 0
         lost = 0
-        if self._surplus > EVIDENCE * self._variance:
-            lost = max(1, round(LOSS + self._surplus / self._doubtful))
+        if self._surplus > _EVIDENCE * self._variance:
+            lost = max(1, round(_LOSS + self._surplus / self._doubtful))
             self._surplus, self._doubtful = 0.0, 0
-        gain = max(FOLLOW, 1.0 / (self._index + 1.0))
-        # Of differences, as another rate is no noise; with steps, so that bursts are no losses.
+        gain = max(_FOLLOW, 1.0 / (self._index + 1.0))
+        # From differences, so that another rate is no noise; with steps, so that bursts are noise.
         self._variance += gain * (0.5 * (late - self._late)**2 - self._variance)
         late -= lost
         found = self._index + lost
@@ -147,10 +168,10 @@ class SampleDecoder:
     Decode `vibration` or `tach_waveform` messages of one type to `SampleBlock`.
 
     `kind` is `FLOAT64`, `FLOAT32` or `IMU`, `imu_axis` one or more of x, y, z; `sample_rate` (Hz,
-    0 for unknown) and `start_time` (s) serve where the message does not carry them. Messages
-    without header are counted from `start_time`; `counted` tells that this happened. Imu messages
-    are counted by their stamps; `restarts` tells how often these jumped back. Raises
-    `ParameterError` for other axes, `MessageError` on a malformed message.
+    0 for unknown) and `start_time` (s) are used if the message does not contain them. Messages
+    without header are counted from `start_time`; `counted` is True if there were such messages.
+    Imu messages are counted by their stamps; `restarts` is how often these jumped back. Raises
+    `ParameterError` for other axes, `MessageError` for a malformed message.
     """
 
     def __init__(self, kind: str, *, sample_rate: float, start_time: float = 0.0,
@@ -169,11 +190,11 @@ class SampleDecoder:
 
     @property
     def restarts(self) -> int:
-        """How often the stamps of Imu messages jumped back."""
+        """Return how often the stamps of Imu messages jumped back."""
         return self._stamps.restarts
 
     def decode(self, message: Any) -> SampleBlock:
-        """Return the block that a message holds."""
+        """Return the block of samples in a message."""
         block = self._decode(message)
         check_times('time of the first sample', block.start_time, MessageError)
         check_samples(block.samples, MessageError)
@@ -218,23 +239,25 @@ class SampleDecoder:
         time = decode_time(message.header.stamp.sec, message.header.stamp.nanosec)
         vector = message.linear_acceleration
         values = tuple(float(getattr(vector, axis)) for axis in self._axes)
-        if (time, *values) != self._imu_last:  # a repeat keeps its index
+        if (time, *values) != self._imu_last:  # a repeated message keeps its index
             self._imu_index = self._stamps.index(time)
         self._imu_last = time, *values
         return SampleBlock(np.array(values)[:, None], time, rate, self._imu_index)
 
 
 def _samples(message: Any, header_size: int) -> tuple[FloatArray, FloatArray]:
-    """Header and channel x sample array of a vibration or waveform message."""
+    """Return header and channel x sample array of a vibration or waveform message."""
     if message.layout.dim:
         header, values, _ = decode_array(message, ('channel', 'sample'), header_size)
     else:  # an empty layout means one channel
         data = np.asarray(message.data)
         if message.layout.data_offset != header_size:
             raise MessageError(f'data_offset {message.layout.data_offset} received, '
-                               f'{header_size} expected')
+                               f'{header_size} expected: put exactly that many header elements '
+                               'in front of the array')
         if data.size < header_size:
-            raise MessageError(f'{data.size} elements cannot hold {header_size} header elements')
+            raise MessageError(f'{data.size} elements received, at least {header_size} header '
+                               'elements expected: send the header, or data_offset 0')
         header, values = data[:header_size].astype(np.float64), data[header_size:][None, :]
     if values.size == 0:
         raise MessageError(f'empty block of {values.shape[0]} channels x {values.shape[1]} '

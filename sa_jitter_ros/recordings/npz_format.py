@@ -1,8 +1,9 @@
 """
 Recordings in `.npz` files: arrays in a zip archive, read without pickle and with bounded memory.
 
-Large members are not loaded: a stored one is mapped where it lies, a deflated one is unpacked once
-into an unnamed temporary file (in `$TMPDIR`) and mapped there.
+Large members are not loaded: a stored one is mapped in the archive, a compressed one is unpacked
+once into an unnamed temporary file (in `$TMPDIR`) and mapped there. numpy.load cannot do this: it
+ignores `mmap_mode` for archives, and reads a member without a limit of its unpacked size.
 """
 
 from collections.abc import Mapping
@@ -31,8 +32,8 @@ def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any]) -> Recor
     """
     Open an `.npz` recording; fields as in `recording_from_fields`.
 
-    Raises RecordingError if the archive is broken, holds pickled objects or needs more than its
-    fields may have.
+    Raises RecordingError if the archive is broken, contains pickled objects or a field exceeds its
+    limit.
     """
     with recording_errors(path), zipfile.ZipFile(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
@@ -46,7 +47,15 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
     """
     Write a recording as `.npz` with bounded memory; vibration and tach are stored as `dtype`.
 
-    Samples are stored in Fortran order, all channels of a moment together, as they come in.
+    Samples are stored in Fortran order, all channels of a sample together.
+
+    >>> import tempfile
+    >>> from sa_jitter_ros.recordings import ArraySource, read
+    >>> recording = Recording(ArraySource(np.ones((1, 2000))), 1e3, pulse_times=np.arange(2.0))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     write_npz(f'{folder}/rig.npz', recording, dtype=np.float32)
+    ...     read(f'{folder}/rig.npz').samples
+    2000
     """
     fields: dict[str, Any] = {
         'sample_rate': recording.sample_rate, 'tach_rate': recording.tach_rate,
@@ -78,15 +87,15 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
     """Return the array of a member: in memory if small, else mapped from a file."""
     info = archive.getinfo(f'{name}.npy')
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise RecordingError(f'{name}: zip method {info.compress_type} is not read: store or '
-                             'deflate it')
+        raise RecordingError(f'{name}: zip method {info.compress_type} is not supported: save '
+                             'with numpy.savez or numpy.savez_compressed')
     with archive.open(info) as stream:
         shape, fortran, dtype, start = _read_header(stream, name)
         size = prod(shape) * dtype.itemsize
         if start + size != info.file_size:
             raise RecordingError(
-                f'{name}: {shape} of {dtype} needs {size} bytes, the file holds '
-                f'{info.file_size - start}: it is truncated or broken')
+                f'{name}: {shape} of {dtype} needs {size} bytes, the file has '
+                f'{info.file_size - start}: it is truncated or broken; copy it again')
         if size > size_limit(name):
             raise RecordingError(f'{name}: {size} bytes exceed its limit of {size_limit(name)}')
         order: Any = 'F' if fortran else 'C'
@@ -108,7 +117,7 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
 def _read_header(stream: IO[bytes],
                  name: str) -> tuple[tuple[int, ...], bool, np.dtype[Any], int]:
     """Return shape, whether in Fortran order, dtype and length of a `.npy` header."""
-    head = BytesIO(stream.read(_HEADER_BYTES))  # a longer one is no header of plain numbers
+    head = BytesIO(stream.read(_HEADER_BYTES))  # the header of an array of numbers is shorter
     version = npy.read_magic(head)
     if version not in ((1, 0), (2, 0)):
         raise RecordingError(f'{name}: npy version {version} is not supported; save it again')
@@ -117,14 +126,14 @@ def _read_header(stream: IO[bytes],
     stream.seek(head.tell())
     if dtype.hasobject:
         raise RecordingError(
-            f'{name}: holds pickled objects, which are never loaded; save plain numbers or text')
+            f'{name} contains Python objects, which are not loaded: save numbers or text')
     if dtype.itemsize == 0 or any(length < 0 for length in shape):
-        raise RecordingError(f'{name}: {shape} of {dtype} is no array that could be stored')
+        raise RecordingError(f'{name}: an array of shape {shape} and type {dtype} cannot be read')
     return shape, fortran, dtype, head.tell()
 
 
 def _data_offset(path: Path, info: zipfile.ZipInfo) -> int:
-    """Return where a stored member's bytes begin in the archive."""
+    """Return the position of the bytes of a stored member in the archive."""
     with open(path, 'rb') as file:
         file.seek(info.header_offset)
         name_length, extra_length = struct.unpack('<26x2H', file.read(30))

@@ -1,4 +1,4 @@
-"""Recordings of every format are opened here, by `read`."""
+"""Opening a recording of any format: `read`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,32 +30,33 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     path
         `.npz`, `.mat`, `.wav`, `.csv`, `.mcap` or `.db3` file, or a rosbag2 folder.
     acquisition
-        Which one, of a file that holds several (`Recording.acquisitions`), from 0.
+        Number of the acquisition, from 0, in a file with several (`Recording.acquisitions`).
     keyphasor
-        Which one, of a bag that holds several; '' for the first one.
+        Name of the keyphasor, in a bag with several; '' for the first one.
     vibration_channels
         Names, or numbers from 0, of the vibration channels; of a bag also a `/topic`. Empty: all
         channels but the tach.
     tach_channel
-        Name or number of the channel that is the sampled keyphasor waveform; of a bag also a
+        Name or number of the channel with the sampled keyphasor waveform; of a bag also a
         `/topic`.
     time_column
-        Name or number of the column of a `.csv` with the sample times in s; '' for one called
+        Name or number of the column of a `.csv` with the sample times in s; '' for one named
         `time` or `t`.
     fields
-        Values that the file lacks, or that replace the file's, by their names in `Recording`:
-        `sample_rate` (Hz), `start_time` (s), `pulse_times` (s), `reference_pulse_times` (s),
-        `tach_rate` (Hz), `pulses_per_revolution`, `pulses_per_trigger`, `ratio`, `orders`,
-        `channel_names`, `units`, `description`. None stands for the file's value. The times that a
-        `.csv` or a bag holds for its samples are not replaced: `sample_rate` must agree with them.
+        Values that are not in the file, or replace those of the file, by their names in
+        `Recording`: `sample_rate` (Hz), `start_time` (s), `pulse_times` (s),
+        `reference_pulse_times` (s), `tach_rate` (Hz), `pulses_per_revolution`,
+        `pulses_per_trigger`, `ratio`, `orders`, `channel_names`, `units`, `description`. None is
+        the value of the file. The sample times of a `.csv` or a bag are not replaced:
+        `sample_rate` must agree with them.
 
     Raises
     ------
     ParameterError
         If `fields` holds an unknown name.
     RecordingError
-        If the file is missing, broken, unsafe or lacks what a recording needs, in one line that
-        starts with the path.
+        If the file is missing, broken, unsafe or incomplete, in one line that starts with the
+        path.
 
     Examples
     --------
@@ -80,11 +81,11 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
                              str(time_column))
     with recording_errors(path):
         if not path.exists():
-            raise RecordingError('no such file or folder')
+            raise RecordingError('no such file or folder: check the path')
         suffix = 'bag' if path.is_dir() else path.suffix.lower()
         if suffix not in ('bag', *SUFFIXES):
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
-                                 f'{", ".join(SUFFIXES)} or a rosbag2 folder')
+                                 f'{", ".join(SUFFIXES)} or a rosbag2 folder; convert it')
         given = converted_fields({key: value for key, value in fields.items()
                                   if value is not None})
         if suffix in ('.npz', '.mat'):
@@ -99,6 +100,6 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
                 open_bag(path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
                 **given)
         if not 0 <= acquisition < recording.acquisitions:
-            raise RecordingError(f'acquisition {acquisition}: the file holds '
+            raise RecordingError(f'acquisition {acquisition}: the file has '
                                  f'{recording.acquisitions}, numbered from 0')
         return replace(recording, description=recording.description or path.name, path=str(path))

@@ -1,4 +1,9 @@
-"""Recordings in `.wav` files: integer or float samples of any width, read in blocks."""
+"""
+Recordings in `.wav` files: integer or float samples of any width, read in blocks.
+
+scipy.io.wavfile.read is not used because it reads a whole file into memory: its `mmap` supports
+neither 24-bit samples nor a data chunk that was cut short.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -53,14 +58,14 @@ def open_wav(path: Path) -> Recording:
     """
     Open a `.wav` file as vibration of all its channels.
 
-    Units are '1' (of full scale) for integers and unknown for floats. A data chunk cut short, as
-    by a recorder that was switched off, is read up to its end and remarked. Raises RecordingError
-    if the file is broken or its coding is unknown.
+    Units are '1' (of full scale) for integers and unknown for floats. A data chunk that was cut
+    short, as by a power failure of the recorder, is read up to its end, with a remark. Raises
+    RecordingError if the file is broken or its coding is not supported.
     """
     with recording_errors(path), open(path, 'rb') as file:
         form, _, kind = struct.unpack('<4sI4s', file.read(12))
         if form != b'RIFF' or kind != b'WAVE':
-            raise RecordingError('is no RIFF/WAVE file; convert it to .wav or .npz')
+            raise RecordingError('is not a RIFF/WAVE file: convert it to .wav or .npz')
         layout: tuple[int, int, int, int] | None = None
         while len(head := file.read(8)) == 8:
             chunk, size = struct.unpack('<4sI', head)
@@ -72,16 +77,17 @@ def open_wav(path: Path) -> Recording:
             else:
                 file.seek(size + size % 2, 1)
         else:
-            raise RecordingError('has no data chunk')
+            raise RecordingError('has no data chunk: the file is broken or not a recording')
         if layout is None:
-            raise RecordingError('has no fmt chunk before its data')
+            raise RecordingError('has no fmt chunk in front of its data: the file is broken')
         coding, channels, rate, bits = layout
         offset = file.tell()
         available = min(size, os.fstat(file.fileno()).st_size - offset)
         samples = available // (channels * bits // 8)
         source = WavSource(path, offset, channels, samples, bits, coding == _FLOAT)
         remarks = () if available == size else (
-            f'the data chunk should hold {size} bytes and holds {available}: read to its end',)
+            f'the data chunk should have {size} bytes and has {available}: it was read up to its '
+            'end',)
         return Recording(source, float(rate), units=('' if coding == _FLOAT else '1',),
                          remarks=remarks)
 
@@ -93,8 +99,9 @@ def _read_format(data: bytes) -> tuple[int, int, int, int]:
         coding = struct.unpack('<H', data[24:26])[0]
     if bits not in _WIDTHS.get(coding, ()):
         raise RecordingError(
-            f'coding {coding} with {bits} bits is not read: use integers of 8 to 32 or floats of '
-            '32 or 64 bits')
+            f'coding {coding} with {bits} bits is not supported: use integers of 8 to 32 bits or '
+            'floats of 32 or 64 bits')
     if channels == 0 or block != channels * bits // 8:
-        raise RecordingError(f'{channels} channels of {bits} bits do not make {block} bytes')
+        raise RecordingError(f'{channels} channels of {bits} bits are not {block} bytes: the '
+                             'file is broken')
     return coding, channels, rate, bits
