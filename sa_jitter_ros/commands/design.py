@@ -8,6 +8,7 @@ variation keep their limits.
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+import re
 import sys
 from typing import Any
 
@@ -37,7 +38,8 @@ EXAMPLES = """examples:
 _STEPS = (1.0, 2.0, 5.0)
 _KEPT = '#d9ead3'
 _BEST = 5  # numbers of trigger cycles to recommend
-_CHANGES = 25  # points of a curve
+_CHANGES = 81  # points of a curve
+_LABEL_SPACE = 0.47  # farthest distance of a label from the middle, in heights and widths
 _LEAST_SHARE = 1e-6  # drawn for an exact notch, whose share is 0
 
 
@@ -191,7 +193,11 @@ def draw_limits(axes: Axes, found: Design, options: argparse.Namespace) -> None:
         lines = axes.contour(cycles, kilo, grid.variation, levels=levels, colors='tab:blue',
                              linewidths=[_width(level, options.maximum_variation)
                                          for level in levels])
-        axes.clabel(lines, fmt=_percent, fontsize=8)
+        for label in axes.clabel(lines, fmt=_percent, fontsize=8):
+            at = axes.transAxes.inverted().transform(
+                axes.transData.transform(label.get_position()))
+            if np.abs(at - 0.5).max() > _LABEL_SPACE:  # the edge would cut it off
+                label.set_visible(False)
     axes.plot([], [], color='tab:red', linestyle='dashed', label='loss')
     axes.plot([], [], color='tab:blue', label='coefficient of variation')
     axes.fill([], [], color=_KEPT, label='both limits (thick lines) kept')
@@ -252,10 +258,16 @@ def main(args: Sequence[str] | None = None) -> int:
         print(table(found, options))
         draw(found, options).savefig(output)
     except (SaJitterError, OSError) as error:
-        print(f'design: {error}', file=sys.stderr)
+        print(f'design: {with_options(str(error))}', file=sys.stderr)
         return 2
     print(f'\nfigure: {output}')
     return 0
+
+
+def with_options(text: str) -> str:
+    """Return a text with the command's options for the keywords that only code has."""
+    options = {action.dest: action.option_strings[0] for action in make_parser()._actions}
+    return re.sub(r'\b[a-z]+(_[a-z]+)+\b', lambda found: options.get(found[0], found[0]), text)
 
 
 def _percent(level: float) -> str:
