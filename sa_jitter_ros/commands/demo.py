@@ -219,7 +219,7 @@ def main(args: Sequence[str] | None = None) -> int:
                         help='round pulse times up to a clock of this rate, as if the keyphasor '
                         'had been sampled with it')
     parser.add_argument('--live', action='store_true',
-                        help='show all results on a web page while they come, until Ctrl-C')
+                        help='show all results live on a web page, until Ctrl-C')
     parser.add_argument('--output', type=Path, default=Path('out'),
                         help='folder for the figures (out)')
     add_recording_options(parser)

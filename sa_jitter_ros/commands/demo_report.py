@@ -75,7 +75,7 @@ def draw_waveform(plan: Plan, raw: AverageMessage, error: AverageMessage | None,
 
 def draw_orders(plan: Plan, amplitudes: Sequence[AverageMessage],
                 prediction: PredictionMessage | None, path: Path) -> None:
-    """Draw amplitudes of the orders, and their attenuation against the predicted one."""
+    """Draw the amplitudes of the orders, and their measured and predicted attenuation."""
     rows, _ = amplitude_rows(amplitudes)
     figure = Figure(figsize=(9.0, 6.2), layout='constrained')
     top, bottom = figure.subplots(2, 1, sharex=True)

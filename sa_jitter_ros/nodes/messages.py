@@ -1,10 +1,10 @@
 """
-Messages to arrays and back: all that another Python node needs.
+Conversion between messages and arrays, for the nodes of this package and others in Python.
 
-Inputs decode to `SampleBlock` and pulse times, by the layouts of `recordings.message_layouts`,
-which bags share. Results are frozen dataclasses with an `encode_*` and a `decode_*` function
-each; their layouts only this module knows. A message that does not follow the layout raises
-`MessageError`. Arrays are in C order; infinities are never published (NaN instead).
+Inputs are decoded to `SampleBlock` and pulse times; their layouts are those of bags, in
+`recordings.message_layouts`. Each result is a frozen dataclass with an `encode_*` and a `decode_*`
+function; only this module knows their layouts. A message with another layout raises
+`MessageError`. Arrays are in C order; NaN is published instead of infinities.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ PULSE_TYPES: dict[str, type] = {
 
 @dataclass(frozen=True)
 class AverageHeader:
-    """What an average covers; times in s, `mean_trigger_speed` of the tach shaft in Hz."""
+    """Times (s), numbers of cycles and `mean_trigger_speed` (Hz, tach shaft) of an average."""
 
     start_time: float
     end_time: float
@@ -61,7 +61,7 @@ class AverageHeader:
 @dataclass(frozen=True)
 class AverageMessage:
     """
-    One array about one average.
+    One array of results of one average.
 
     `values` is channel x angle for a synchronous average, channel x order x field for order
     amplitudes (`AMPLITUDE_FIELDS`), pulse x field for pulse errors (`PULSE_ERROR_FIELDS`) and
@@ -75,7 +75,7 @@ class AverageMessage:
 
 @dataclass(frozen=True)
 class PredictionMessage:
-    """Statistics of each order, order x `PREDICTION_FIELDS`, and what they hold for."""
+    """Statistics (order, `PREDICTION_FIELDS`), and speed, rate, cycles and ratio they are for."""
 
     values: FloatArray
     trigger_speed: float
@@ -88,7 +88,7 @@ class PredictionMessage:
 
 @dataclass(frozen=True)
 class ResidualMessage:
-    """Observed against predicted, order x `RESIDUAL_FIELDS`, and the summary."""
+    """Observed and predicted attenuation (order, `RESIDUAL_FIELDS`), and their summary."""
 
     values: FloatArray
     acquisitions: int
@@ -98,7 +98,7 @@ class ResidualMessage:
 
 
 def known_type(parameter: str, name: str, types: dict[str, type]) -> str:
-    """Key of `types` for a message type as users write it; raises `ParameterError`."""
+    """Return the key of `types` for a message type, with or without `/msg`."""
     key = name.replace('/msg/', '/')
     if key not in types:
         raise ParameterError(f'{parameter} is {name!r}: give one of {", ".join(types)}')
@@ -107,7 +107,7 @@ def known_type(parameter: str, name: str, types: dict[str, type]) -> str:
 
 def _build(message: ArrayMessage, typecode: str, values: NDArray[np.floating[Any]],
            labels: tuple[str, ...], header: tuple[float, ...]) -> ArrayMessage:
-    """Fill a message with an array whose dimensions are named `labels`, behind its header."""
+    """Return the message filled with header and array, whose dimensions are named `labels`."""
     stride = values.size
     for label, size in zip(labels, values.shape, strict=True):
         message.layout.dim.append(
@@ -122,7 +122,7 @@ def _build(message: ArrayMessage, typecode: str, values: NDArray[np.floating[Any
 
 def encode_array(values: FloatArray, labels: tuple[str, ...],
                  header: tuple[float, ...] = ()) -> Float64MultiArray:
-    """Encode a result: dimensions named `labels`, `header` elements in front, no infinities."""
+    """Encode a result: `header` elements, then the array; infinities become NaN."""
     finite = tuple(item if math.isfinite(item) else math.nan for item in map(float, header))
     values = np.where(np.isinf(values), np.nan, values)
     return _build(Float64MultiArray(), 'd', values, labels, finite)
@@ -149,9 +149,9 @@ decode_pulse_array = message_layouts.decode_pulse_array
 
 def encode_pulse_reference(time: float, source: str) -> TimeReference:
     """
-    Encode one pulse; header.stamp repeats its time so that tools can plot it.
+    Encode one pulse; header.stamp has the same time, for tools that plot it.
 
-    Raises `MessageError` for a time beyond 2^31 s, which the message cannot hold.
+    Raises `MessageError` for a time beyond 2^31 s, which the message cannot represent.
     """
     message = TimeReference(source=source)
     second, nanosecond = message_layouts.encode_time(time)

@@ -5,8 +5,8 @@ Name this module in the `conftest.py` at the top of your tests:
 
     pytest_plugins = ['sa_jitter_ros.nodes.testing']
 
-A test then asks for `ros_graph`, adds nodes to it, captures topics, publishes, and serves the
-callbacks until something has happened:
+A test requests the fixture `ros_graph`, adds nodes to it, captures topics, publishes messages, and
+serves callbacks until a condition is true:
 
     def test_listener(ros_graph):
         ros_graph.add(SynchronousAverager, {'trigger_cycles': 10, 'shaft.orders': [1.0]})
@@ -15,9 +15,9 @@ callbacks until something has happened:
         ros_graph.settle()
         assert len(amplitudes) == 2
 
-The import switches discovery off, so that no test meets another ROS graph, and the checks of
-message fields on. Both must be set before a message package is imported: name the module in
-`conftest.py`, not in a test. For the same reason rclpy is imported where it is used.
+The import of this module disables discovery, so that tests do not find other ROS graphs, and
+enables the checks of message fields. Both must be set before a message package is imported: name
+the module in `conftest.py`, not in a test. For the same reason rclpy is imported where it is used.
 """
 
 from collections import Counter
@@ -38,17 +38,17 @@ os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='OFF', ROS_PYTHON_CHECK_FIELDS='
 for _name in ('ROS_DISCOVERY_SERVER', 'ROS_LOCALHOST_ONLY', 'ROS_STATIC_PEERS'):
     os.environ.pop(_name, None)
 
-_DEPTH = 5000  # messages of a captured topic that may wait: none is lost in a test
-_AHEAD = 50  # messages that `publish` sends before it serves callbacks: fewer than an input queues
-_IDLE_ROUNDS = 40  # without a new message, each of one callback at most, before all is settled
-_DOMAINS = range(1, 101)  # of ROS: on every system their ports are below those given to clients
+_DEPTH = 5000  # messages in the queue of a captured topic: none is lost in a test
+_AHEAD = 50  # messages that `publish` sends before it serves callbacks; inputs queue 200
+_IDLE_ROUNDS = 40  # rounds of one callback without a new message, after which all is settled
+_DOMAINS = range(1, 101)  # ROS domains whose ports are outside the range of clients' ports
 
 
 class Graph:
     """
     Nodes, publishers and captured topics in one context and one single-threaded executor.
 
-    `context` is that of the nodes, `node` the one that publishes and captures.
+    `context` is the context of all nodes; `node` publishes and captures.
     """
 
     def __init__(self) -> None:
@@ -64,11 +64,11 @@ class Graph:
         self._captured: list[list[Any]] = []
         self._listeners = Counter[str]()  # by resolved topic, as the others
         self._handled = Counter[str]()
-        self._expected = Counter[str]()  # of what this graph publishes
+        self._expected = Counter[str]()  # messages published by `publish`
 
     def add(self, node_class: Callable[..., Any], parameters: Mapping[str, Any] | None = None,
             **node_kwargs: Any) -> Any:
-        """Construct a node in this graph with parameters by name; return it."""
+        """Create a node in this graph with parameters by name; return it."""
         from rclpy.parameter import Parameter
         if parameters:
             node_kwargs['parameter_overrides'] = [
@@ -91,7 +91,7 @@ class Graph:
 
     def capture(self, topic: str, kind: type, *, qos: Any = None, latched: bool = False
                 ) -> list[Any]:
-        """Return the list to which each message of a topic will be added, from now on."""
+        """Return a list to which each further message of a topic is added."""
         from rclpy.qos import DurabilityPolicy, QoSProfile
         if qos is None:
             qos = QoSProfile(depth=_DEPTH)
@@ -103,7 +103,7 @@ class Graph:
         return messages
 
     def publisher(self, topic: str, kind: type, *, qos: Any = None) -> Any:
-        """Return the publisher of a topic, made at the first call; default QoS: of an input."""
+        """Return the publisher of a topic; its default quality of service is that of inputs."""
         from sa_jitter_ros.nodes.base import INPUT_QOS
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(kind, topic, qos or INPUT_QOS)
@@ -111,9 +111,9 @@ class Graph:
 
     def publish(self, topic: str, *messages: Any) -> None:
         """
-        Publish messages, once a node of this graph or another subscribes.
+        Publish messages after waiting for a subscriber.
 
-        Many messages never overflow a queue: callbacks are served in between.
+        Callbacks are served in between, so that many messages do not overflow a queue.
         """
         for message in messages:
             publisher = self.publisher(topic, type(message))
@@ -125,10 +125,9 @@ class Graph:
 
     def spin(self, until: Callable[[], object], timeout: float = 60.0) -> bool:
         """
-        Serve callbacks until `until()` is true; return whether it was before `timeout` seconds.
+        Serve callbacks until `until()` is true; return False after `timeout` seconds.
 
-        The timeout ends a test that would hang. Leave it generous: a test must not depend on how
-        fast the machine is.
+        The timeout only ends a test that hangs: no test may depend on the speed of the computer.
         """
         deadline = time.monotonic() + timeout
         while not until():
@@ -138,7 +137,7 @@ class Graph:
         return True
 
     def settle(self) -> None:
-        """Serve callbacks until all that was published, and all results of it, have arrived."""
+        """Serve callbacks until all published messages and their results have arrived."""
         assert self.spin(self._all_handled)
         idle, before = 0, self._arrived()
         while idle < _IDLE_ROUNDS:
@@ -162,7 +161,7 @@ class Graph:
 
 @pytest.fixture
 def ros_graph() -> Iterator[Graph]:
-    """Yield a ROS graph for this test only, without nodes; skip the test where there is no ROS."""
+    """Yield an empty ROS graph for one test; skip the test if ROS is not installed."""
     pytest.importorskip('rclpy')
     graph = Graph()
     yield graph
@@ -171,7 +170,7 @@ def ros_graph() -> Iterator[Graph]:
 
 @pytest.fixture
 def process_environment() -> Iterator[dict[str, str]]:
-    """Yield the environment of processes that meet each other, and nobody else, over DDS."""
+    """Yield an environment in which processes find only each other over DDS."""
     domain, lock = _reserve_domain()
     with lock:
         yield {**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST',
@@ -179,7 +178,7 @@ def process_environment() -> Iterator[dict[str, str]]:
 
 
 def _reserve_domain() -> tuple[int, TextIO]:
-    """Return a ROS domain that nobody on this host uses, and the file that reserves it if open."""
+    """Return an unused ROS domain, and the open file that reserves it."""
     for domain in random.sample(_DOMAINS, len(_DOMAINS)):
         with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             lock = Path(tempfile.gettempdir(), f'sa_jitter_ros_domain_{domain}').open('w')
