@@ -1,4 +1,4 @@
-"""Fixtures that all tests share; those of nodes are the package's own, as its users have them."""
+"""Fixtures of all tests; those of nodes are the ones that the package gives its users."""
 
 import atexit
 import os

@@ -49,13 +49,13 @@ def test_amplitudes_come_back_and_errors_are_found(ratio, law):
         wanted = scale * np.array([AMPLITUDES[order] for order in ORDERS])
         # the noise of an amplitude, and what errors that are not known exactly leave of it
         errors = np.array([true[time] for time in average.pulses.tolist()])
-        left = correction.pulse_errors - (errors - errors.mean())
-        angle = 2.0 * np.pi * np.array(ORDERS) * ratio * SPEED * left.std()
+        remaining = correction.pulse_errors - (errors - errors.mean())
+        angle = 2.0 * np.pi * np.array(ORDERS) * ratio * SPEED * remaining.std()
         np.testing.assert_array_less(
             np.abs(np.abs(correction.amplitudes) - wanted),
             4.0 * correction.noise + wanted * angle**2 + 1e-3)
         np.testing.assert_array_less(np.abs(average.amplitudes), wanted * 1.01)
-        assert left.std() < 0.1 / CLOCK
+        assert remaining.std() < 0.1 / CLOCK
         np.testing.assert_allclose(
             correction.attenuation,
             np.abs(average.amplitudes) / np.abs(correction.amplitudes))
@@ -90,7 +90,7 @@ def test_order_whose_phase_the_errors_do_not_tell_is_not_corrected():
                                       np.isnan(correction.amplitudes))
 
 
-def test_noise_alone_is_left_as_it_is():
+def test_noise_alone_is_not_changed():
     machine = gearbox(1.0, noise=1.0, harmonics=(0.0, 0.0))
     for average in averages_of(machine):
         correction = average.correction
@@ -123,7 +123,7 @@ def test_a_declared_order_that_is_no_integer_tells_the_errors(rng):
 @pytest.mark.parametrize('amplitude', [1.0, 2.0])
 def test_errors_that_follow_another_shafts_order_are_refused(rng, amplitude):
     """
-    Order 12.04 is not told from 12 by six cycles.
+    Six cycles do not separate order 12.04 from order 12.
 
     A displaced pulse, far beyond the declared jitter, leaves no other order to recover from.
     """

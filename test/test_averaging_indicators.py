@@ -28,7 +28,7 @@ def gaussian_moment(order, degrees):
 
 class TestLines:
 
-    def test_mesh_shaft_and_sidebands_are_told_apart(self):
+    def test_mesh_shaft_and_sidebands_are_separated(self):
         lines = gear_lines(GearSettings([10], sidebands=2, shaft_harmonics=2), 64)
         assert np.flatnonzero(lines.mesh).tolist() == [10, 20, 30]
         assert np.flatnonzero(lines.shaft).tolist() == [0, 1, 2]

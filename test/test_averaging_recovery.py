@@ -68,9 +68,9 @@ def test_gear_mesh_is_restored_at_the_widths_that_hide_it(rng, width, snr_db):
     np.testing.assert_array_equal(found.orders, [19.0, 38.0])
     # standard error of an amplitude: noise sqrt(2 / samples), plus what the errors leave of it
     tolerance = 4.0 * noise * np.sqrt(2.0 / cycles.shape[0] / cycles.shape[1])
-    left = (2.0 * np.pi * found.orders * SPEED * np.median(found.standard_errors)) ** 2
+    remaining = (2.0 * np.pi * found.orders * SPEED * np.median(found.standard_errors)) ** 2
     np.testing.assert_array_less(np.abs(np.abs(found.amplitudes[0]) - [1.0, 0.5]),
-                                 tolerance + left)
+                                 tolerance + remaining)
     after = np.std(found.errors - errors)
     assert after < 4e-6
     assert after < 0.06 * np.std(errors)
@@ -234,7 +234,7 @@ def test_a_known_order_of_another_shaft_helps_and_does_not_disturb(rng):
     assert np.mean(z_scores(recovery, errors) ** 2) < 1.0 + 4.0 * np.sqrt(2.0 / errors.size)
 
 
-def test_speed_ripple_inside_the_cycle_is_told_from_pulse_errors(rng):
+def test_speed_ripple_inside_the_cycle_is_separated_from_pulse_errors(rng):
     errors = jitter(rng, 0.2)
     ripple = 4.0 * declared(0.2) * rng.standard_normal(100)
     cycles, pulses = simulate(rng, errors, MESH, samples=1024, noise=0.1, ripple=ripple)

@@ -108,7 +108,7 @@ def test_exponential_mean_has_the_noise_of_as_many_equal_weights(rng):
     assert np.mean(np.square(errors)) * cycles == pytest.approx(1.0, abs=0.06)
 
 
-def test_exponential_mean_begins_as_the_plain_one():
+def test_exponential_mean_begins_as_the_ordinary_mean():
     values = [1.0, 2.0, 6.0, -3.0]
     mean = filled(ExponentialMean(20.0), values)
     assert mean.mean[0] == pytest.approx(np.mean(values))

@@ -475,14 +475,14 @@ def test_kinds_of_average_weigh_the_cycles_as_they_say(cycles, rng):
 # --- gaps, restarts ------------------------------------------------------------------------------
 
 
-def check(machine, found, *, orders, trigger_cycles, seen=()):
-    """Check every average against the cycles it claims; `seen` are spans (s) that were lost."""
+def check(machine, found, *, orders, trigger_cycles, lost_spans=()):
+    """Check every average against the cycles it claims; `lost_spans` (s) have no samples."""
     for _, average in found:
         assert len(average.pulses) == trigger_cycles + 1
         np.testing.assert_allclose(np.diff(average.pulses), 1.0 / machine.speed, rtol=1e-6)
         truth = machine.amplitudes(average.pulses, orders, angle=average.first_angle)
         np.testing.assert_allclose(average.amplitudes[0], truth, atol=3e-4)
-        for start, end in seen:
+        for start, end in lost_spans:
             assert average.end_time <= start or average.start_time >= end
 
 
@@ -515,7 +515,7 @@ def test_fault_costs_its_cycles_and_nothing_else(fault, lag):
             else:
                 found += target.add_samples(blocks[step])
     lost = (1.50, 1.55) if fault not in ('nan', 'infinite') else (1.5233, 1.5236)
-    check(machine, found, orders=(1.0, 7.0, 23.0), trigger_cycles=8, seen=[lost])
+    check(machine, found, orders=(1.0, 7.0, 23.0), trigger_cycles=8, lost_spans=[lost])
     assert 14 <= len(found) <= 16
     assert 1 <= target.counts.cycles_dropped <= 3
     assert target.counts.averages_dropped <= 1
@@ -786,7 +786,7 @@ def test_pulses_of_a_run_stay_with_it_in_a_gap_and_behind_its_end_though_the_nex
         target.add_samples(new.block(index, 1280, start=1.5))
     found = target.add_pulses(old.pulses(2.0))
     assert len(found) > 20
-    check(old, found, orders=(1.0,), trigger_cycles=2, seen=[(1.4, 1.6), (1.9, 9.0)])
+    check(old, found, orders=(1.0,), trigger_cycles=2, lost_spans=[(1.4, 1.6), (1.9, 9.0)])
     later = [item for pulse in new.pulses(3.0, 1.5) for item in target.add_pulses([pulse])]
     assert len(later) > 40
     for _, average in later:

@@ -14,7 +14,7 @@ RATE = 1000.0
 
 
 def block(index, count, *, time=None, rate=RATE, channels=1, base=0.0):
-    """Return a block whose samples are their own index, plus `base`, in every channel."""
+    """Return a block whose samples are their index plus `base`, in every channel."""
     samples = np.tile(base + np.arange(index, index + count, dtype=float), (channels, 1))
     return SampleBlock(samples, index / rate if time is None else time, rate, index)
 

@@ -95,7 +95,7 @@ def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environm
 
 
 @pytest.mark.processes
-def test_demo_plays_a_wav_whose_tach_channel_it_is_told(machine, process_environment, tmp_path):
+def test_demo_plays_a_wav_whose_tach_channel_is_given(machine, process_environment, tmp_path):
     count = round(RATE * SECONDS)
     turns = np.interp(np.arange(count) / RATE, machine.pulses(0.0, SECONDS).times,
                       np.arange(len(machine.pulses(0.0, SECONDS).times)), left=-1.0)

@@ -84,17 +84,17 @@ def test_interfering_components_and_detection_are_in_table_and_figure(tmp_path, 
     assert settings(text) == (found.keyphasor_rate, found.trigger_cycles)
     assert '-5 % detected' in text
     np.testing.assert_allclose(rows(text)[:, 3], found.detection, atol=6e-5)
-    left = found.leakage
+    leakage = found.leakage
     printed = re.findall(
         r'^(order 18.6886|50 Hz .*\)|1850 Hz .*\)) +([\d.]+) +([\d.]+) +([\d.]+)$', text,
         re.MULTILINE)
     np.testing.assert_allclose(np.array([line[1:] for line in printed], float),
-                               np.column_stack([left.share, left.waveform_share]), atol=6e-6)
+                               np.column_stack([leakage.share, leakage.waveform_share]), atol=6e-6)
     table = text.split('with the smallest shares')[1]
     best, shares = (np.array(re.search(rf'^{name} +(.*)$', table, re.MULTILINE)[1].split(), float)
                     for name in ('trigger cycles', 'largest share'))
-    assert best.tolist() == left.best(5).tolist()
-    np.testing.assert_allclose(shares, [left.largest_share[count - left.candidates[0]]
+    assert best.tolist() == leakage.best(5).tolist()
+    np.testing.assert_allclose(shares, [leakage.largest_share[count - leakage.candidates[0]]
                                         for count in best.astype(int)], atol=6e-6)
     assert sizes[1] > 1.3 * sizes[0]
 

@@ -94,9 +94,9 @@ def test_no_effect_is_the_prediction_itself():
     ('additive_noise', {}), ('interfering_tone', {})])
 def test_effects_of_no_size_leave_the_prediction_as_it_is(name, values, cycles):
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
-    plain, after = predict(model), predict(model, [make_effect(name, **values)])
+    declared, after = predict(model), predict(model, [make_effect(name, **values)])
     for figure in ('mean_attenuation', 'standard_deviation', 'quantile_05', 'quantile_95'):
-        np.testing.assert_array_equal(getattr(after, figure), getattr(plain, figure))
+        np.testing.assert_array_equal(getattr(after, figure), getattr(declared, figure))
 
 
 def test_excess_jitter_is_independent_normal(rng):
@@ -196,9 +196,9 @@ def test_pulses_without_those_beside_are_the_same_pulses(before, after):
     missing = np.array([0, 1, 0, 2, 0, 0, 0, 0, 1])
     pulses = Pulses(0.04 * np.arange(10.0), 3, np.arange(10.0), missing)
     kept = pulses.without(before, after)
-    own = slice(before, 10 - after)
+    kept_pulses = slice(before, 10 - after)
     for name in ('times', 'errors', 'index'):
-        np.testing.assert_array_equal(getattr(kept, name), getattr(pulses, name)[own])
+        np.testing.assert_array_equal(getattr(kept, name), getattr(pulses, name)[kept_pulses])
     np.testing.assert_array_equal(np.diff(kept.index), 1 + kept.missing)
 
 
@@ -322,29 +322,30 @@ def test_known_errors_of_too_many_orders_and_cycles_are_refused():
 
 def test_interpolation_loss_is_the_gain_of_the_interpolator():
     ratio = np.array(MODEL.orders) * 25.0 / 20_000.0
-    plain = predict(MODEL).moments.mean
+    declared = predict(MODEL).moments.mean
     for method, gain in (('linear', np.sinc(ratio) ** 2),
                          ('spline', 3.0 * np.sinc(ratio) ** 4 / (2.0 + np.cos(
                              2.0 * np.pi * ratio)))):
         prediction = predict(MODEL, [make_effect('interpolation_loss', method=method)])
-        assert np.abs(prediction.moments.mean / plain) == pytest.approx(gain, abs=1e-4)
+        assert np.abs(prediction.moments.mean / declared) == pytest.approx(gain, abs=1e-4)
 
 
 def test_noise_and_tone_add_their_power():
-    plain = predict(MODEL).moments.mean_square
+    declared = predict(MODEL).moments.mean_square
     noisy = predict(MODEL, [make_effect('additive_noise', std=1.0)]).moments.mean_square
-    assert noisy - plain == pytest.approx(4.0 / (20_000.0 * 0.8))
+    assert noisy - declared == pytest.approx(4.0 / (20_000.0 * 0.8))
     tone = make_effect('interfering_tone', frequency=250.5, amplitude=0.2)
-    added = predict(MODEL, [tone]).moments.mean_square - plain
+    added = predict(MODEL, [tone]).moments.mean_square - declared
     assert added[0] == pytest.approx(0.04 * np.sinc(0.5 * 0.8) ** 2, rel=1e-2)
     assert np.all(added[1:] < 1e-3 * added[0])
 
 
 def test_modulation_leaves_the_mean_and_widens_all_orders_alike():
-    plain = predict(MODEL)
+    declared = predict(MODEL)
     after = predict(MODEL, [make_effect('amplitude_modulation', std=0.2)])
-    assert after.moments.mean == pytest.approx(plain.moments.mean)
-    spread = np.sqrt(after.moments.variance - plain.moments.variance) / np.abs(after.moments.mean)
+    assert after.moments.mean == pytest.approx(declared.moments.mean)
+    spread = (np.sqrt(after.moments.variance - declared.moments.variance)
+              / np.abs(after.moments.mean))
     assert spread == pytest.approx(np.full(3, spread[0]), rel=0.04)
 
 
@@ -427,10 +428,10 @@ def test_grid_of_a_clock_is_found_and_says_the_errors(rng, rate):
     clock = find_clock(times)
     assert clock.rate == pytest.approx(rate, rel=1e-9)
     errors = times - true
-    told = smooth_on_grid(times, rate)
-    left = (errors - told) - np.mean(errors - told)
-    assert left.std() < 0.6 * errors.std()  # a whole number of ticks a period tells least
-    assert np.all(np.abs(told) <= 0.5 / rate * (1.0 + 1e-6))
+    smooth = smooth_on_grid(times, rate)
+    remaining = (errors - smooth) - np.mean(errors - smooth)
+    assert remaining.std() < 0.6 * errors.std()  # worst with a whole number of ticks a period
+    assert np.all(np.abs(smooth) <= 0.5 / rate * (1.0 + 1e-6))
 
 
 def test_pulses_on_no_grid_show_none(rng):

@@ -92,17 +92,17 @@ def test_lines_that_beat_otherwise_were_not_interpolated(rng):
     assert method(np.stack([np.roll(row, n) for row, n in zip(beat.T, delay)], axis=1)) == ''
 
 
-def test_errors_within_ticks_are_told_from_larger_ones(rng):
+def test_errors_within_ticks_are_separated_from_larger_ones(rng):
     clock = 4000.0
     grid = rng.uniform(-0.5, 0.5, (8, 21)) / clock
-    seen = grid - grid.mean(axis=1, keepdims=True) + rng.normal(0.0, 2e-6, grid.shape)
+    recovered = grid - grid.mean(axis=1, keepdims=True) + rng.normal(0.0, 2e-6, grid.shape)
     small = np.full(grid.shape, 2e-6)
-    assert ticks_leave_room(seen, small, clock)
-    assert not ticks_leave_room(seen + rng.normal(0.0, 0.2 / clock, grid.shape), small, clock)
-    placed, beyond = placed_on_grid(seen[0], clock)
+    assert ticks_leave_room(recovered, small, clock)
+    assert not ticks_leave_room(recovered + rng.normal(0.0, 0.2 / clock, grid.shape), small, clock)
+    placed, beyond = placed_on_grid(recovered[0], clock)
     assert beyond < 0.02 / clock
     assert np.abs(placed).max() < 0.54 / clock
-    slipped = seen[0] + np.where(np.arange(21) == 7, 2.0 / clock, 0.0)
+    slipped = recovered[0] + np.where(np.arange(21) == 7, 2.0 / clock, 0.0)
     assert np.abs(on_grid(slipped, clock)).max() < 0.75 / clock
 
 

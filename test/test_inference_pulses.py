@@ -46,7 +46,7 @@ def validated(times, marks):
 
 
 @pytest.mark.parametrize('marks', [1, 4])
-def test_spurious_pulses_are_dropped_and_their_cycles_left_out(rng, marks):
+def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
     """Wherever in its interval, of a target with uneven marks and beside lost pulses."""
     late = np.resize([0.0, 0.06, -0.05, 0.02][:marks], 1200)
     true = (np.arange(1200) + late + rng.normal(0.0, 0.01, 1200)) * 0.04 / marks
@@ -188,11 +188,11 @@ def test_gap_turns_by_whole_cycles_whatever_the_speed():
     effect = make_effect('missing_pulses', probability=0.02)
     found = []
     for share in (1.0, 1.0004):
-        seen = observe(lost, MODEL)
-        seen = replace(seen, model=replace(seen.model, trigger_speed=(
-            share * seen.model.trigger_speed)))
-        bench = make_bench(seen, [seen], [lost], ())
-        found.append(bench.expect([effect], range(len(seen.acquisitions))).attenuation)
+        observation = observe(lost, MODEL)
+        observation = replace(observation, model=replace(observation.model, trigger_speed=(
+            share * observation.model.trigger_speed)))
+        bench = make_bench(observation, [observation], [lost], ())
+        found.append(bench.expect([effect], range(len(observation.acquisitions))).attenuation)
     np.testing.assert_allclose(found[0], found[1], atol=2e-5)
 
 
@@ -205,6 +205,6 @@ def test_too_few_trigger_cycles_are_named(cycles):
 def test_order_that_is_not_compared_is_named():
     content = report(traced(simulated(), replace(MODEL, orders=(8.0, 13.0, 16.0))))
     assert {item['order'] for item in content['lines']} == {8.0, 16.0}
-    assert any(text.startswith('order 13 was declared and is not compared')
+    assert any(text.startswith('order 13 is declared but not compared')
                for text in content['remarks'])
     assert 'order 13' in summary(content)

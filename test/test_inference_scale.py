@@ -48,7 +48,7 @@ def observation(recording):
 
 
 def drifting(observation, size, rng):
-    """Return an observation whose lines have another load in each acquisition, each its own."""
+    """Return an observation whose lines have different loads in each acquisition."""
     def changed(item):
         gain = 1.0 + size * rng.standard_normal(item.raw.shape)
         return replace(item, raw_cycles=gain * item.raw_cycles, cycles=gain * item.cycles)
@@ -59,7 +59,7 @@ def test_steady_machine_has_no_unsteadiness(recording, observation):
     assert trace([observation], [recording]).unsteadiness == 0.0
 
 
-def test_small_scatter_of_its_own_is_the_machines(recording, observation, rng):
+def test_small_unexplained_scatter_is_unsteadiness(recording, observation, rng):
     size = 0.012
     found = trace([drifting(observation, size, rng)], [recording])
     count = found.level.size * len(observation.acquisitions)
@@ -70,7 +70,7 @@ def test_small_scatter_of_its_own_is_the_machines(recording, observation, rng):
     assert found.after.ks < 1.63 / np.sqrt(count // 2)
 
 
-def test_large_scatter_of_its_own_stays_unexplained(recording, observation, rng):
+def test_large_unexplained_scatter_stays_unexplained(recording, observation, rng):
     found = trace([drifting(observation, 0.08, rng)], [recording])
     assert found.verdict == 'unexplained'
     assert found.findings == ()
@@ -78,7 +78,7 @@ def test_large_scatter_of_its_own_stays_unexplained(recording, observation, rng)
     assert found.after.chi2_per_dof > 5.0
 
 
-def test_little_white_noise_is_told_although_it_is_within_a_machines_own_scatter():
+def test_little_white_noise_is_named_although_the_machine_scatters_as_much():
     noisy = simulated(noise=0.3)
     found = trace([observe(noisy, MODEL)], [noisy])
     effect, = (item.effect for item in found.findings)

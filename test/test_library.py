@@ -21,9 +21,9 @@ def test_the_import_loads_less_than_that_of_numpy():
     count = 'import json, sys\nbefore = set(sys.modules)\n{}\nprint(json.dumps(sorted(' \
             'set(sys.modules) - before)))'
     numpy = in_new_process(count.format('import numpy'))
-    own = in_new_process(count.format('import sa_jitter_ros'))
-    assert len(own) <= 0.3 * len(numpy)
-    assert not {name.partition('.')[0] for name in own} & set(SLOW)
+    package = in_new_process(count.format('import sa_jitter_ros'))
+    assert len(package) <= 0.3 * len(numpy)
+    assert not {name.partition('.')[0] for name in package} & set(SLOW)
 
 
 def test_every_public_name_works_without_ros_and_matplotlib():

@@ -25,7 +25,7 @@ ORDERS = [1.0, 7.0, 23.0]
 
 @pytest.fixture
 def bench(ros_graph):
-    """Return a maker of benches; averages of 10 trigger cycles unless told otherwise."""
+    """Return a maker of benches; averages of 10 trigger cycles unless parameters say otherwise."""
     def make(**options):
         options = {'trigger_cycles': 10, 'shaft__orders': ORDERS, **options}
         return AveragerBench(ros_graph, **options)
@@ -183,7 +183,7 @@ def test_imu_axes_are_channels(bench, rng):
     assert b.status()['clock_deviation'] == 0
 
 
-def test_imu_losses_repeats_and_restarts_are_seen(bench):
+def test_imu_losses_repeats_and_restarts_are_detected(bench):
     machine = Machine(speed=8.0, rate=400.0, components={1.0: (1.0, 0.4)}, channels=1)
     b = bench(vibration_type='sensor_msgs/Imu', sample_rate=400.0, shaft__orders=[1.0])
     samples = [imu(k / 400.0, 0.0, 0.0, value) for k, value in enumerate(

@@ -127,7 +127,7 @@ def test_changes_of_parameters_at_any_time_mix_nothing(ros_graph, rng):
 
 
 def test_the_check_sees_what_is_wrong(ros_graph):
-    """An average of other cycles, phases, samples or counts is told from a true one."""
+    """An average of other cycles, phases, samples or counts is found to be wrong."""
     b = SceneBench(ros_graph, 3)
     scene = b.source.scene(changes=False, faults=False)
     for _, topic, message in scene.events:

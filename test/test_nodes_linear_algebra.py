@@ -27,10 +27,10 @@ print(found, *threads)
 
 def threads(**environment):
     """Return how many libraries were set, and the threads of each, in a process of its own."""
-    plain = {key: value for key, value in os.environ.items()
+    usual = {key: value for key, value in os.environ.items()
              if key not in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')}
     done = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, check=True,
-                          cwd=Path(__file__).parents[1], env={**plain, **environment}, text=True)
+                          cwd=Path(__file__).parents[1], env={**usual, **environment}, text=True)
     found, *counts = map(int, done.stdout.split())
     if not counts:
         pytest.skip('numpy and scipy do not use OpenBLAS here')

@@ -168,7 +168,7 @@ def test_imu_of_a_slightly_other_rate_loses_nothing(source_rate):
     count = 20_000 if abs(source_rate - 1000.0) < 2.0 else 4000  # off by two samples or more
     stamps = 100.0 + np.arange(count) / source_rate
     assert imu_blocks(stamps, rate=1000.0) == list(range(count))
-    if abs(source_rate - 1000.0) <= 10.0:  # and what it does lose is seen
+    if abs(source_rate - 1000.0) <= 10.0:  # and what it does lose is detected
         kept = np.delete(np.arange(3000), [1500, 2000, 2001])
         assert imu_blocks(stamps[kept], rate=1000.0) == kept.tolist()
 
@@ -194,7 +194,7 @@ def test_imu_jitter_is_no_loss(rng, jitter):
     assert imu_blocks(stamps, rate=1000.0) == list(range(20_000))
 
 
-def test_imu_loss_amid_jitter_is_seen_when_it_can_be_told(rng):
+def test_imu_loss_amid_jitter_is_detected_where_it_can_be(rng):
     kept = np.delete(np.arange(3000), range(1500, 1502))
     stamps = 100.0 + (kept + 0.2 * rng.standard_normal(kept.size)) / 1000.0
     indices = np.array(imu_blocks(stamps, rate=1000.0))

@@ -195,10 +195,10 @@ def test_changes_of_one_shaft_and_of_all_and_the_speed_reach_every_shaft(bench):
 
 @pytest.mark.parametrize('prefix', ['', 'output.'])
 def test_one_named_shaft_has_the_topic_of_one(bench, prefix):
-    own = {f'{prefix}{name}': MODEL[name] for name in ('ratio', 'orders')}
+    of_shaft = {f'{prefix}{name}': MODEL[name] for name in ('ratio', 'orders')}
     b = bench({**{name: SHAFTS[name] for name in ('keyphasor_rate', 'trigger_speed',
                                                   'trigger_cycles')},
-               'shafts': ['output'], **own})
+               'shafts': ['output'], **of_shaft})
     np.testing.assert_array_equal(b.latest(1)[0].values, expected())
     assert b.set_parameters(**{f'{prefix}ratio': 2.0}).successful
     np.testing.assert_array_equal(b.latest(2)[0].values, expected(ratio=2.0))

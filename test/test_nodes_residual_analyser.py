@@ -387,7 +387,7 @@ def test_name_of_another_node_is_not_taken_for_the_predictor(bench):
     assert b.reports()[0]['declared']['keyphasor_rate'] == CLOCK
 
 
-def test_effects_reach_the_predictor_and_refusal_is_told(bench, ros_graph):
+def test_effects_reach_the_predictor_and_a_refusal_is_reported(bench, ros_graph):
     predictor = ros_graph.add(JitterPredictor, {
         'keyphasor_rate': CLOCK, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,
         'ratio': RATIO, 'orders': list(MODEL.orders)})

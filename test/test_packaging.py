@@ -27,12 +27,12 @@ ROSDEP_KEYS = {'rosbags': 'python3-rosbags-pip'}
 @pytest.fixture(scope='module')
 def setup():
     """Return what setup.py tells setuptools."""
-    told = {}
+    keywords_of_setup = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(setuptools, 'setup', lambda **keywords: told.update(keywords))
+        patch.setattr(setuptools, 'setup', lambda **keywords: keywords_of_setup.update(keywords))
         patch.chdir(ROOT)
         runpy.run_path('setup.py')
-    return told
+    return keywords_of_setup
 
 
 @pytest.fixture(scope='module')
@@ -55,8 +55,8 @@ def manifest():
 @pytest.fixture(scope='module')
 def packages():
     """Return all packages that are imported and neither ours, nor Python's, nor of tests only."""
-    own = {path.stem for path in MODULES} | {path.parent.name for path in MODULES}
-    return set().union(*map(needs, MODULES)) - own - {'pytest'}
+    modules = {path.stem for path in MODULES} | {path.parent.name for path in MODULES}
+    return set().union(*map(needs, MODULES)) - modules - {'pytest'}
 
 
 def test_manifest_is_of_format_3_for_ament_python(manifest):

@@ -121,14 +121,14 @@ def test_noise_adds_to_the_mean_square_what_one_line_holds():
 @pytest.mark.parametrize('cycles', [3, 41])
 def test_gain_acts_on_the_component_alone_and_noise_adds_to_the_mean_square(cycles):
     model = replace(MODEL, trigger_cycles=cycles)
-    plain = predict(model)
+    usual = predict(model)
     half = predict(model, [Gain(0.5)])
-    np.testing.assert_allclose(half.mean_attenuation, 0.5 * plain.mean_attenuation, rtol=1e-6)
-    np.testing.assert_allclose(half.quantile_05, 0.5 * plain.quantile_05, rtol=1e-5)
+    np.testing.assert_allclose(half.mean_attenuation, 0.5 * usual.mean_attenuation, rtol=1e-6)
+    np.testing.assert_allclose(half.quantile_05, 0.5 * usual.quantile_05, rtol=1e-5)
     turned = predict(model, [Gain(1j)])
-    np.testing.assert_allclose(turned.quantile_95, plain.quantile_95, rtol=1e-6)
+    np.testing.assert_allclose(turned.quantile_95, usual.quantile_95, rtol=1e-6)
     loud = predict(model, [Given(variance=np.array([0.0, 0.1, 0.2]))])
-    np.testing.assert_allclose(loud.moments.mean_square - plain.moments.mean_square,
+    np.testing.assert_allclose(loud.moments.mean_square - usual.moments.mean_square,
                                [0.0, 0.1, 0.2], atol=1e-12)
 
 

@@ -70,15 +70,15 @@ def test_interfering_components_move_the_number_of_cycles_and_never_below_the_li
               'sample_rate': 5e4}
     needed = design(**BENCH, **limits).trigger_cycles
     found = design(**BENCH, **limits, others=[45 / 2.40789], tones=[50.0, 1880.0])
-    left = found.leakage
-    assert needed < found.trigger_cycles == left.trigger_cycles <= 2 * needed + 20
-    assert left.candidates[0] == needed
+    leakage = found.leakage
+    assert needed < found.trigger_cycles == leakage.trigger_cycles <= 2 * needed + 20
+    assert leakage.candidates[0] == needed
     speed = 41.5 * 2.40789
-    np.testing.assert_allclose(left.orders, [45 / 2.40789, 50.0 / speed, 1880.0 / speed])
-    np.testing.assert_array_equal(left.share, order_share(
-        left.orders[:, None], [19.0, 38.0], found.trigger_cycles * 2.40789))
-    at_needed = left.largest_share[0]
-    assert left.share.max() < 0.3 * at_needed
+    np.testing.assert_allclose(leakage.orders, [45 / 2.40789, 50.0 / speed, 1880.0 / speed])
+    np.testing.assert_array_equal(leakage.share, order_share(
+        leakage.orders[:, None], [19.0, 38.0], found.trigger_cycles * 2.40789))
+    at_needed = leakage.largest_share[0]
+    assert leakage.share.max() < 0.3 * at_needed
     assert found.variation.max() <= 0.01
 
 

@@ -166,10 +166,10 @@ def test_clock_skew_alone_is_a_sinc():
 
 def test_known_errors_of_0_change_nothing():
     jitter = [IndependentPulseJitter(EXPONENTIAL)]
-    plain = cycle_moments([0.5, 1.0], jitter).averaged(7)
+    centred = cycle_moments([0.5, 1.0], jitter).averaged(7)
     known = scenario_moments(unit_model(7, 0.5, 1.0), jitter, np.zeros((1, 8)))
     for name in ('mean', 'variance', 'pseudo_variance'):
-        np.testing.assert_allclose(getattr(known, name)[0], getattr(plain, name), atol=1e-13)
+        np.testing.assert_allclose(getattr(known, name)[0], getattr(centred, name), atol=1e-13)
 
 
 def test_noise_in_one_line_of_an_average_in_peak_units(rng):

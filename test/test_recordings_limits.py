@@ -86,7 +86,7 @@ BOMB = frame([(1, 1 << 17, b'\0')] * 1000)  # 4 kB for 128 MB
 
 @pytest.mark.parametrize(('name', 'content'), [
     ('bomb.mcap', mcap(BOMB)), ('bomb.mcap.zstd', BOMB), ('bomb.db3.zstd', BOMB)])
-def test_bombs_are_seen_without_being_unpacked(tmp_path, name, content):
+def test_bombs_are_refused_without_being_unpacked(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RecordingError, match='more than 200 times as many'):
         check_bag(tmp_path)

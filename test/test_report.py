@@ -192,10 +192,10 @@ def test_evidence_follows_the_effect_that_it_convicted(traces):
     trace = traces['traced']
     label = 'with excess_jitter'
     axes = panel(trace, 'trigger_cycle', 'over the trigger cycle')
-    with_effect, seen = curve(axes, label)[1], curve(axes, 'recovered')[1]
+    with_effect, recovered = curve(axes, label)[1], curve(axes, 'recovered')[1]
     # 9 acquisitions of 21 pulses: the RMS of n normal errors is known to 1/sqrt(2n)
-    np.testing.assert_allclose(seen, with_effect, rtol=4.0 / np.sqrt(2.0 * 9 * 21))
-    assert (seen > 2.0 * curve(axes, 'declared model')[1]).all()
+    np.testing.assert_allclose(recovered, with_effect, rtol=4.0 / np.sqrt(2.0 * 9 * 21))
+    assert (recovered > 2.0 * curve(axes, 'declared model')[1]).all()
 
 
 def test_declared_effects_belong_to_the_declared_model(traces):
@@ -210,7 +210,7 @@ def test_declared_effects_belong_to_the_declared_model(traces):
         np.testing.assert_allclose(curve(axes, 'recovered')[1], curve(axes, label)[1], rtol=0.1)
 
 
-def test_target_is_folded_by_its_own_period(traces):
+def test_target_is_folded_by_its_period(traces):
     trace = traces['geometry']
     period = len(trace.findings[0].effect.pulse_angles)
     assert period == 3
@@ -225,8 +225,8 @@ def test_target_is_folded_by_its_own_period(traces):
 
 def test_lattice_panel_names_the_clock_of_the_pulse_times(traces):
     axes = panel(traces['grid'], 'pulse_errors', 'clock of the pulse times, 4000 Hz')
-    imposed, seen = axes.lines[0].get_data()
-    assert np.corrcoef(imposed, seen)[0, 1] > 0.99
+    imposed, recovered = axes.lines[0].get_data()
+    assert np.corrcoef(imposed, recovered)[0, 1] > 0.99
     assert panel(traces['none'], 'pulse_errors', f'declared clock, {CLOCK:g} Hz')
 
 

@@ -225,7 +225,7 @@ def test_bad_input_is_one_line_and_status_2(capsys, arguments, message):
     assert error.count('\n') == 1
 
 
-def test_progress_is_told_on_stderr(capsys):
+def test_progress_goes_to_stderr(capsys):
     progress = stage(reproduce.show(2, 'title'), 1, 2)
     for done in (0.0, 0.5, 0.501, 1.0):
         progress(done)

@@ -109,16 +109,16 @@ def test_prediction_of_the_distribution_holds_for_other_jitters_ratios_and_stron
 
 def test_chunks_seeds_and_progress():
     signal = AveragedSignal(1000, 2.286)
-    seen = []
+    shares = []
     draws = monte_carlo(signal.whole_trigger_cycles, Uniform(0.2), 1000, 1200, seed=7,
-                        progress=seen.append)
+                        progress=shares.append)
     again = monte_carlo(signal.whole_trigger_cycles, Uniform(0.2), 1000, 1200, seed=7)
     other = monte_carlo(signal.whole_trigger_cycles, Uniform(0.2), 1000, 1200, seed=8)
     np.testing.assert_array_equal(draws, again)
     assert np.all(draws != other)
-    assert seen == sorted(seen)
-    assert len(seen) == 3
-    assert seen[-1] == 1.0
+    assert shares == sorted(shares)
+    assert len(shares) == 3
+    assert shares[-1] == 1.0
     assert monte_carlo(signal.whole_trigger_cycles, Uniform(0.2), 1000, 3, seed=7).shape == (3,)
 
 
