@@ -65,7 +65,7 @@ class NodeBench:
                 for key, value in self.diagnostics()[2].items()}
 
     def client(self):
-        """Return a client of the node's parameter services that waits for what it asks."""
+        """Return a client of the node's parameter services that waits for answers."""
         client = AsyncParameterClient(self.graph.node, self.node.get_name())
         assert self.spin(client.services_are_ready)
 
@@ -77,7 +77,7 @@ class NodeBench:
         return ask
 
     def set_parameter(self, name, value):
-        """Set a parameter through its service; return whether that went well, and the reason."""
+        """Set a parameter through its service; return success and the reason of a refusal."""
         result = self.client()('set_parameters', [Parameter(name, value=value)]).results[0]
         return result.successful, result.reason
 

@@ -1,4 +1,4 @@
-"""Fixtures of all tests; those of nodes are the ones that the package gives its users."""
+"""Fixtures of all tests; those of nodes are the fixtures that the package gives its users."""
 
 import atexit
 import os

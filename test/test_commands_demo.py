@@ -1,4 +1,4 @@
-"""The demo as a user meets it: separate processes over DDS, a table and figures."""
+"""The demo as users start it: separate processes over DDS, a table and figures."""
 
 import os
 import re
@@ -20,7 +20,7 @@ CLOCK, RATE, SPEED, SECONDS = 4000.0, 20000.0, 31.7, 6.0
 
 
 def run_demo(environment, *arguments):
-    """Run the demo as a process of its own."""
+    """Run the demo as a separate process."""
     return subprocess.run(
         [sys.executable, '-c',
          'from sa_jitter_ros.commands.demo import main; raise SystemExit(main())', *arguments],
@@ -95,7 +95,7 @@ def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environm
 
 
 @pytest.mark.processes
-def test_demo_plays_a_wav_whose_tach_channel_is_given(machine, process_environment, tmp_path):
+def test_demo_plays_a_wav_with_a_tach_channel(machine, process_environment, tmp_path):
     count = round(RATE * SECONDS)
     turns = np.interp(np.arange(count) / RATE, machine.pulses(0.0, SECONDS).times,
                       np.arange(len(machine.pulses(0.0, SECONDS).times)), left=-1.0)

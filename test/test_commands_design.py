@@ -1,4 +1,4 @@
-"""The command `design`: its table keeps the limits, its figure is a figure, bad input one line."""
+"""The command `design`: its table, its figure, and one line for bad input."""
 
 import os
 from pathlib import Path
@@ -111,7 +111,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('orders', [['0.001'], ['38', '400']])
-def test_the_figure_bears_orders_without_iso_lines_and_pulses_that_could_swap(
+def test_figure_of_orders_without_iso_lines_and_of_pulses_that_could_swap(
         tmp_path, capsys, orders):
     assert design.main(['--orders', *orders, '--trigger-speed', '41.5', '--keyphasor-rate', '100',
                         '--trigger-cycles', '41', '--output', str(tmp_path / 'a.png')]) == 0

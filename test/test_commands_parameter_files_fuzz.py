@@ -1,4 +1,4 @@
-"""Whatever is in a parameter file, the command ends with one line, and nothing of it is run."""
+"""Random parameter files: commands read them or end with one line, and execute nothing."""
 
 from dataclasses import replace
 
@@ -126,7 +126,7 @@ def test_the_last_section_wins_and_names_are_joined(tmp_path):
 
 
 @pytest.mark.parametrize('make', [lambda path: None, lambda path: path.mkdir()])
-def test_what_is_no_file(tmp_path, make):
+def test_path_that_is_no_file(tmp_path, make):
     path = tmp_path / 'model.yaml'
     make(path)
     with pytest.raises(ParameterError, match=r'model\.yaml: (No such file|Is a directory)'):
@@ -188,7 +188,7 @@ def test_shafts_declared_in_both_forms_or_without_names_are_refused(tmp_path, li
         read_declaration(path)
 
 
-def test_what_names_no_shaft_is_unknown(tmp_path):
+def test_parameter_of_no_shaft_is_unknown(tmp_path):
     path = tmp_path / 'model.yaml'
     path.write_text('/**: {ros__parameters: {shafts: [a, b], c.ratio: 2.0, use_sim_time: true}}')
     assert read_declaration(path).unknown == ('c.ratio',)

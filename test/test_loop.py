@@ -1,4 +1,4 @@
-"""The loop as one function: what it takes, what it returns, what it writes."""
+"""The loop off line as a function: its arguments, its result, its files."""
 
 from dataclasses import replace
 import doctest
@@ -76,7 +76,7 @@ def test_written_report_is_the_report(found, tmp_path):
 
 @pytest.mark.machines
 def test_every_shaft_has_its_report(recording, found, tmp_path):
-    """The recording's ratio is that of one of them."""
+    """The ratio of the recording is that of one of the shafts."""
     declared = tmp_path / 'model.yaml'
     declared.write_text("""
 jitter_predictor:
@@ -102,7 +102,7 @@ jitter_predictor:
         close_loop(replace(recording, ratio=3.0), declared)
 
 
-def test_what_cannot_be_used_is_named(recording, tmp_path):
+def test_unusable_input_is_named(recording, tmp_path):
     with pytest.raises(ModelError, match='no recording: give at least one'):
         close_loop([], KEYWORDS)
     with pytest.raises(ModelError, match='pinoin is not a keyword of a declared model'):

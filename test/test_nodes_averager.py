@@ -25,7 +25,7 @@ ORDERS = [1.0, 7.0, 23.0]
 
 @pytest.fixture
 def bench(ros_graph):
-    """Return a maker of benches; averages of 10 trigger cycles unless parameters say otherwise."""
+    """Return a maker of benches; averages have 10 trigger cycles by default."""
     def make(**options):
         options = {'trigger_cycles': 10, 'shaft__orders': ORDERS, **options}
         return AveragerBench(ros_graph, **options)
@@ -231,7 +231,7 @@ def test_one_keyphasor_is_used_and_the_others_counted(bench, named):
     assert status['keyphasor'] == 'kp'
 
 
-def test_a_keyphasor_without_a_name_is_one_too(bench):
+def test_keyphasor_may_have_an_empty_name(bench):
     b = bench()
     b.send_pulses([-0.5], source='')
     b.play(MACHINE, 1.0)
@@ -239,7 +239,7 @@ def test_a_keyphasor_without_a_name_is_one_too(bench):
     assert b.status()['pulses_dropped'] == len(MACHINE.pulses(1.0))
 
 
-def test_an_error_that_nobody_thought_of_costs_its_message_only(bench, monkeypatch):
+def test_unexpected_error_rejects_one_message_only(bench, monkeypatch):
     b = bench()
     add_pulses = b.node._averager.add_pulses
 
@@ -258,7 +258,7 @@ def test_an_error_that_nobody_thought_of_costs_its_message_only(bench, monkeypat
 
 
 def malformed():
-    """Yield what is wrong about a message, the message and what the node says."""
+    """Yield the name of an error, a message with it, and the text of the node."""
     good = messages.encode_samples
 
     def changed(**changes):
@@ -333,7 +333,7 @@ def test_malformed_pulses_are_rejected(bench):
     assert len(b.amplitudes()) == 2
 
 
-def test_rate_that_no_one_gives_is_asked_for(bench):
+def test_missing_sample_rate_is_requested(bench):
     b = bench(vibration_type='std_msgs/Float32MultiArray')
     b.send('vibration', messages.encode_samples_float32(MACHINE.block(0, 100)))
     _, text, values = b.diagnostics()
@@ -341,7 +341,7 @@ def test_rate_that_no_one_gives_is_asked_for(bench):
     assert values['messages_rejected'] == '1'
 
 
-def test_channels_that_change_for_good_are_averaged_from_then_on(bench):
+def test_lasting_change_of_channels_is_averaged(bench):
     b = bench()
     other = Machine(channels=3)
     b.play(MACHINE, 0.8)
@@ -427,7 +427,7 @@ def test_parameter_can_be_set_while_it_runs(bench, name, value, stored):
 
 
 @pytest.mark.parametrize(('name', 'value', 'reason'), [
-    ('trigger_cycles', 0, 'trigger_cycles out of range. Min: 1'),  # rclpy says it first
+    ('trigger_cycles', 0, 'trigger_cycles out of range. Min: 1'),  # refused by rclpy
     ('trigger_cycles', 10.5, 'trigger_cycles is 10.5: give a whole number'),
     ('trigger_cycles', 'many', "trigger_cycles is 'many': give a whole number"),
     ('shaft.ratio', 0.0, 'shaft.ratio out of range Min: 0.001, Max: 1000.0'),
@@ -485,7 +485,7 @@ def test_node_refuses_to_start_with(ros_graph, name, value, says):
         ros_graph.add(SynchronousAverager, {name: value})
 
 
-def test_override_that_matches_nothing_is_named(bench, capfd):
+def test_override_without_parameter_is_named(bench, capfd):
     bench(overrides=[Parameter('shaft.ration', value=2.0)])
     assert 'parameter shaft.ration is ignored' in capfd.readouterr().err
 
@@ -503,7 +503,7 @@ def test_incompatible_publisher_is_an_error_that_names_the_override(bench):
     assert b.diagnostics()[0] == DiagnosticStatus.ERROR
     for publisher in b.publishers.values():
         b.graph.node.destroy_publisher(publisher)
-    assert b.spin(lambda: b.diagnostics()[0] == DiagnosticStatus.OK)  # nobody is there to fit
+    assert b.spin(lambda: b.diagnostics()[0] == DiagnosticStatus.OK)  # no publisher is left
 
 
 def test_durability_can_be_overridden_as_the_error_says(bench):

@@ -73,7 +73,7 @@ class SceneBench:
 @pytest.mark.parametrize(('averaging', 'seed'), [
     ('block', 1), pytest.param('block', 2, marks=pytest.mark.campaign), ('sliding', 3),
     pytest.param('exponential', 4, marks=pytest.mark.campaign)])
-def test_every_average_is_true_whatever_happens(ros_graph, averaging, seed):
+def test_every_average_is_true_in_spite_of_faults(ros_graph, averaging, seed):
     b = SceneBench(ros_graph, seed, averaging=averaging)
     for _ in range(2):
         missing = set(SHAFTS) - b.play()
@@ -101,7 +101,7 @@ def test_every_average_is_true_whatever_happens(ros_graph, averaging, seed):
     assert status['cycles_dropped'] > 0
 
 
-def test_changes_of_parameters_at_any_time_mix_nothing(ros_graph, rng):
+def test_no_average_mixes_old_and_new_parameters(ros_graph, rng):
     b = SceneBench(ros_graph, 5)
     for name, value in (('trigger_cycles', 9), ('gear.ratio', 0.41), ('pulses_per_trigger', 1),
                         ('tach.orders', [2.5]), ('missing_pulses', 'bridge'),
@@ -126,8 +126,8 @@ def test_changes_of_parameters_at_any_time_mix_nothing(ros_graph, rng):
     assert status['averages'] == sum(checker.checked for checker in b.checkers.values()) > 100
 
 
-def test_the_check_sees_what_is_wrong(ros_graph):
-    """An average of other cycles, phases, samples or counts is found to be wrong."""
+def test_check_of_averages_detects_errors(ros_graph):
+    """Averages of other cycles, phases, samples or counts are detected."""
     b = SceneBench(ros_graph, 3)
     scene = b.source.scene(changes=False, faults=False)
     for _, topic, message in scene.events:
@@ -165,7 +165,7 @@ def test_the_check_sees_what_is_wrong(ros_graph):
 
 @pytest.fixture
 def corrected(ros_graph):
-    """Return averages with their corrections, and the places where they were found."""
+    """Return averages with their corrections, and their positions in the record."""
     settings = [dict(DETECTED)]
     options = {name.replace('.', '__'): value for name, value in DETECTED.items()}
     b = AveragerBench(ros_graph, **options)
@@ -191,7 +191,7 @@ def with_value(message, place, change):
     return replace(message, values=values)
 
 
-def test_the_check_of_corrected_averages_sees_what_is_wrong(corrected):
+def test_check_of_corrected_averages_detects_errors(corrected):
     assert len(corrected) > 5
     largest = [np.abs(item.pulse_error.values[:, 1]).max() for item, _ in corrected]
     assert max(largest) > 2e-5
@@ -203,7 +203,7 @@ def test_the_check_of_corrected_averages_sees_what_is_wrong(corrected):
             replace(item, amplitude=with_value(item.amplitude, (0, 2, 4), lambda x: x + 0.01)),
             replace(item, corrected=with_value(item.corrected, (0, 7), lambda x: x + 0.2))],
         'standard errors apart': [
-            replace(item, pulse_error=with_value(  # without being less sure
+            replace(item, pulse_error=with_value(  # with the same standard error
                 item.pulse_error, (2, 1), lambda x: x + 8.0 * errors[2, 2])),
             replace(item, pulse_error=with_value(
                 item.pulse_error, (slice(None), 1), lambda x: x + 1e-6))],
@@ -221,7 +221,7 @@ def test_the_check_of_corrected_averages_sees_what_is_wrong(corrected):
         check_correction('shaft', item, place, [{**DETECTED, 'correct_jitter': False}])
 
 
-def test_the_check_of_residuals_sees_what_is_wrong(corrected):
+def test_check_of_residuals_detects_errors(corrected):
     amplitudes = [item.amplitude for item, _ in corrected]
     order = amplitudes[0].values[0, :, 0]
     table = np.stack((order, *np.tile([[0.9], [0.01], [0.1], [0.8], [0.9], [1.0]], 3)), axis=1)
@@ -245,7 +245,7 @@ def test_the_check_of_residuals_sees_what_is_wrong(corrected):
             checker.check(with_value(residual, (1, column), lambda x: 1.01 * x + 0.001))
 
 
-def test_the_check_of_reports_sees_what_is_wrong():
+def test_check_of_reports_detects_errors():
     whole = {'declared': {}, 'acquisitions': {'fit': 2, 'held_out': 2}, 'orders': [1.0],
              'missing_effects': [], 'candidates': [], 'error_before': {}, 'error_after': {},
              'verdict': 'none'}
@@ -262,8 +262,8 @@ def test_the_check_of_reports_sees_what_is_wrong():
         check_report(json.dumps(whole))
 
 
-def test_node_goes_on_after_nonsense_of_every_kind(ros_graph):
-    """Random layouts, headers and data: rejected or used, never raised; then it still works."""
+def test_node_works_after_random_messages(ros_graph):
+    """Random layouts, headers and data are rejected or used; afterwards the node still works."""
     rng = np.random.default_rng(5)
     b = AveragerBench(ros_graph, shafts=('tach',), trigger_cycles=6,
                       tach__orders=ORDERS)

@@ -1,4 +1,4 @@
-"""The parameter files of the package start their nodes, and its profile their transport."""
+"""The parameter files and the transport profile of the package start its nodes."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A node's process keeps to one thread of linear algebra, unless its environment asks for more."""
+"""A node uses one thread of linear algebra, unless its environment sets the number."""
 
 import os
 from pathlib import Path
@@ -26,7 +26,7 @@ print(found, *threads)
 
 
 def threads(**environment):
-    """Return how many libraries were set, and the threads of each, in a process of its own."""
+    """Return how many libraries were limited, and the threads of each, in a separate process."""
     usual = {key: value for key, value in os.environ.items()
              if key not in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS')}
     done = subprocess.run([sys.executable, '-c', PROGRAM], capture_output=True, check=True,
@@ -37,14 +37,14 @@ def threads(**environment):
     return found, counts
 
 
-def test_every_openblas_is_kept_to_one_thread():
+def test_every_openblas_is_limited_to_one_thread():
     found, counts = threads()
     assert found == len(counts)
     assert set(counts) == {1}
 
 
 @pytest.mark.parametrize('name', ['OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'])
-def test_what_the_environment_asks_for_stays(name):
+def test_number_of_threads_in_the_environment_is_kept(name):
     found, counts = threads(**{name: '2'})
     assert found == 0
     assert set(counts) == {min(2, len(os.sched_getaffinity(0)))}

@@ -1,4 +1,4 @@
-"""The live view: what is published reaches the page, through HTTP and in a real browser."""
+"""The live view: published messages reach the page, through HTTP and in a real browser."""
 
 from concurrent.futures import ThreadPoolExecutor
 import http.client
@@ -60,7 +60,7 @@ class ViewBench(NodeBench):
         self.port = int(re.search(r':(\d+)/', self.diagnostics()[2]['address'])[1])
 
     def ask(self, path='/snapshot.json', method='GET', host=None):
-        """Return status, headers and body of an answer while the node goes on."""
+        """Return status, headers and body of an answer; the node is served meanwhile."""
         def talk():
             connection = http.client.HTTPConnection('127.0.0.1', self.port, timeout=60.0)
             connection.request(method, path, headers={
@@ -195,7 +195,7 @@ def test_snapshot_holds_what_was_published(bench):
     assert news['silence'] >= 0.0
 
 
-def test_only_news_are_served_to_one_who_has_the_rest(bench):
+def test_only_changes_since_a_version_are_served(bench):
     b = bench()
     publish_all(b)
     known = b.snapshot()
@@ -207,7 +207,7 @@ def test_only_news_are_served_to_one_who_has_the_rest(bench):
     assert news['run'] == known['run']
 
 
-def test_what_is_undefined_is_null(bench):
+def test_undefined_numbers_are_null(bench):
     b = bench()
     assert b.snapshot()['silence'] is None
     table = amplitudes(attenuation=NAN)
@@ -245,7 +245,7 @@ def test_histories_follow_time_and_are_bounded(bench):
     assert b.part('shaft/order_amplitude')['history'] == [[[0.7] * 3]]
 
 
-def test_a_snapshot_of_much_stays_small(bench, rng):
+def test_snapshot_has_a_limited_size(bench, rng):
     b = bench()
     b.send('shaft/synchronous_average', average(
         'synchronous_average', rng.normal(size=(100, 20000))))
@@ -309,7 +309,7 @@ def test_a_malformed_message_is_counted_and_not_shown(bench, bad):
     assert topic in b.snapshot()['parts']
 
 
-def test_nothing_but_get(bench):
+def test_only_get_is_served(bench):
     b = bench()
     methods = ('HEAD', 'POST', 'PUT', 'DELETE', 'OPTIONS', 'PATCH')
     for method in methods:
@@ -333,7 +333,7 @@ def test_a_bad_version_is_refused(bench):
         assert b.ask(f'/snapshot.json?since={since}')[0] == 400
 
 
-def test_a_name_that_is_not_ours_is_refused(bench):
+def test_foreign_host_name_is_refused(bench):
     b = bench()
     hosts = ('evil.example', 'evil.example:8420', '127.0.0.1.evil.example', '', '[::1',
              'localhost.evil', 'x@evil.example')
@@ -347,11 +347,11 @@ def test_a_name_that_is_not_ours_is_refused(bench):
 
 @pytest.mark.parametrize('host', [
     'localhost', 'localhost:9', '127.0.0.1:80', '[::1]:8420', '192.0.2.7', socket.gethostname()])
-def test_addresses_and_own_names_are_served(host):
+def test_addresses_and_names_of_this_host_are_served(host):
     assert is_own_name(host)
 
 
-def test_the_page_is_complete_and_asks_nobody_else(bench):
+def test_page_is_complete_and_requests_nothing_elsewhere(bench):
     b = bench()
     status, headers, body = b.ask('/')
     assert status == 200
@@ -374,7 +374,7 @@ def test_the_page_is_complete_and_asks_nobody_else(bench):
 
 
 @pytest.mark.parametrize('host', ['0.0.0.0', '::', '192.0.2.7', 'rig.example'])
-def test_other_machines_are_let_in_only_on_request(ros_graph, host):
+def test_other_machines_are_admitted_only_on_request(ros_graph, host):
     with pytest.raises(ParameterError, match='open_to_network'):
         ros_graph.add(LiveView, {'host': host, 'port': 0})
 
@@ -384,7 +384,7 @@ def test_opened_to_the_network_it_listens_there(ros_graph):
     assert socket.gethostname() in node.summary()[1]['address']
 
 
-def test_an_address_that_is_not_here_is_refused(ros_graph):
+def test_address_of_another_host_is_refused(ros_graph):
     with pytest.raises(ParameterError, match=r'cannot listen on 192\.0\.2\.7'):
         ros_graph.add(LiveView, {'host': '192.0.2.7', 'open_to_network': True, 'port': 0})
 
@@ -395,7 +395,7 @@ def test_names_that_no_topic_can_have_are_refused(ros_graph, shaft):
         ros_graph.add(LiveView, {'shafts': [shaft], 'port': 0})
 
 
-def test_a_port_in_use_gives_the_next(bench):
+def test_port_in_use_is_replaced_by_the_next(bench):
     first = bench()
     second = bench(port=first.port)
     assert first.port < second.port < first.port + PORTS_TRIED
@@ -424,7 +424,7 @@ def test_labels_change_while_it_runs(bench):
     assert not b.set_parameter('port', 1)[0]
 
 
-def test_diagnostics_say_where_the_page_is_and_what_is_on_it(bench, monkeypatch):
+def test_diagnostics_contain_the_address_and_the_number_of_averages(bench, monkeypatch):
     clock = SteadyClock()
     monkeypatch.setattr(board, 'time', clock)
     b = bench()
@@ -450,7 +450,7 @@ FLAGS = (
 
 
 def shown(b, *flags):
-    """Return the page's document after two seconds in a browser, while the node goes on."""
+    """Return the page's document after two seconds in a browser; the node is served meanwhile."""
     if BROWSER is None:
         pytest.skip('no chromium: apt install chromium')
     with tempfile.TemporaryDirectory() as profile, tempfile.TemporaryFile() as output:
@@ -507,7 +507,7 @@ def test_the_browser_shows_the_numbers(bench):
     assert '<b>end' not in page
 
 
-def test_the_browser_bears_a_report_that_is_not_as_ours_are(bench):
+def test_malformed_report_does_not_disturb_the_page(bench):
     b = bench()
     publish_all(b)
     b.send('missing_effect', String(data='{"lines": [null], "missing_effects": 3}'))
@@ -516,7 +516,7 @@ def test_the_browser_bears_a_report_that_is_not_as_ours_are(bench):
     assert 'rig/averager' in text_of(page, 'nodes')
 
 
-def test_the_browser_says_when_there_is_nothing(bench):
+def test_the_browser_shows_that_there_is_no_data(bench):
     page = shown(bench())
     assert text_of(page, 'state') == 'no data received yet'
     assert 'no synchronous average received yet' in page

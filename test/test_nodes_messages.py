@@ -1,4 +1,4 @@
-"""Messages to arrays and back: every layout both ways, by hypothesis; what is malformed."""
+"""Conversion of messages to arrays and back, for random and for malformed messages."""
 
 from dataclasses import replace
 import math
@@ -127,7 +127,7 @@ def test_float32_offset_of_float64_is_refused():
 
 
 @pytest.mark.parametrize('kind', [FLOAT32, IMU])
-def test_a_rate_that_no_one_gives_is_asked_for(kind):
+def test_missing_sample_rate_is_requested(kind):
     message = messages.SAMPLE_TYPES[kind]()
     if kind == FLOAT32:
         message.data = [0.0]
@@ -194,7 +194,7 @@ def test_imu_jitter_is_no_loss(rng, jitter):
     assert imu_blocks(stamps, rate=1000.0) == list(range(20_000))
 
 
-def test_imu_loss_amid_jitter_is_detected_where_it_can_be(rng):
+def test_imu_loss_amid_jitter_is_detected_when_it_is_significant(rng):
     kept = np.delete(np.arange(3000), range(1500, 1502))
     stamps = 100.0 + (kept + 0.2 * rng.standard_normal(kept.size)) / 1000.0
     indices = np.array(imu_blocks(stamps, rate=1000.0))
@@ -209,7 +209,7 @@ def test_imu_stamps_of_bursts_are_no_losses():
     assert np.all(np.diff(indices[8:]) == 1)  # from the second burst on
 
 
-def test_imu_stamps_that_run_back_start_again():
+def test_imu_stamps_that_jump_back_start_a_new_run():
     assert imu_blocks([9.0, 9.01, 9.02, 1.0, 1.01]) == [0, 1, 2, 0, 1]
 
 
@@ -294,7 +294,7 @@ def test_result_of_another_topic_is_refused():
         messages.decode_prediction(message)
 
 
-def test_types_are_known_as_users_write_them():
+def test_types_are_known_with_and_without_msg():
     known = messages.known_type('vibration_type', 'std_msgs/msg/Float32MultiArray',
                                 messages.SAMPLE_TYPES)
     assert messages.SAMPLE_TYPES[known] is Float32MultiArray

@@ -1,4 +1,4 @@
-"""Whatever a message holds, decoders raise nothing but MessageError and no node dies of it."""
+"""Random messages: decoders raise nothing except MessageError, and no node stops."""
 
 from contextlib import suppress
 import math
@@ -31,7 +31,7 @@ LABELLED = [('channel', 'sample'), ('channel', 'angle'), ('channel', 'order', 'f
 
 
 def filled(message, offset, dims, data):
-    """Return a message with this layout and data; float32 holds what it can of them."""
+    """Return a message with this layout and data, limited to the range of float32."""
     message.layout.data_offset = offset
     message.layout.dim = [MultiArrayDimension(label=label, size=size, stride=size)
                           for label, size in dims]

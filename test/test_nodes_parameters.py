@@ -1,4 +1,4 @@
-"""Parameters: kinds, ranges, reasons; and what a change does to a node."""
+"""Parameters: types, ranges, reasons of refusals, and changes in a running node."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_wrong_values_are_refused(index, given, says):
         SPECIFICATIONS[index].convert(given)
 
 
-def test_descriptors_tell_unit_range_and_choices():
+def test_descriptors_contain_unit_range_and_choices():
     rate, count, mode, *_, fixed = (descriptor_of(item) for item in SPECIFICATIONS)
     assert rate.description == 'a rate [Hz]'
     assert rate.additional_constraints == 'more than 0.0'
@@ -122,7 +122,7 @@ def test_a_change_is_checked_before_and_applied_after(node_with):
     ('rate', 'x'), ('rate', 0.0), ('count', 2.5), ('count', 10), ('mode', 'none'),
     ('orders', [1.0, -1.0]), ('orders', 1.0), ('teeth', [0]), ('fixed', 6), ('flag', 1),
 ])
-def test_a_refused_change_leaves_all_as_it_was(node_with, name, value):
+def test_refused_change_changes_nothing(node_with, name, value):
     node, parameters = node_with()
     applied, before = [], parameters.values()
     parameters.watch(check=lambda values: None, apply=applied.append)
@@ -142,7 +142,7 @@ def test_lists_may_become_empty_and_full_again(node_with):
         assert parameters.values()['teeth'] == value
 
 
-def test_what_matches_nothing_is_named(node_with, capfd):
+def test_override_without_parameter_is_named(node_with, capfd):
     _, parameters = node_with(**{'rat': 2.0, 'use_sim_time': False,
                                  'qos_overrides./a.subscription.depth': 5})
     parameters.watch(check=lambda values: None, apply=lambda values: None)

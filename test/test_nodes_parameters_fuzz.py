@@ -1,4 +1,4 @@
-"""Whatever parameters a node is given, it says what is wrong with them or works with them."""
+"""Random parameters: a node refuses them with a reason or works with them."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -51,7 +51,7 @@ def vibration():
 
 
 def signals(node):
-    """Let the node have what its inputs are for, and its timers their turn."""
+    """Send messages to all inputs of the node, and call its timer."""
     callbacks = {item.topic_name.lstrip('/'): item.callback for item in node.subscriptions}
     if 'tach_waveform' in callbacks:
         callbacks['tach_waveform'](vibration())
@@ -77,7 +77,7 @@ NODES = {
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_any_parameters_are_refused_or_worked_with(ros_graph, recording, name):
+def test_any_parameters_are_refused_or_used(ros_graph, recording, name):
     node_class, needed = NODES[name]
     if name == 'player':
         needed = {**needed, 'recording': recording}

@@ -67,12 +67,12 @@ class Bench(NodeBench):
         return not self.node.get_parameter('playing').value
 
     def tick(self):
-        """Send what is due now, whatever the timer does, and let it come in."""
+        """Send what is due now, and receive it."""
         self.node._tick()
         self.settle()
 
     def play(self):
-        """Play to the end and let the last messages come in."""
+        """Play to the end and receive the last messages."""
         assert self.spin(self.ended)
         self.settle()
 
@@ -219,7 +219,7 @@ def test_nan_is_a_gap(bench, recording):
 
 @pytest.fixture
 def clock(monkeypatch):
-    """Return the clock by which players keep their pace."""
+    """Return the clock of the players; it stands still until a test moves it."""
     found = SteadyClock()
     monkeypatch.setattr(playback, 'time', found)
     return found
@@ -243,7 +243,7 @@ def test_stop_go_and_rate(bench, clock):
     assert 'ended' in player.node.summary()[0]
 
 
-def test_what_cannot_be_sent_in_time_is_given_up_with_a_warning(bench, clock):
+def test_signals_that_are_late_are_delayed_with_a_warning(bench, clock):
     player = bench(rate=1.0)
     player.tick()
     clock.now += 1.2
@@ -255,7 +255,7 @@ def test_what_cannot_be_sent_in_time_is_given_up_with_a_warning(bench, clock):
     assert 300 <= len(player.samples()[0]) <= 400
 
 
-def test_a_recording_that_breaks_ends_with_an_error_that_stays(bench, recording):
+def test_defect_in_a_recording_ends_it_with_a_lasting_error(bench, recording):
     vibration = recording.read()
     vibration[0, 1234] = 1e200
     player = bench(replace(recording, vibration=ArraySource(vibration)))
@@ -268,7 +268,7 @@ def test_a_recording_that_breaks_ends_with_an_error_that_stays(bench, recording)
         assert 'rig.npz: sample of 1e+200: must be within' in text
 
 
-def test_it_can_be_played_again_after_its_end(bench, recording):
+def test_recording_can_be_played_again_after_its_end(bench, recording):
     player = bench()
     player.play()
     player.node.set_parameters([Parameter('playing', value=True)])
@@ -283,7 +283,7 @@ def test_messages_stay_small(bench):
     assert 250_000 < 8 * player.blocks[0].samples.size < 300_000
 
 
-def test_diagnostics_tell_the_progress(bench, clock):
+def test_diagnostics_contain_the_progress(bench, clock):
     player = bench(rate=1.0)
     player.tick()
     clock.now += 0.08
@@ -295,7 +295,7 @@ def test_diagnostics_tell_the_progress(bench, clock):
     assert values['seconds_sent'] == '0.100'
 
 
-def test_it_waits_for_subscribers(ros_graph, clock, tmp_path, recording):
+def test_player_waits_for_subscribers(ros_graph, clock, tmp_path, recording):
     write_npz(tmp_path / 'rig.npz', recording)
     node = ros_graph.add(RecordingPlayer, {
         'recording': str(tmp_path / 'rig.npz'), 'wait_seconds': 0.5})
@@ -336,7 +336,7 @@ def test_unusable_parameters_are_refused(bench, parameters, error, message):
         bench(**parameters)
 
 
-def test_a_keyphasor_that_is_not_there_is_refused(bench, recording):
+def test_keyphasor_that_the_recording_lacks_is_refused(bench, recording):
     with pytest.raises(ParameterError, match='the recording contains waveform, reference'):
         bench(replace(recording, pulse_times=None), tach='pulses')
 

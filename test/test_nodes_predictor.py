@@ -63,7 +63,7 @@ def bench(ros_graph):
     return lambda *arguments, **parameters: Bench(ros_graph, *arguments, **parameters)
 
 
-def test_prediction_is_latched_and_says_what_it_holds_for(bench):
+def test_prediction_is_latched_and_contains_its_conditions(bench):
     message = bench().received[0]
     np.testing.assert_array_equal(message.values, expected())
     assert (message.trigger_speed, message.keyphasor_rate, message.trigger_cycles,
@@ -124,7 +124,7 @@ def test_speed_is_followed_when_asked(bench):
     assert b.received[-1].trigger_speed == 22.0
 
 
-def test_speed_is_left_alone_unless_asked(bench):
+def test_measured_speed_is_ignored_by_default(bench):
     b = bench()
     b.graph.publish('shaft_speed', Float64(data=22.0))
     b.graph.settle()
@@ -211,6 +211,6 @@ def test_one_named_shaft_has_the_topic_of_one(bench, prefix):
     ({'shafts': ['a', 'a']}, "shafts is 'a', 'a': give different names"),
     ({'shafts': ['a', 'b'], 'b.ratio': 0.0}, 'b.ratio is 0.0: give at least 0.001'),
 ])
-def test_shafts_declared_in_both_forms_or_badly_are_refused(ros_graph, given, message):
+def test_shafts_declared_in_both_forms_or_wrongly_are_refused(ros_graph, given, message):
     with pytest.raises(ParameterError, match=message):
         ros_graph.add(JitterPredictor, given)

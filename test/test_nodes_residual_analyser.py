@@ -1,4 +1,4 @@
-"""The loop on line: its core on synthetic averages, the node from simulator to closed loop."""
+"""The loop on line: functions on synthetic averages, and the node in a closed loop."""
 
 from dataclasses import replace
 import json
@@ -47,7 +47,7 @@ def synthetic(count, *, std=0.0, seed=0, noise=1e-3, grid=0.0, wander=0.0):
     rng = np.random.default_rng(seed)
     edges = np.arange(count * CYCLES + 1)
     errors = rng.uniform(-0.5, 0.5, edges.size) / CLOCK + std * rng.standard_normal(edges.size)
-    # the tach shaft is not quite steady, so that its times do not tell the errors
+    # the speed fluctuates, so that the pulse times alone do not show the errors
     true = edges / SPEED + 1e-4 * np.sin(0.3 * edges)
     times = true + errors
     if grid:
@@ -79,7 +79,7 @@ def synthetic(count, *, std=0.0, seed=0, noise=1e-3, grid=0.0, wander=0.0):
 # --- core ----------------------------------------------------------------------------------------
 
 
-def test_residual_of_the_declared_jitter_is_chance():
+def test_residual_of_the_declared_jitter_is_random():
     z, p_values = [], []
     for seed in range(20):
         table, found = compare(synthetic(16, seed=seed), published())
@@ -142,7 +142,7 @@ def test_trace_names_the_effect_and_its_size():
     assert 'run close_loop on a recording' in reasons['speed_fluctuation']
 
 
-def test_trace_sees_the_grid_of_a_clock():
+def test_trace_finds_the_grid_of_a_clock():
     found = trace_averages(synthetic(20, grid=4000.0), MODEL)
     assert found.verdict == 'traced'
     assert [item.name for item in found.findings] == ['keyphasor_quantisation']
@@ -150,13 +150,13 @@ def test_trace_sees_the_grid_of_a_clock():
     assert found.after.rms < 0.1 * found.before.rms
 
 
-def test_trace_names_what_it_cannot_tell_apart():
+def test_trace_names_indistinguishable_effects():
     found = trace_averages(synthetic(20, wander=3e-5), MODEL)
     assert [item.name for item in found.findings] == ['phase_wander']
     assert 'speed_fluctuation' in report(found)['missing_effects'][0]['indistinguishable_from']
 
 
-def test_trace_knows_what_is_declared_already():
+def test_trace_does_not_repeat_declared_effects():
     averages = synthetic(20, std=5e-5)
     assert trace_averages(synthetic(20), MODEL).verdict == 'none'
     found = trace_averages(averages, MODEL, declared=(make_effect('excess_jitter', std=5e-5),))
@@ -179,7 +179,7 @@ def test_trace_takes_the_longest_stretch_without_a_gap():
 @pytest.mark.parametrize('change', [
     {}, {'jitter_distribution': 'normal', 'jitter_std': 3e-5},
     {'pulses_per_revolution': 6, 'pulses_per_trigger': 2, 'trigger_speed': SPEED / 3.0}])
-def test_prediction_tells_what_was_declared(change):
+def test_declared_model_is_recovered_from_the_prediction(change):
     model = replace(MODEL, **change)
     averages = [replace(item, trigger_speed=model.trigger_speed) for item in synthetic(4)]
     found = declared_by(averages, published(**change))
@@ -321,7 +321,7 @@ def test_absent_predictor_is_a_diagnostic(bench, clock):
 
 @pytest.mark.parametrize(('change', 'reason'), [
     ({'trigger_cycles': 40}, 'set trigger_cycles'), ({'ratio': 1.0}, 'set ratio')])
-def test_mismatch_is_said_and_cured(bench, change, reason):
+def test_mismatch_is_reported_until_it_is_corrected(bench, change, reason):
     b = bench()
     b.predict(**change)
     b.average(synthetic(8))
@@ -378,7 +378,7 @@ def test_bad_messages_are_counted(bench):
     assert b.diagnostics()[2]['averages'] == '0'
 
 
-def test_name_of_another_node_is_not_taken_for_the_predictor(bench):
+def test_node_that_is_no_predictor_is_reported(bench):
     b = bench(predictor='test')  # the graph's node has parameter services, not the parameters
     b.predict()
     b.average(synthetic(8, std=5e-5))
@@ -387,7 +387,7 @@ def test_name_of_another_node_is_not_taken_for_the_predictor(bench):
     assert b.reports()[0]['declared']['keyphasor_rate'] == CLOCK
 
 
-def test_effects_reach_the_predictor_and_a_refusal_is_reported(bench, ros_graph):
+def test_effects_are_set_in_the_predictor_and_a_refusal_is_reported(bench, ros_graph):
     predictor = ros_graph.add(JitterPredictor, {
         'keyphasor_rate': CLOCK, 'trigger_speed': SPEED, 'trigger_cycles': CYCLES,
         'ratio': RATIO, 'orders': list(MODEL.orders)})

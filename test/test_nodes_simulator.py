@@ -37,7 +37,7 @@ class Bench(NodeBench):
                 for item in self.received['tach_pulse']]
 
     def play(self):
-        """Simulate to the end and let the last messages come in."""
+        """Simulate to the end and receive the last messages."""
         assert self.spin(lambda: not self.node.get_parameter('playing').value)
         self.settle()
 
@@ -58,7 +58,7 @@ def bench(ros_graph):
     return lambda **parameters: Bench(ros_graph, **parameters)
 
 
-def test_what_arrives_is_the_machine(bench):
+def test_published_signals_are_those_of_the_machine(bench):
     simulator = bench(tach='both', start_time=100.0, channel_gains=[1.0, 0.5],
                       pulses_per_revolution=2, seed=3, speed_fluctuation_std=1e-3)
     simulator.play()
@@ -127,7 +127,7 @@ def test_declared_jitter_of_every_kind(bench):
     ({'jitter_distribution': 'table'}, 'needs finite errors'),
     ({'keyphasor_rate': -1.0}, 'keyphasor_rate is -1.0'),
 ])
-def test_changes_that_cannot_be_are_refused_with_the_reason(bench, change, reason):
+def test_impossible_changes_are_refused_with_the_reason(bench, change, reason):
     simulator = bench(**{'effects.missing_pulses.enabled': True})
     machine = simulator.node.machine
     result = simulator.node.set_parameters(

@@ -1,4 +1,4 @@
-"""The tach detector node: the pulses of its core, through topics, whatever the messages do."""
+"""The tach detector node publishes the pulses that the library finds, in spite of faults."""
 
 from bench import NodeBench
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -35,7 +35,7 @@ def bench(ros_graph):
 
 def play(b, samples, *, size=250, start=0.0, index=0, skip=(),
          encode=messages.encode_samples):
-    """Publish a waveform in blocks, but for those lost."""
+    """Publish a waveform in blocks, except those in `skip`."""
     for number, first in enumerate(range(0, len(samples), size)):
         if number not in skip:
             b.send('tach_waveform', encode(SampleBlock(
@@ -82,7 +82,7 @@ def test_edge_and_polarity_reach_the_core(bench, edge, polarity):
     np.testing.assert_allclose(pulses(b), expected, atol=6e-10)
 
 
-def test_a_set_threshold_needs_no_learning(bench):
+def test_given_threshold_needs_no_learning(bench):
     b = bench(automatic_threshold=False, threshold=1, hysteresis=0)
     play(b, waveform(0.3))
     assert len(pulses(b)) == 7
@@ -101,7 +101,7 @@ def test_no_pulse_is_read_across_a_gap(bench):
     assert b.status()['gaps'] == 1
 
 
-def test_a_restart_learns_anew(bench):
+def test_state_levels_are_learnt_again_after_a_restart(bench):
     b = bench()
     play(b, waveform(2.0))
     before = len(pulses(b))
@@ -114,7 +114,7 @@ def test_a_restart_learns_anew(bench):
 
 
 @pytest.mark.parametrize('bad', ['channels', 'nan', 'label', 'repeat'])
-def test_a_bad_block_is_counted_and_the_rest_used(bench, bad):
+def test_bad_block_is_counted_and_the_others_are_used(bench, bad):
     b = bench()
     samples = waveform(3.0)
     blocks = [SampleBlock(samples[None, first:first + 250], first / RATE, RATE, first)
@@ -174,7 +174,7 @@ def test_parameters_change_while_it_runs(bench):
 
 
 @pytest.mark.parametrize('factor', [2.0, 1.0 + 1e-10])
-def test_a_source_that_comes_back_with_another_rate_is_learnt_anew(bench, factor):
+def test_state_levels_are_learnt_again_after_a_change_of_rate(bench, factor):
     b = bench()
     play(b, waveform(2.0))
     before = len(pulses(b))
@@ -187,12 +187,12 @@ def test_a_source_that_comes_back_with_another_rate_is_learnt_anew(bench, factor
     assert b.spin(lambda: not b.node._waiting)
     b.settle()
     late = pulses(b)[before:]
-    # the first block of another layout may be a fault; it tells with the second one
+    # the first block of another layout may be a fault: only the second starts a new run
     assert len(late) >= len(KeyphasorDetector().update(samples, 0.0, RATE)) - 2
     np.testing.assert_allclose(np.diff(late), 1.0 / SPEED / factor, rtol=1e-3)
 
 
-def test_another_name_loses_nothing_and_other_options_count_what_they_lose(bench):
+def test_new_name_drops_nothing_and_new_options_count_what_they_drop(bench):
     b = bench(minimum_interval=0.05)  # above the period of 0.047 s
     play(b, waveform(2.0))
     dropped = int(b.diagnostics()[2]['pulses_dropped'])
@@ -220,7 +220,7 @@ def test_silence_is_not_a_keyphasor(bench, rng):
     assert b.diagnostics()[1] == 'learning the state levels'
 
 
-def test_times_that_a_reference_cannot_hold_are_counted_and_named(bench):
+def test_times_too_large_for_a_reference_are_counted_and_named(bench):
     b = bench()
     play(b, waveform(1.0), start=3.8e9)
     assert len(pulses(b)) == 0

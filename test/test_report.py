@@ -1,4 +1,4 @@
-"""The files of a report: figures that show what they must, one page that needs nothing else."""
+"""The files of a report: figures with their contents, and a self-contained page."""
 
 import base64
 from dataclasses import replace
@@ -66,7 +66,7 @@ def files(traces):
 
 
 class Page(HTMLParser):
-    """What a page consists of."""
+    """The tags, links and text of a page."""
 
     def __init__(self, text):
         super().__init__()
@@ -88,7 +88,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
-def test_page_is_whole_and_needs_nothing_else(files, verdict):
+def test_page_is_complete_and_self_contained(files, verdict):
     found = files[verdict]
     names = NAMES if verdict != 'blind' else {'residual', 'distribution'}
     assert found.keys() == {'report.json', 'report.html', *(f'{name}.png' for name in names)}
@@ -138,7 +138,7 @@ def test_panels_are_labelled(traces, verdict):
         assert item.figure.axes[-1].get_xlabel()
 
 
-def test_sentence_says_what_was_found_and_what_it_was_worth(traces):
+def test_sentence_contains_effect_and_errors(traces):
     content = report(traces['traced'])
     (effect,) = content['missing_effects']
     std = effect['parameters']['std']
@@ -155,7 +155,7 @@ def test_sentence_of_other_verdicts(traces, verdict, says):
     assert says in verdict_sentence(report(traces[verdict]))
 
 
-def test_sentence_names_what_was_added_in_vain(traces):
+def test_sentence_names_effects_that_do_not_suffice(traces):
     content = report(replace(traces['traced'], verdict='unexplained'))
     assert 'even with excess_jitter (std = ' in verdict_sentence(content)
 
@@ -188,7 +188,7 @@ def test_expected_profile_is_that_of_the_declared_jitter(traces):
         size, 1e6 / (CLOCK * np.sqrt(12.0)) * np.sqrt((1.0 - u) ** 2 + u**2), rtol=1e-3)
 
 
-def test_evidence_follows_the_effect_that_it_convicted(traces):
+def test_recovered_errors_follow_the_traced_effect(traces):
     trace = traces['traced']
     label = 'with excess_jitter'
     axes = panel(trace, 'trigger_cycle', 'over the trigger cycle')
@@ -236,10 +236,10 @@ def test_lines_have_the_names_of_their_channels(traces):
     assert {label.split(', ')[1] for label in labels} == {'<left>', 'right & top'}
 
 
-def test_fold_counts_the_pulses_that_lack(traces):
+def test_fold_counts_missing_pulses(traces):
     trace = traces['geometry']
     first, *rest = trace.evidence.pulses
-    # from pulse 7 of the first acquisition on, one pulse lacks: its marks are the next ones
+    # after pulse 7 of the first acquisition one pulse is missing: the marks shift by one
     missing = np.where(np.arange(len(first.times) - 1) == 6, 1, 0)
     gap = replace(trace, evidence=replace(trace.evidence, pulses=(
         replace(first, missing=missing), *rest)))

@@ -1,4 +1,4 @@
-"""The script `run`: what the quick tests leave out, and one clear line where it cannot work."""
+"""The script `run`: the marks that the quick tests leave out, and its errors of one line."""
 
 import os
 from pathlib import Path
