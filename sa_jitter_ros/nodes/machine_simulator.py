@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.effects import EFFECTS, parameter_ranges
+from sa_jitter_ros.effects import enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
@@ -98,12 +98,7 @@ def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
 
 def effects_of(values: Values) -> tuple[Effect, ...]:
     """Return declared jitter and noise and the enabled effects; raises `ParameterError`."""
-    options = {}
-    for name, kind in EFFECTS.items():
-        if values[f'effects.{name}.enabled']:
-            found = {key: values[f'effects.{name}.{key}'] for key in parameter_ranges(kind)}
-            options[name] = {key: tuple(value) if isinstance(value, list) else value
-                             for key, value in found.items()}
+    options = {effect.name: dict(effect.values) for effect in enabled_effects(values)}
     declared: list[Effect] = [AdditiveNoise(values['noise_std'], 'declared_noise')]
     distribution, rate = values['jitter_distribution'], values['keyphasor_rate']
     if distribution == 'sampled' and 'keyphasor_quantisation' not in options:

@@ -6,7 +6,6 @@ import io
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,6 @@ class Illustration:
     def png(self) -> bytes:
         """Return the figure as PNG."""
         buffer = io.BytesIO()
-        FigureCanvasAgg(self.figure)
         self.figure.savefig(buffer, format='png', dpi=110)
         return buffer.getvalue()
 

@@ -144,8 +144,8 @@ def _error_table(content: Mapping[str, Json]) -> str:
 
 def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
     return _table(
-        ('quantity', 'lowest', 'highest', 'change of the residual before', 'p value',
-         'change of the residual after', 'p value'),
+        ('quantity', 'lowest', 'highest', 'change of the residual, before', 'p value',
+         'change of the residual, after', 'p value'),
         [(item['on'].replace('_', ' '), number_text(item['low']),
           f'{number_text(item["high"])} {item["unit"]}'.strip(),
           *(text for when in ('before', 'after') for text in (
