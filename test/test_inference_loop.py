@@ -266,10 +266,10 @@ def test_missing_pulses_are_counted():
     assert found.bridged[:31] == pytest.approx(every[:31], abs=1e-12)
     assert np.isnan(found.bridged[31:36]).all()
     assert np.flatnonzero(found.starts_run).tolist() == [0, 28]
-    assert found.remarks == ('3 pulses are missing beside the 52 that were measured',
-                             '1 of 52 pulses come late, after a gap that is no whole number of '
-                             'intervals or longer than three missing pulses: no acquisition '
-                             'holds such a gap')
+    assert found.remarks == ('3 pulses are missing between the 52 that were measured',
+                             '1 of 52 pulses are late: the gap before them is not a whole number '
+                             'of intervals, or longer than three missing pulses; no acquisition '
+                             'contains such a gap')
 
 
 def changed(**values):

@@ -219,7 +219,7 @@ def test_effects_of_size_zero_change_nothing():
 
 
 @pytest.mark.parametrize(('options', 'message'), [
-    ({'excess_jiter': {'std': 1.0}}, "no effect 'excess_jiter': there are excess_jitter"),
+    ({'excess_jiter': {'std': 1.0}}, "no effect 'excess_jiter': choose from excess_jitter"),
     ({'excess_jitter': {'sdt': 1.0}}, 'effect excess_jitter has std and not sdt'),
     ({'excess_jitter': {'std': -1.0}}, 'excess_jitter.std -1.0: must be finite and at least 0'),
     ({'correlated_jitter': {'std': 1.0, 'correlation': 1.0}}, 'above -0.9999 and below 0.9999'),
@@ -246,7 +246,7 @@ def test_wrong_options_are_refused(options, message):
 @pytest.mark.parametrize(('options', 'message'), [
     ({'distribution': 'cauchy'}, "'cauchy': must be one of"),
     ({'distribution': 'normal', 'std': -1.0}, 'jitter std -1.0'),
-    ({'distribution': 'table'}, 'needs finite errors'),
+    ({'distribution': 'table'}, 'give finite errors'),
 ])
 def test_wrong_jitter_is_refused(options, message):
     with pytest.raises(ParameterError, match=message):

@@ -1,4 +1,4 @@
-"""Trigger cycles of a recording for the averager, and the pulse errors that they tell."""
+"""Trigger cycles of a recording, their average, and the pulse errors recovered from them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from sa_jitter_ros.pulses.resampling import margin
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-# Errors of this many declared standard deviations are tried again as if more had been declared: an
-# effect may be larger than the declared jitter, and orders may have slipped a cycle.
+# Errors above this many declared standard deviations are recovered again with a wider prior, in
+# declared standard deviations: an effect may be larger than the declared jitter.
 _SUSPICIOUS, _WIDER = 1.3, 4.0
-_WORTHWHILE = 0.7  # as in the recovery, of the errors that were found
+_WORTHWHILE = 0.7  # as in the recovery, but relative to the recovered errors
 _LEAST = 1e-9
 _WHOLE = 1e-9
-_MARGIN = 40  # samples beside a cycle: more than interpolation reads, and corrected pulses move
+_MARGIN = 40  # samples on either side of a cycle, for interpolation and corrected pulses
 _COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
-#: Of a fitted ripple, in parts of that of noise of unit power over a cycle.
+#: Variance of a fitted ripple, for noise of unit power over a cycle.
 RIPPLE_VARIANCE = float(np.mean(1.0 / (1.0 / 30.0 - (1.0 + _COSINE) / (24.0 * (2.0 + _COSINE)))))
 
 
 @dataclass(frozen=True)
 class CycleReader:
-    """Reads trigger cycles of a recording, `samples` (sample, channel) from `start_time` on."""
+    """Reads trigger cycles of a recording: `samples` (sample, channel) from `start_time` (s)."""
 
     samples: FloatArray
     start_time: float
@@ -38,7 +38,7 @@ class CycleReader:
     method: str
 
     def inside(self, times: FloatArray) -> bool:
-        """Tell whether cycles between these pulses can be read."""
+        """Whether the cycles between these pulses (s) are inside the samples."""
         reach = margin(self.method) + 1
         position = (times[[0, -1]] - self.start_time) * self.rate
         return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
@@ -48,8 +48,8 @@ class CycleReader:
         """
         Return the trigger cycles between pulses.
 
-        `pulses` are those of the cycles and all that the `law` reads beside them; `ripple` is that
-        of the speed in each cycle (s).
+        `pulses` (s) are those of the cycles and the others that the `law` uses; `ripple` (s) is
+        the speed ripple in each cycle.
         """
         return [
             CycleSamples.cut(
@@ -59,7 +59,7 @@ class CycleReader:
 
     def average(self, cycles: Sequence[CycleSamples], model: DeclaredModel, orders: FloatArray,
                 law: AngleLaw = LINEAR_LAW) -> Average:
-        """Return the synchronous average of cycles, begun at angle 0."""
+        """Return the synchronous average of cycles, the first of which begins at angle 0."""
         return average_cycles(cycles, AverageSettings(
             cycle_length=model.cycle_length, trigger_cycles=len(cycles),
             orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
@@ -95,23 +95,23 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
 
 
 def _stands_out(recovery: PulseErrorRecovery) -> bool:
-    """Tell whether the errors themselves, not only those expected, exceed their standard error."""
+    """Whether the recovered errors, not only the expected ones, exceed their standard error."""
     power = float(np.mean(recovery.standard_errors**2))
     return recovery.accepted and power < _WORTHWHILE**2 * (float(recovery.errors.var()) - power)
 
 
 def _strength(recovery: PulseErrorRecovery) -> float:
-    """Return how much power of how high an order the recovered errors bring back."""
+    """Return the power of the recovered orders, weighted by the square of the order."""
     return float(np.sum((recovery.orders * np.abs(recovery.amplitudes)) ** 2))
 
 
 def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
     """
-    Return the standard error of the ripple (s) that the noise of the recovered orders leaves.
+    Return the standard error of the ripple (s) due to the noise of the recovered orders.
 
-    Ripples and pulse errors are fitted jointly, of all cycles: at the frequency w (per cycle)
-    u (1 - u) keeps 1/30 - (1 + cos w) / (24 (2 + cos w)) in mean square beyond what straight
-    lines between the pulses follow.
+    Ripples and pulse errors of all cycles are fitted jointly. At the frequency w (per cycle) the
+    mean square of u (1 - u) without its best fit by straight lines between the pulses is
+    1/30 - (1 + cos w) / (24 (2 + cos w)).
     """
     with np.errstate(divide='ignore', invalid='ignore'):
         signal = (2.0 * np.pi * recovery.orders * np.abs(recovery.amplitudes)) ** 2
@@ -120,6 +120,6 @@ def ripple_error(recovery: PulseErrorRecovery, model: DeclaredModel) -> float:
     return float(cycles / model.fundamental_frequency)
 
 
-def kept_apart(ratio: float, orders: FloatArray) -> bool:
-    """Tell whether all orders are lines of a trigger cycle of `ratio` fundamental cycles."""
-    return bool(np.all(np.abs(ratio * orders - np.rint(ratio * orders)) < _WHOLE))
+def kept_apart(cycle_length: float, orders: FloatArray) -> bool:
+    """Whether all orders have whole cycles in a trigger cycle of this length."""
+    return bool(np.all(np.abs(cycle_length * orders - np.rint(cycle_length * orders)) < _WHOLE))

@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.scoring import Bench
 
-_FEWEST = 4  # cycles of an average, and fundamental cycles
+_FEWEST = 4  # trigger cycles, and fundamental cycles, of an average
 _FOLD = 8
 
 
 def with_fewer_cycles(bench: Bench) -> Bench:
-    """Return the bench with `fewer` of an eighth of the cycles, or of the least that will do."""
+    """Return the bench with `fewer`: averages over an eighth of the cycles, or the fewest."""
     model = bench.observation.model
     count = int(max(_FEWEST, np.ceil(_FEWEST / model.cycle_length), model.trigger_cycles // _FOLD))
     if 2 * count > model.trigger_cycles:
@@ -22,10 +22,10 @@ def with_fewer_cycles(bench: Bench) -> Bench:
 
 def fewer_cycles(bench: Bench, count: int) -> Bench:
     """
-    Return a bench whose acquisitions are averages of `count` trigger cycles of this one's.
+    Return a bench whose acquisitions are averages over `count` trigger cycles of each acquisition.
 
-    What is left at the end of an acquisition is not used. Those of one that is held out are held
-    out, in its place and one behind the other.
+    Remaining cycles at the end of an acquisition are not used. The parts of a held-out acquisition
+    are held out, too.
     """
     observation = bench.observation
     parts = observation.model.trigger_cycles // count
@@ -46,7 +46,7 @@ def fewer_cycles(bench: Bench, count: int) -> Bench:
 
 
 def _part(observation: Observation, item: Acquisition, start: int, count: int) -> Acquisition:
-    """Return `count` cycles of an acquisition, at angle 0 where they begin."""
+    """Return `count` cycles of an acquisition, which begin at angle 0."""
     stop = start + count
     pulses, cycles = slice(start, stop + 1), slice(start, stop)
     index = item.number
@@ -64,5 +64,5 @@ def _part(observation: Observation, item: Acquisition, start: int, count: int) -
 
 
 def _turn(observation: Observation, angle: float) -> NDArray[np.complex128]:
-    """Return the factor (order,) that moves angle 0 on, by fundamental cycles."""
+    """Return the factor (order,) for an angle 0 that is later by fundamental cycles."""
     return np.asarray(np.exp(2j * np.pi * angle * observation.sources))

@@ -1,10 +1,14 @@
 """
-Observation: what each acquisition of a recording shows of the attenuation of its lines.
+Observation: the attenuation of each line in each acquisition of a recording.
 
-An acquisition is N_t consecutive trigger cycles. Its raw amplitudes come from the measured pulses
-by the declared angle law; its corrected ones from the better keyphasor, by the same law, where
-there is one, else from pulses whose errors were recovered from the vibration. The attenuation is
-raw over corrected amplitude: what noise, modulation and interpolation do to both cancels in it.
+An acquisition is N_t consecutive trigger cycles. Its raw amplitudes are those between the measured
+pulses with the declared angle law. Its corrected amplitudes are those between the pulses of a
+reference keyphasor with the same law, or, without one, between pulses whose errors were recovered
+from the vibration. The attenuation is the raw over the corrected amplitude. Effects of noise,
+modulation and interpolation on both cancel in it.
+
+The pulses are those that the pulse validation of the averager accepts, and each average is that of
+the on-line averager (`averaging/shaft.py`).
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +26,7 @@ from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, Recor
 from sa_jitter_ros.inference.undeclared_orders import undeclared_orders
 from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw
+from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
 from sa_jitter_ros.recordings.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -30,28 +34,30 @@ ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 
 MOST_SAMPLES = 200_000_000
-#: Lines are coherent from cycle to cycle by more than this many times the coherence of noise.
+#: A line is above the noise if its coherence from cycle to cycle exceeds that of noise so often.
 CHANCE = 4
 _OTHER_MACHINE = 5.0
-# Acquisitions by which a better keyphasor is judged, on lines whose noise is below a share.
+# Acquisitions that test a reference keyphasor, largest noise over amplitude of the lines for it,
+# and largest loss of amplitude.
 _TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
 _FULL_BAND = 0.45  # of the sample rate
-# A ripple of this many times its noise in power is taken out of the corrected average.
+# A ripple with more than this many times the power of its noise is corrected.
 _RIPPLE = 3.0
 
 
 @dataclass(frozen=True)
 class Acquisition:
     """
-    One acquisition: N_t consecutive trigger cycles from trigger pulse `first` of the record on.
+    One acquisition: N_t consecutive trigger cycles from trigger pulse `first` of the recording on.
 
-    `times` (N_t + 1,) and `errors`, `standard_errors` (s) of its measured pulses, errors measured
-    minus true with mean 0 (NaN where nothing was recovered). `missing` (N_t,) pulses lack in each
-    cycle; `bridged` are the times with those put in. `raw` and `corrected` (channel, order)
-    are complex peak amplitudes; `cycles` (cycle, channel, order) the corrected ones of each cycle
-    at hand; `noise` (channel, order) the standard deviation of an amplitude along its radius,
-    `noise_floor` what of it the spectrum around the order makes.
-    `ripple` (cycle,) is the factor of u (1 - u) in the error inside a cycle (s).
+    `times`, `errors` and `standard_errors` (N_t + 1,) in s are those of its measured pulses;
+    errors are measured minus true times with mean 0, NaN where nothing was recovered. `missing`
+    (N_t,) is the number of missing pulses in each cycle; `bridged` are the times with these
+    interpolated. `raw` and `corrected` (channel, order) are complex peak amplitudes; `raw_cycles`
+    and `cycles` (cycle, channel, order) those of single cycles. `noise` (channel, order) is the
+    standard deviation of an amplitude along its radius, `noise_floor` the part of it that the
+    spectrum around the order shows. `ripple` (cycle,) is the factor of u (1 - u) in the error
+    inside a cycle (s).
     """
 
     first: int
@@ -71,7 +77,7 @@ class Acquisition:
 
     @property
     def number(self) -> NDArray[np.int64]:
-        """Return where its measured pulses are among the bridged ones."""
+        """Return the indices of the measured pulses in `bridged`."""
         return numbered(self.missing)
 
     @cached_property
@@ -92,7 +98,7 @@ class Acquisition:
 
     @property
     def attenuation_standard_error(self) -> FloatArray:
-        """Return its standard error; the noise of both amplitudes is correlated by it."""
+        """Return its standard error; the noise of both amplitudes has this correlation."""
         with np.errstate(divide='ignore', invalid='ignore'):
             share = np.sqrt(np.clip(1.0 - self.attenuation**2, 0.0, 1.0))
             return np.asarray(self.noise / np.abs(self.corrected) * share)
@@ -101,11 +107,11 @@ class Acquisition:
 @dataclass(frozen=True)
 class Observation:
     """
-    All acquisitions of one recording; `orders` as declared, `sources` those that may leak in.
+    All acquisitions of one recording.
 
-    The amplitudes of an acquisition are those of `sources`, of which the first `len(orders)` are
-    the declared orders. The trigger_speed of `model` is the measured mean, which fits and
-    predictions share; `declared_speed` (Hz) is what was declared.
+    `orders` are the declared ones, `sources` these and the undeclared orders that leak into them.
+    The amplitudes of an acquisition are those of `sources`. The trigger_speed of `model` is the
+    measured mean; `declared_speed` (Hz) is the declared one.
     """
 
     model: DeclaredModel
@@ -127,38 +133,39 @@ class Observation:
 def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 'band_limited',
             sources: Sequence[float] = (), progress: Progress | None = None) -> Observation:
     """
-    Observe a recording's acquisitions.
+    Observe the acquisitions of a recording.
 
-    `sources` are the declared orders and after them others that may leak; without it they are
-    looked for. A better keyphasor is left aside where the vibration itself moves against it, or
-    inside its cycles, so much that its own average loses amplitude.
-    Raises RecordingError where there is no whole acquisition or the better keyphasor is a worse
-    one, ModelError where the declared model does not fit the recording, SignalError where nothing
-    is there to compare with.
+    `sources` are the declared orders, then others that leak into them; without it these are
+    searched for. A reference keyphasor is not used if the vibration wanders against it, or the
+    speed ripples between its pulses, so much that the average with it loses amplitude. Raises
+    RecordingError if there is no whole acquisition or the reference keyphasor is worse than the
+    keyphasor, ModelError if the declared model does not fit the recording, SignalError if there is
+    no reference keyphasor and the pulse errors cannot be recovered.
     """
     if recording.samples * recording.channels > MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
-                             f'most {MOST_SAMPLES} values fit; cut the recording')
+                             f'most {MOST_SAMPLES} values are read; cut the recording')
     if model.trigger_cycles <= CHANCE:
-        raise ModelError(f'trigger_cycles is {model.trigger_cycles}: whether a line is coherent '
-                         f'from cycle to cycle takes at least {CHANCE + 1}; raise trigger_cycles')
+        raise ModelError(f'trigger_cycles is {model.trigger_cycles}: the coherence of a line from '
+                         f'cycle to cycle needs at least {CHANCE + 1}; raise trigger_cycles')
     if model.sample_rate and abs(recording.sample_rate / model.sample_rate - 1.0) > 1e-3:
         raise ModelError(f'sample_rate is declared as {model.sample_rate:g} Hz but the recording '
-                         f'has {recording.sample_rate:g} Hz')
-    once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each leaks into others only
+                         f'has {recording.sample_rate:g} Hz: declare {recording.sample_rate:g}')
+    once = tuple(dict.fromkeys(float(g) for g in model.orders))  # each order once
     pulses, declared_speed = record_pulses(recording, model), model.trigger_speed
     speed = model.trigger_revolutions / mean_period(pulses.times, pulses.missing)
     model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
     samples = np.ascontiguousarray(recording.read().T)
     if not np.all(np.isfinite(samples)):
-        raise RecordingError('vibration holds NaN or infinity: cut the recording at its gaps')
+        raise RecordingError('the vibration has NaN or infinity: cut the recording at its gaps')
     samples -= samples.mean(axis=0)
     reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
     starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
     if not starts:
         raise RecordingError(
-            f'{pulses.times.size} trigger pulses hold no acquisition of {model.trigger_cycles} '
-            'trigger cycles inside the vibration: lower trigger_cycles or record longer'
+            f'{pulses.times.size} trigger pulses do not make an acquisition of '
+            f'{model.trigger_cycles} consecutive trigger cycles inside the vibration: lower '
+            'trigger_cycles or record longer'
             + ''.join(f' ({remark})' for remark in pulses.remarks))
     rows = tuple(range(samples.shape[1]))
     orders = np.array(sources if len(sources) else [
@@ -187,7 +194,7 @@ def together(observations: Sequence[Observation]) -> Observation:
     """
     Return the acquisitions of several recordings of one machine as one observation.
 
-    Raises ModelError for recordings of different machines: other channels, rate or amplitudes.
+    Raises ModelError for recordings of different machines: channels, rate or amplitudes differ.
     """
     first = observations[0]
     level = np.abs(first.stacked('corrected')).mean(axis=0)
@@ -202,8 +209,8 @@ def together(observations: Sequence[Observation]) -> Observation:
         strong = level > 0.2 * level.max()
         if not np.all((ratio[strong] > 1.0 / _OTHER_MACHINE) & (ratio[strong] < _OTHER_MACHINE)):
             raise ModelError(f'recordings {first.name!r} and {other.name!r} have amplitudes that '
-                             f'differ more than {_OTHER_MACHINE:g}-fold: these are different '
-                             'machines or loads; run the loop on each by itself')
+                             f'differ by more than a factor of {_OTHER_MACHINE:g}: these are '
+                             'different machines or loads; run the loop on each alone')
     pulses = RecordPulses(
         **{name: np.concatenate([getattr(item.pulses, name) for item in observations])
            for name in ('times', 'missing', 'starts_run', 'doubtful', 'bridged')},
@@ -220,7 +227,7 @@ def together(observations: Sequence[Observation]) -> Observation:
 
 def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]
                     ) -> FloatArray:
-    """Return pulse errors (acquisition, N_t + 1) that only some channels tell, NaN where none."""
+    """Return the pulse errors (acquisition, N_t + 1) from some channels, NaN where refused."""
     samples = np.ascontiguousarray(recording.read().T)
     reader = CycleReader(samples - samples.mean(axis=0), recording.start_time,
                          recording.sample_rate, 'band_limited')
@@ -235,7 +242,7 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
 
 
 def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
-    """Return the first pulse of every acquisition whose vibration and pulses can be believed."""
+    """Return the first pulse of every acquisition with valid pulses and gapless vibration."""
     times, number = pulses.times, pulses.number
     found, first = [], law.before
     while first + cycles + law.after < times.size:
@@ -257,7 +264,7 @@ def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLa
 
 def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel,
                       starts: Sequence[int], orders: FloatArray, rows: tuple[int, ...]) -> bool:
-    """Tell, by a few acquisitions, whether the better keyphasor keeps the amplitudes."""
+    """Whether, in a few acquisitions, the reference keyphasor keeps the amplitudes."""
     bare = replace(pulses, reference=None)
     kept, gained = [], []
     for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
@@ -273,9 +280,9 @@ def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: Declared
     gain = np.median(gained, axis=0)
     if np.any(gain > 1.0 + _LOSS):
         raise RecordingError(
-            f'reference_pulse_times keep less amplitude than pulse_times (raw over reference '
-            f'amplitude {np.nanmax(gain):.3f}): the reference keyphasor is the worse one; give '
-            'the better one or none')
+            f'reference_pulse_times give less amplitude than pulse_times (raw over reference '
+            f'amplitude {np.nanmax(gain):.3f}, at most {1.0 + _LOSS:g}): the reference keyphasor '
+            'is worse; give a better one or none')
     return not kept or not bool(np.any(np.median(kept, axis=0) < 1.0 - _LOSS))
 
 
@@ -293,25 +300,25 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
                            additional_orders=sources)
     errors = np.full(times.size, np.nan)
     standard_errors, ripple = errors.copy(), np.full(count, np.nan)
-    bend_error = float('nan')
+    ripple_uncertainty = float('nan')
     better: FloatArray = fixed
     if recovery.accepted:
         errors, standard_errors = recovery.errors[keep], recovery.standard_errors[keep]
         if with_ripple:
-            ripple, bend_error = recovery.ripple, ripple_error(recovery, model)
+            ripple, ripple_uncertainty = recovery.ripple, ripple_error(recovery, model)
         better = fixed - recovery.errors
     law = angle_law(model.angle_law)
     near = slice(first - law.before, first + count + 1 + law.after)
-    clean_law = angle_law('linear')  # whose error in a cycle the recovery knows
+    clean_law = LINEAR_LAW  # the recovery is a model of the linear law
     if pulses.reference is not None:
         clean_law = law
         better = pulses.reference[here.start - law.before:here.stop + law.after]
         errors = times - pulses.reference[here][keep]
     errors = errors - errors.mean()
-    clear = with_ripple and np.mean(ripple**2) > _RIPPLE * bend_error**2
-    bend = ripple if pulses.reference is None and clear else None
+    clear = with_ripple and np.mean(ripple**2) > _RIPPLE * ripple_uncertainty**2
+    corrected_ripple = ripple if pulses.reference is None and clear else None
     raw = reader.average(reader.cycles(pulses.times[near], law=law), model, sources, law)
-    cycles = reader.cycles(better, law=clean_law, ripple=bend)
+    cycles = reader.cycles(better, law=clean_law, ripple=corrected_ripple)
     corrected = reader.average(cycles, model, sources, clean_law)
     clean = without_leakage(
         corrected.cycle_amplitudes, tuple(sources.tolist()), model.cycle_length,
@@ -322,4 +329,4 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, fixed, errors, standard_errors, raw.cycle_amplitudes, clean,
-        corrected.noise, floor, ripple, bend_error, recovery.accepted, recovery.reason)
+        corrected.noise, floor, ripple, ripple_uncertainty, recovery.accepted, recovery.reason)

@@ -1,4 +1,4 @@
-"""The trigger pulses of a whole recording, numbered over gaps, and those of a better keyphasor."""
+"""The trigger pulses of a recording, numbered over gaps, and those of a reference keyphasor."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,14 +16,14 @@ BoolArray = NDArray[np.bool_]
 
 _SPEED_TOLERANCE = 0.1
 _MOST_SPURIOUS = 0.05
-# Marks of a target that nobody has declared may stand out of place by an eighth of an interval.
+# Marks of an undeclared target may deviate from even spacing by an eighth of an interval.
 _TOLERANCE = 0.3
 _FEWEST = 3
-_SAME_RATIO = 1e-5  # six digits, as people write them
+_SAME_RATIO = 1e-5  # relative; users give six digits
 _SAME_RATE = 0.01
-# Pulses by which two keyphasors are aligned, and the share of the pulses that both must have.
+# Pulses used to align two keyphasors, and the fraction of the pulses that the reference must have.
 _ALIGNED, _COVERED = 15, 0.5
-_AS_MANY = 0.6  # of the pulses: a reference with fewer has one pulse a trigger cycle
+_AS_MANY = 0.6  # fraction of the pulses: a reference with fewer has one pulse per trigger cycle
 _LONGEST_GAP = 1_000_000  # pulses
 
 
@@ -32,12 +32,12 @@ class RecordPulses:
     """
     Trigger pulses of a recording.
 
-    `times` (n,) in s are those that were measured; `missing` (n - 1,) is how many trigger pulses
-    lack in each interval. `starts_run` (n,): the number of trigger cycles since the pulse before
-    is not certain. `doubtful` (n,): a double pulse was dropped beside it, and it may be the double
-    itself. `bridged` and `reference` (m,), m = n + the missing ones, are the times with short gaps
-    filled and those of a better keyphasor, NaN where there is none; `reference` is None without
-    one. `remarks` say what was done to the pulses.
+    `times` (n,) in s are the measured ones; `missing` (n - 1,) is the number of trigger pulses
+    that are missing in each interval. `starts_run` (n,): the number of trigger cycles since the
+    pulse before is uncertain. `doubtful` (n,): a double pulse next to this one was dropped, and
+    this one may be the wrong one. `bridged` (m,), m = n + the missing ones, are the times with
+    missing pulses interpolated, `reference` (m,) those of a reference keyphasor (None without
+    one); both are NaN where there is no pulse. `remarks` say how pulses were repaired.
     """
 
     times: FloatArray
@@ -50,40 +50,41 @@ class RecordPulses:
 
     @classmethod
     def unbroken(cls, times: FloatArray) -> 'RecordPulses':
-        """Return consecutive trigger pulses, all of which can be believed."""
+        """Return consecutive trigger pulses, all of which are valid."""
         none = np.zeros(times.size, np.bool_)
         return cls(times, np.zeros(max(times.size - 1, 0), np.int64), none, none, times)
 
     @property
     def number(self) -> IntArray:
-        """Return how many trigger cycles each pulse (n,) is after the first one."""
+        """Return the number of trigger cycles from the first pulse to each pulse (n,)."""
         return numbered(self.missing)
 
 
 def numbered(missing: IntArray) -> IntArray:
-    """Return the numbers (n,) of pulses of which `missing` (n - 1,) lack between them."""
+    """Return the numbers (n,) of pulses between which `missing` (n - 1,) others are missing."""
     return np.asarray(np.concatenate(([0], np.cumsum(1 + missing))), np.int64)
 
 
 def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     """
-    Return the trigger pulses of a recording, as the pulse validation of the averager accepts them.
+    Return the trigger pulses of a recording that the pulse validation of the averager accepts.
 
-    Raises ModelError where the recording contradicts the declared model and RecordingError where
-    it has no usable pulses.
+    Raises ModelError if the recording contradicts the declared model, RecordingError if it has no
+    usable pulses.
     """
     if abs(recording.ratio / model.ratio - 1.0) > _SAME_RATIO and recording.ratio != 1.0:
         raise ModelError(f'ratio is declared as {model.ratio:.9g} but the recording says '
                          f'{recording.ratio:.9g}: declare the ratio of this machine')
     if recording.pulses_per_revolution not in (1, model.pulses_per_revolution):
         raise ModelError(f'pulses_per_revolution is declared as {model.pulses_per_revolution} but '
-                         f'the recording says {recording.pulses_per_revolution}')
+                         f'the recording says {recording.pulses_per_revolution}: declare '
+                         'that of this machine')
     step = model.pulses_per_trigger or model.pulses_per_revolution
     # As the keyphasor was sampled: the jitter of its sampling is part of the declared model.
     measured = recording.keyphasor_pulses(interpolate=False)
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
-                             'look at the tach, its level may never cross the threshold')
+                             'check that the tach waveform crosses its threshold')
     pulses, counts = _validated(measured)
     spurious = counts.doubles + counts.early
     if spurious > _MOST_SPURIOUS * measured.size:
@@ -110,7 +111,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
 
 @dataclass(frozen=True)
 class _Accepted:
-    """Accepted pulses (k,), missing ones that were put in included, numbered over all gaps."""
+    """Accepted pulses (k,) with interpolated missing ones, numbered over all gaps."""
 
     times: FloatArray
     number: IntArray
@@ -133,8 +134,8 @@ class _Accepted:
 
 
 def _validated(times: FloatArray) -> tuple[_Accepted, PulseCounts]:
-    """Return the accepted pulses, and what became of all."""
-    # Every pulse is a trigger here: trigger cycles are counted over what breaks a run.
+    """Return the accepted pulses, and the counts of all pulses."""
+    # Every pulse is a trigger here, so that pulses are counted also where a run is interrupted.
     validator = PulseValidator(missing_pulses='bridge', interval_tolerance=_TOLERANCE)
     found = validator.update(times)
     number = found.count.copy()
@@ -143,8 +144,8 @@ def _validated(times: FloatArray) -> tuple[_Accepted, PulseCounts]:
         gap = float(found.times[begin] - found.times[begin - 1])
         number[begin:] += number[begin - 1] + int(np.clip(round(gap / usual), 1, _LONGEST_GAP)
                                                   ) - number[begin]
-    # The double, or the pulse before it, is the true one; one of the last two before a break may
-    # be what broke the run.
+    # Of a double and the pulse before it, either may be the true one. One of the last two pulses
+    # before an interruption may be its cause.
     doubtful = found.doubtful | np.append((found.doubtful | found.starts_run)[1:], False)
     doubtful[:-2] |= found.starts_run[2:]
     return (_Accepted(found.times, number, found.measured, found.starts_run, doubtful),
@@ -152,7 +153,7 @@ def _validated(times: FloatArray) -> tuple[_Accepted, PulseCounts]:
 
 
 def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArray:
-    """Return the time of every trigger pulse (m,) on the better keyphasor, NaN where none is."""
+    """Return the reference time of every trigger pulse (m,), NaN where there is none."""
     some = pulses.times[:_ALIGNED]
     nearest = np.argmin(np.abs(better.times[:, None] - some), axis=0)
     shift = int(np.median(better.number[nearest] - step * pulses.number[:some.size]))
@@ -164,34 +165,34 @@ def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArra
     matched[inside] = known[wanted[inside]]
     share = float(np.mean(np.isfinite(matched[pulses.number])))
     if share < _COVERED:
-        raise RecordingError(f'reference_pulse_times cover {share:.0%} of the pulses: give the '
-                             'same stretch of time')
+        raise RecordingError(f'reference_pulse_times cover {share:.0%} of the pulses, at least '
+                             f'{_COVERED:.0%} are needed: give pulses of the same period of time')
     return matched
 
 
 def _remarks(counts: PulseCounts, total: int) -> Sequence[str]:
-    """Say what the validation dropped, put in or could not use."""
+    """Return what the validation dropped, interpolated or could not use, one sentence each."""
     found = []
     spurious = counts.doubles + counts.early
     if spurious:
         found.append(f'{spurious} of {total} pulses are spurious ({counts.doubles} double, '
-                     f'{counts.early} early): they were dropped, and no acquisition holds a '
-                     'trigger cycle beside them')
+                     f'{counts.early} early): they were dropped, and no acquisition contains a '
+                     'trigger cycle next to them')
     if counts.missing_bridged:
-        found.append(f'{counts.missing_bridged} pulses are missing beside the {total} that were '
+        found.append(f'{counts.missing_bridged} pulses are missing between the {total} that were '
                      'measured')
     if counts.late:
-        found.append(f'{counts.late} of {total} pulses come late, after a gap that is no whole '
-                     'number of intervals or longer than three missing pulses: no acquisition '
-                     'holds such a gap')
+        found.append(f'{counts.late} of {total} pulses are late: the gap before them is not a '
+                     'whole number of intervals, or longer than three missing pulses; no '
+                     'acquisition contains such a gap')
     if counts.unlocked:
-        found.append(f'{counts.unlocked} of {total} pulses came while no steady interval was '
+        found.append(f'{counts.unlocked} of {total} pulses arrived before a steady interval was '
                      'known: they were dropped')
     return found
 
 
 def _tach_rate_remark(recording: Recording, model: DeclaredModel) -> Sequence[str]:
-    """Say that the recording's tach was sampled at another rate than the declared one."""
+    """Return a remark if the tach was sampled at another rate than the declared one."""
     rate = recording.tach_rate
     if not rate or abs(model.keyphasor_rate / rate - 1.0) <= _SAME_RATE:
         return []

@@ -110,9 +110,9 @@ def predict(model: DeclaredModel, effects: Sequence[Influence] = ()) -> Predicti
     >>> model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
     ...                       orders=(23.0, 46.0))
     >>> predict(model).mean_attenuation.round(3)
-    array([0.991, 0.966])
+    array([0.997, 0.986])
     >>> predict(model, [make_effect('excess_jitter', std=5e-5)]).mean_attenuation.round(3)
-    array([0.974, 0.9  ])
+    array([0.986, 0.946])
     """
     amplitudes = unit_amplitudes(model, effects)
     noise = line_variance(model, effects)

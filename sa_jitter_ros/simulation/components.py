@@ -10,7 +10,7 @@ from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 
 ComplexArray = NDArray[np.complex128]
 
-MAX_WIDTH = 0.15  # beyond it bursts of more than the next revolutions would overlap
+MAX_WIDTH = 0.15  # revolutions; beyond it more than two neighbouring bursts overlap
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Component:
     """
     A sinusoid locked to a shaft: amplitude x cos(2 pi order x angle + phase) on every channel.
 
-    `order` in multiples of the shaft, peak `amplitudes` and `phases` (rad) one per channel.
+    `order` in multiples of the shaft speed; peak `amplitudes` and `phases` (rad), one per channel.
     """
 
     shaft: str
@@ -35,11 +35,17 @@ class Component:
 @dataclass(frozen=True)
 class ChippedTooth:
     """
-    A burst once a revolution of a shaft, where the broken tooth passes.
+    A burst once per revolution of a shaft, where the chipped tooth is in mesh.
 
     It is amplitude x exp(-x^2/2) x cos(2 pi order (angle - place)), x = (angle - place) / `width`,
-    angles in revolutions: added to a mesh it weakens or strengthens the mesh over about `width`
+    angles in revolutions. Added to a mesh it weakens or strengthens the mesh over about `width`
     revolutions around `place`. The order is a whole number, the width at most 0.15.
+
+    >>> tooth = ChippedTooth('output', order=19, amplitudes=(0.5,), width=0.02, place=0.5)
+    >>> tooth.burst(np.array([0.5, 0.53])).round(3)
+    array([ 1.   , -0.294])
+    >>> abs(tooth.phasor(19.0)).round(4)
+    array([0.0251])
     """
 
     shaft: str
@@ -51,7 +57,8 @@ class ChippedTooth:
     def __post_init__(self) -> None:
         """Check the parameters."""
         if self.order != int(self.order) or self.order < 0:
-            raise ParameterError(f'order {self.order} of a chipped tooth: must be a whole number')
+            raise ParameterError(f'order {self.order} of a chipped tooth: give a whole number, '
+                                 'at least 0')
         if not 0 < self.width <= MAX_WIDTH:
             raise ParameterError(f'width {self.width} of a chipped tooth: must be positive and at '
                                  f'most {MAX_WIDTH} revolutions')
@@ -90,9 +97,14 @@ def mesh(shaft: str, teeth: int, *, harmonics: Sequence[float] = (1.0, 0.5, 0.25
     channel_gains
         Factor on each channel.
     sidebands
-        Distance in orders from each harmonic, with the amplitude relative to it, on either side.
+        Distance from each harmonic in orders: amplitude relative to it, on either side.
     seed
         Of the phases.
+
+    Examples
+    --------
+    >>> [(line.order, line.amplitudes) for line in mesh('output', 19, harmonics=(1.0, 0.5))]
+    [(19.0, (1.0,)), (38.0, (0.5,))]
 
     """
     lines = [(teeth * (k + 1.0), amplitude) for k, amplitude in enumerate(harmonics)]

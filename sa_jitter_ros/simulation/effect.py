@@ -1,4 +1,4 @@
-"""The base of simulated effects, and the properties of the machine that they may use."""
+"""The base class of simulated effects, and the properties of the machine that they may use."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,14 +32,14 @@ class Setting:
 
 
 class Effect:
-    """An effect that changes nothing; each effect overrides the methods that it needs."""
+    """Base class of the effects: it changes nothing, subclasses override what they change."""
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation of the speed."""
         return ZERO
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
-        """Return the angle in rad that is added to the angle of a shaft in its vibration."""
+        """Return an angle (rad) that is added to the angle of a shaft in its vibration."""
         return 0.0
 
     def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
@@ -48,7 +48,7 @@ class Effect:
 
     def sampled(self, setting: Setting, signal: Signal, start: int,
                 stop: int) -> FloatArray | None:
-        """Return samples `start` to `stop` of a signal, None where the effect does not sample."""
+        """Return samples `start` to `stop` of a signal, None if the effect does not resample."""
         return None
 
     def added(self, setting: Setting, start: int, stop: int) -> FloatArray | float:
@@ -57,7 +57,7 @@ class Effect:
 
     def pulse_delay(self, setting: Setting, index: IndexArray,
                     times: FloatArray) -> FloatArray | float:
-        """Return the delay in s of the pulses `index`, which are due at `times`."""
+        """Return the delay (s) of the pulses `index`, whose true times are `times` (s)."""
         return 0.0
 
     def observed(self, setting: Setting, times: FloatArray) -> FloatArray:

@@ -21,25 +21,25 @@ from sa_jitter_ros.simulation.random_streams import (
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtri
 
-MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones to draw
+MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones
 JITTER_DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
-GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # of rates; irrational: fractions spread evenly
-_SPLINE_MARGIN = 32  # an end acts on the spline by 0.268^32 there: below rounding
+GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # relative, irrational: all fractions occur evenly
+_SPLINE_MARGIN = 32  # samples; there the end acts on the spline by 0.268^32: below rounding
 
 Interpolator = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def _per_pulse(draw: Callable[[int, int], FloatArray], index: IndexArray) -> FloatArray:
-    """Return one item of a stream for each of consecutive pulses."""
+    """Return one item of a stream for each of some consecutive pulses."""
     return draw(int(index[0]), int(index[-1]) + 1)[0] if index.size else np.empty(0)
 
 
 @dataclass(frozen=True)
 class DeclaredJitter(Effect):
     """
-    The declared pulse error: independent, of zero mean.
+    The declared pulse errors: independent, of zero mean.
 
-    `std` in s; a `table` (s) lists equally likely errors and needs no `std`.
+    `std` in s; a `table` (s) has equally likely errors and needs no `std`.
     """
 
     distribution: str
@@ -54,7 +54,7 @@ class DeclaredJitter(Effect):
         require_number('jitter std', self.std, minimum=0)
         if self.distribution == 'table' and not (
                 self.table and np.isfinite(self.table).all()):
-            raise ParameterError(f'jitter table {self.table}: needs finite errors in s')
+            raise ParameterError(f'jitter table {self.table}: give finite errors in s')
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the error of each pulse."""
@@ -72,7 +72,7 @@ class DeclaredJitter(Effect):
 
 @dataclass(frozen=True)
 class ExcessJitter(Effect):
-    """Independent normal errors of the pulse times, `std` s (electrical noise)."""
+    """Independent normal errors of the pulse times, `std` in s (electrical noise)."""
 
     std: float
 
@@ -87,7 +87,7 @@ class ExcessJitter(Effect):
 
 @dataclass(frozen=True)
 class CorrelatedJitter(Effect):
-    """Normal errors of `std` s, pulses k apart correlated by `correlation^k`."""
+    """Normal errors of `std` s; those of pulses k apart have the correlation `correlation^k`."""
 
     std: float
     correlation: float
@@ -110,7 +110,7 @@ class TargetGeometry(Effect):
     """
     Marks of the target that are not evenly spaced: pulse k is late by `pulse_angles[k mod n]` rad.
 
-    With one angle for each pulse of a revolution, an angle belongs to a mark of the target.
+    With as many angles as pulses per revolution, each angle belongs to a mark of the target.
     """
 
     pulse_angles: tuple[float, ...]
@@ -118,11 +118,11 @@ class TargetGeometry(Effect):
     def __post_init__(self) -> None:
         """Check the parameters."""
         if not self.pulse_angles or not np.isfinite(self.pulse_angles).all():
-            raise ParameterError(f'target_geometry.pulse_angles {self.pulse_angles}: needs at '
+            raise ParameterError(f'target_geometry.pulse_angles {self.pulse_angles}: give at '
                                  'least one finite angle in rad')
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
-        """Return how much later each mark passes than an evenly spaced one."""
+        """Return the delay of each mark against an evenly spaced one."""
         marks = np.array(self.pulse_angles)[index % len(self.pulse_angles)] / (2.0 * np.pi)
         nominal = index / setting.pulses_per_revolution
         return setting.motion.time_at(nominal + marks) - times
@@ -130,7 +130,7 @@ class TargetGeometry(Effect):
 
 @dataclass(frozen=True)
 class ClockSkew(Effect):
-    """The clock of the keyphasor runs fast by `skew`: it shows t (1 + skew) at time t."""
+    """The clock of the keyphasor is fast by `skew`: it shows t (1 + skew) at time t."""
 
     skew: float
 
@@ -148,8 +148,8 @@ class KeyphasorQuantisation(Effect):
     """
     The keyphasor is sampled: pulse times are rounded up to a clock of `clock_rate` Hz.
 
-    `period_std` (s) is the standard deviation of the trigger period by a slow speed fluctuation,
-    which spreads the pulses evenly between the ticks of the clock.
+    `period_std` (s) is the standard deviation of the trigger period due to a slow speed
+    fluctuation, which distributes the pulses evenly between the ticks of the clock.
     """
 
     clock_rate: float
@@ -190,10 +190,10 @@ class MissingPulses(Effect):
 @dataclass(frozen=True)
 class SpeedFluctuation(Effect):
     """
-    Random acceleration of `acceleration_std` rad/s^2 of the tach shaft.
+    Random acceleration of the tach shaft with the standard deviation `acceleration_std` (rad/s^2).
 
-    Its frequencies lie below a fifth of the trigger rate: it is nearly constant within a trigger
-    cycle.
+    Its frequencies are below a fifth of the trigger rate, so that it is nearly constant within a
+    trigger cycle.
     """
 
     acceleration_std: float
@@ -215,7 +215,7 @@ class PhaseWander(Effect):
     """
     Slow random angle of `std` rad between a shaft and its vibration, independent for each shaft.
 
-    Its frequencies reach up to `bandwidth` times the trigger rate.
+    Its frequencies are up to `bandwidth` times the trigger rate.
     """
 
     std: float
@@ -269,7 +269,7 @@ def spline(samples: FloatArray, positions: FloatArray) -> FloatArray:
     return np.asarray(CubicSpline(np.arange(samples.shape[1]), samples, axis=1)(positions))
 
 
-# Name of the averager's method: function, and number of samples that it needs on either side.
+# Name of the averager's method: its function and the samples that it needs on either side.
 INTERPOLATORS: Mapping[str, tuple[Interpolator, int]] = {
     'linear': (linear, 1), 'cubic': (cubic, 2), 'spline': (spline, _SPLINE_MARGIN)}
 
@@ -279,7 +279,7 @@ class InterpolationLoss(Effect):
     """
     The vibration was sampled on another grid of nearly the same rate and interpolated by `method`.
 
-    Positions between two samples of the other grid run evenly through all fractions.
+    The positions between two samples of that grid go evenly through all fractions.
     """
 
     method: str
@@ -336,7 +336,7 @@ class InterferingTone(Effect):
         return np.asarray(self.amplitude * np.cos(2.0 * np.pi * (cycles % 1.0 + phase)))
 
 
-# A clock's skew comes before its quantisation: effects are applied in this order.
+# Effects are applied in this order: the skew of a clock before its quantisation.
 EFFECTS: Mapping[str, type[Effect]] = {
     'excess_jitter': ExcessJitter,
     'correlated_jitter': CorrelatedJitter,
@@ -355,13 +355,16 @@ EFFECTS: Mapping[str, type[Effect]] = {
 
 def make_effects(options: Mapping[str, Mapping[str, Any]]) -> tuple[Effect, ...]:
     """
-    Return effects from their names and parameters, as `{'clock_skew': {'skew': 1e-5}}`.
+    Return effects from their names and parameters.
 
     Raises ParameterError if there is no such effect or parameter, or a value is out of range.
+
+    >>> make_effects({'excess_jitter': {'std': 2e-5}, 'clock_skew': {'skew': 1e-5}})
+    (ExcessJitter(std=2e-05), ClockSkew(skew=1e-05))
     """
     for name, parameters in options.items():
         if name not in EFFECTS:
-            raise ParameterError(f'no effect {name!r}: there are {", ".join(EFFECTS)}')
+            raise ParameterError(f'no effect {name!r}: choose from {", ".join(EFFECTS)}')
         known = [item.name for item in fields(EFFECTS[name])]  # type: ignore[arg-type]
         if set(parameters) - set(known):
             raise ParameterError(f'effect {name} has {", ".join(known)} and not '

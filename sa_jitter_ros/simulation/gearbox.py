@@ -1,8 +1,8 @@
 """
-A simulated gearbox: vibration and keyphasor pulses, exact at its true angle.
+A simulated gearbox: vibration and keyphasor pulses at its exact angle.
 
 Samples and pulses depend on the seed and their index only, not on the blocks in which they are
-read: they are evaluated in chunks at fixed places, and the last chunk is kept.
+read: they are computed in chunks at fixed indices, and the last chunk is kept.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ from sa_jitter_ros.simulation.motion import Motion, Torsion
 from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream, SinusoidSum, ZERO
 
 CHUNK = 4096
-_PULSE_MARGIN = 3  # pulses beyond a window whose errors may carry them into it
+_PULSE_MARGIN = 3  # pulses beyond a window that may be in it because of their errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Gearbox:
     Parameters
     ----------
     components
-        Orders that the vibration consists of.
+        Orders of the vibration.
     sample_rate
         Sampling rate of the vibration, Hz.
     shafts
@@ -51,7 +51,7 @@ class Gearbox:
     faults
         Chipped teeth.
     effects
-        Declared jitter and noise first, then undeclared effects; applied in this order.
+        Declared jitter and noise, then undeclared effects; they are applied in this order.
     seed
         Seed of all random numbers.
 
@@ -59,6 +59,19 @@ class Gearbox:
     ------
     ParameterError
         If the parts do not fit each other.
+
+    Examples
+    --------
+    A gear of 19 teeth whose keyphasor is sampled at 3 kHz:
+
+    >>> from sa_jitter_ros.simulation import DeclaredJitter, mesh
+    >>> gearbox = Gearbox(mesh('output', 19), 20e3, shafts={'output': 2.5}, speed=[(0.0, 16.6)],
+    ...                   effects=[DeclaredJitter('uniform', 1 / 3e3 / np.sqrt(12))], seed=1)
+    >>> gearbox.vibration(0, 20_000).shape, abs(gearbox.amplitude(38.0, 'output')).tolist()
+    ((1, 20000), [0.5])
+    >>> pulses = gearbox.pulses(0.0, 10.0)
+    >>> pulses.times.size, bool(abs(pulses.errors).max() < 0.5 / 3e3)
+    (166, True)
 
     """
 
@@ -81,14 +94,14 @@ class Gearbox:
         parts = self._parts
         for part in parts:
             if part.shaft not in self.shafts:
-                raise ParameterError(f'no shaft {part.shaft!r}: there are '
+                raise ParameterError(f'no shaft {part.shaft!r}: choose from '
                                      f'{", ".join(self.shafts)}')
         sizes = {len(part.amplitudes) for part in parts} | {
             len(component.phases) for component in self.components}
         if len(sizes) != 1 or 0 in sizes:
             raise ParameterError(f'components of {sorted(sizes)} channels: give all the same '
                                  'number')
-        self.setting  # noqa: B018 (an impossible motion must fail here)
+        self.setting  # noqa: B018 (raises the error of an impossible motion)
 
     @property
     def _parts(self) -> tuple[Component | ChippedTooth, ...]:
@@ -126,8 +139,8 @@ class Gearbox:
         """
         Return the true complex amplitude of an order of a shaft, one per channel.
 
-        Peak amplitude and phase of a cosine of the shaft's true angle, without effects; components
-        of all shafts that turn at this order count.
+        It is peak amplitude and phase of a cosine of the true angle of the shaft, without effects,
+        summed over the components of all shafts at this order.
         """
         total = np.zeros(self.channels, dtype=np.complex128)
         for component in self.components:
@@ -165,7 +178,7 @@ class Gearbox:
         return Pulses(pulses.index[found], pulses.times[found], pulses.true_times[found])
 
     def _pulses_around(self, start: float, stop: float) -> tuple[Pulses, NDArray[np.bool_]]:
-        """Return consecutive pulses that reach beyond a window, and which of them are measured."""
+        """Return consecutive pulses in and around a window, and which of them are measured."""
         setting, count = self.setting, self.keyphasor.pulses_per_revolution
         edges = np.array([start, stop])
         slack = 2.0 * float(np.abs(self._observed(edges) - edges).max())
@@ -236,7 +249,7 @@ class Gearbox:
         phase = keyphasor.pulses_per_revolution * motion.angle(true_times)
         pulse = np.floor(phase + 0.25)
         measured = kept[np.clip(pulse - pulses.index[0], 0, kept.size - 1).astype(np.int64)]
-        # A missing pulse leaves the waveform where it is just before one: low, or in the middle.
+        # Without its pulse the waveform keeps the level from before: low, or in the middle.
         within = np.where(measured, phase - pulse, 0.0 if keyphasor.waveform == 'sine' else 0.74)
         rise: FloatArray | float = 0.0
         if keyphasor.rise_time > 0.0:
@@ -248,7 +261,7 @@ class Gearbox:
 
 
 class _Chunks:
-    """Reads any range of samples from chunks at fixed places, and keeps the last chunk."""
+    """Reads any range of samples from chunks at fixed indices, and keeps the last chunk."""
 
     def __init__(self, evaluate: Callable[[int, int], FloatArray]) -> None:
         self._evaluate = evaluate

@@ -15,8 +15,8 @@ class Pulses:
     """
     Measured pulses and their true times.
 
-    The tach shaft has turned by `index` pulses at `true_times` (s); the keyphasor measured
-    `times` (s) instead.
+    `index` counts the pulses since angle 0; `true_times` (s) are their true times, `times` (s) the
+    measured ones.
     """
 
     index: IndexArray
@@ -43,12 +43,12 @@ class Keyphasor:
     rate
         Sampling rate of the waveform, Hz.
     waveform
-        'ttl': low, and high from a pulse on for `duty` of a pulse's cycle; 'sine': one period a
-        pulse, which rises through the middle level at the pulse.
+        'ttl': low, and high for the fraction `duty` of an interval from each pulse on; 'sine': one
+        period per pulse, which rises through the middle level at the pulse.
     low, high
         Levels.
     duty
-        Share of the cycle that is high, up to 0.6.
+        Fraction of the interval between pulses that is high, below 0.6.
     rise_time
         Of the edges, s; the pulse lies at half of it.
     noise_std
@@ -85,10 +85,10 @@ class Keyphasor:
 
     def shape(self, phase: FloatArray, rise: FloatArray | float) -> FloatArray:
         """
-        Return the noiseless waveform.
+        Return the waveform without noise.
 
-        `phase` counts from 0 at a pulse to 1 at the next, and may start a quarter below; a ttl
-        edge takes the share `rise` of that.
+        `phase` is 0 at a pulse and 1 at the next one; it may begin at -0.25. A ttl edge takes the
+        fraction `rise` of this range.
         """
         middle = (self.low + self.high) / 2.0
         if self.waveform == 'sine':

@@ -1,8 +1,8 @@
 """
 Motion of the tach shaft: speed profile, random fluctuation and torsion, exactly invertible.
 
-The angle is a chain of increasing maps, angle(t) = torsion(profile(warp(t))), each with an exact
-derivative, so that both the angle of any time and the time of any angle hold to rounding.
+The angle is a chain of increasing functions, angle(t) = torsion(profile(warp(t))), each with an
+exact derivative, so that the angle at any time and the time of any angle are exact to rounding.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.random_streams import FloatArray, SinusoidSum, ZERO
 
-MAX_FLUCTUATION = 0.9  # of the bound, about ten standard deviations, that is never reached
+MAX_FLUCTUATION = 0.9  # of the upper bound, which is about ten standard deviations
 MAX_TORSION = 0.5
 _PICARD_STEPS = 6
 _NEWTON_STEPS = 6
@@ -41,7 +41,7 @@ class Motion:
     ----------
     points
         Speed profile: times (s, from 0, increasing) and speeds (Hz, not negative), linear between
-        them and constant after the last one (which also holds before time 0).
+        them and constant after the last one. The last speed is also that before time 0.
     fluctuation
         Relative speed fluctuation as a function of time.
     torsion
@@ -53,6 +53,14 @@ class Motion:
     ------
     ParameterError
         If the profile is malformed or the shaft would turn backwards.
+
+    Examples
+    --------
+    >>> motion = Motion(points=[(0.0, 10.0), (2.0, 20.0)])
+    >>> motion.angle(np.array([0.0, 1.0, 2.0])), motion.speed(np.array([1.0]))
+    (array([ 0. , 12.5, 30. ]), array([15.]))
+    >>> motion.time_at(np.array([12.5, 40.0]))
+    array([1. , 2.5])
 
     """
 
@@ -81,11 +89,11 @@ class Motion:
         if self.fluctuation.bound > MAX_FLUCTUATION:
             raise ParameterError(
                 f'speed fluctuation may reach {self.fluctuation.bound:.3g} of the speed: at most '
-                f'{MAX_FLUCTUATION}; make it slower or smaller')
+                f'{MAX_FLUCTUATION}; lower its standard deviation')
         twist = sum(abs(item.order * item.amplitude) for item in self.torsion)
         if not twist <= MAX_TORSION:
-            raise ParameterError(f'torsion changes the speed by {twist:.3g} of itself: at most '
-                                 f'{MAX_TORSION}')
+            raise ParameterError(f'torsion changes the speed by up to {twist:.3g} of its value: '
+                                 f'at most {MAX_TORSION}; lower order or amplitude')
         steps = np.diff(times) * (speeds[1:] + speeds[:-1]) / 2.0
         object.__setattr__(self, '_times', times)
         object.__setattr__(self, '_speeds', speeds)
@@ -155,10 +163,10 @@ class Motion:
 def _invert(function: Callable[[FloatArray], FloatArray],
             slope: Callable[[FloatArray], FloatArray], values: FloatArray) -> FloatArray:
     """
-    Return where a function with slopes of 0.5 to 1.5 takes `values`.
+    Return the arguments at which a function with slopes of 0.5 to 1.5 has `values`.
 
-    Steps of slope 1 halve the error at least and bring Newton's method home. Their number is
-    fixed: the result for a value must not depend on the other values.
+    Steps of slope 1 at least halve the error, after which Newton's method converges. The number of
+    steps is fixed, so that the result for a value does not depend on the other values.
     """
     places = np.array(values)
     for step in range(_PICARD_STEPS + _NEWTON_STEPS):

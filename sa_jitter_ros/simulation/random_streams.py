@@ -22,7 +22,7 @@ _NEGLIGIBLE = 1e-17  # correlation below the resolution of a float64
 @dataclass(frozen=True)
 class RandomStream:
     """
-    An endless table of random numbers: item `k` of a row does not depend on how it is read.
+    An endless table of random numbers: item `k` of a row is the same however it is read.
 
     Parameters
     ----------
@@ -32,6 +32,12 @@ class RandomStream:
         Name of this stream; streams of different names are independent.
     rows
         Number of independent rows.
+
+    Examples
+    --------
+    >>> stream = RandomStream(seed=1, name='noise')
+    >>> bool(np.all(stream.normal(0, 3000)[:, 2000:2010] == stream.normal(2000, 2010)))
+    True
 
     """
 
@@ -51,7 +57,7 @@ class RandomStream:
         """
         Return standard normal items whose neighbours are correlated, lag k by `correlation^k`.
 
-        Each chunk filters white noise that begins so early that still earlier noise has no effect.
+        Each chunk filters white noise from so early on that earlier noise is negligible.
         """
         if abs(correlation) < _NEGLIGIBLE:
             return self.normal(start, stop)
@@ -79,7 +85,7 @@ class RandomStream:
 
     def _generator(self, chunk: int) -> np.random.Generator:
         key = np.random.SeedSequence([self.seed, zlib.crc32(self.name.encode())])
-        # The upper half of the counter is the chunk's number; numbers below 0 are legal.
+        # The upper half of the counter is the number of the chunk, which may be negative.
         return np.random.Generator(np.random.Philox(
             key=key.generate_state(2, np.uint64), counter=(chunk % 2**63) << 128))
 
@@ -95,7 +101,7 @@ class SinusoidSum:
     def value(self, times: FloatArray) -> FloatArray:
         """Return the value at `times`, of their shape."""
         angles = np.multiply.outer(times, 2.0 * np.pi * self.frequencies) + self.phases
-        # A plain sum, no matrix product: a value must not depend on the other times.
+        # A sum, not a matrix product, whose rounding depends on the other times.
         return np.asarray((np.cos(angles) * self.amplitudes).sum(axis=-1))
 
     def integral(self) -> 'SinusoidSum':
@@ -115,7 +121,7 @@ class SinusoidSum:
 
     @property
     def bound(self) -> float:
-        """Return a value that the function's magnitude never exceeds."""
+        """Return an upper bound of the magnitude of the function."""
         return float(np.abs(self.amplitudes).sum())
 
 
@@ -128,12 +134,16 @@ def band_limited(*, std: float, band: tuple[float, float], seed: int, name: str)
 
     Its standard deviation over a long time is `std`. Raises ParameterError if the band is not
     0 < low < high or `std` is negative.
+
+    >>> wander = band_limited(std=0.01, band=(0.5, 5.0), seed=1, name='wander')
+    >>> float(wander.value(np.arange(0.0, 500.0, 0.02)).std().round(4))
+    0.01
     """
     low, high = band
     if not 0.0 < low < high < np.inf:
-        raise ParameterError(f'{name}: band {low} to {high} Hz, must be 0 < low < high')
+        raise ParameterError(f'{name}: band is {low} to {high} Hz, must be 0 < low < high')
     if not 0.0 <= std < np.inf:
-        raise ParameterError(f'{name}: standard deviation {std}, must be at least 0')
+        raise ParameterError(f'{name}: standard deviation is {std}, must be at least 0')
     places, phases = RandomStream(seed, name, rows=2).uniform(0, LINES)
     frequencies = low + (np.arange(LINES) + places) * (high - low) / LINES
     return SinusoidSum(np.full(LINES, std * np.sqrt(2.0 / LINES)), frequencies,
