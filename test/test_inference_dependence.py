@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sa_jitter_ros.inference.dependence import dependences, moving, still_moving
+from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.fewer_cycles import fewer_cycles
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import make_bench, trace
@@ -135,7 +136,7 @@ def test_dependence_judges_normal_errors_by_their_own_scatter(rng):
         noisy = replace(bench.observation, acquisitions=tuple(
             replace(item, raw_cycles=item.raw_cycles * each)
             for item, each in zip(bench.observation.acquisitions, gain)))
-        shaken = replace(bench, observation=noisy, memory={}, fewer=None)
+        shaken = replace(bench, observation=noisy, memory=Memory(), fewer=None)
         p_values.append([item.p_value for item in dependences(shaken, (), ())
                          if item.on == 'speed'])
     share = np.mean(np.array(p_values) < 0.05)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.inference.expectation import expect, Lines
+from sa_jitter_ros.inference.expectation import expect, Lines, Memory
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.scoring import STEADY
@@ -131,7 +131,7 @@ def test_acquisitions_are_predicted_alike_together_alone_and_from_memory(observa
     lines, level, group = lines_of(observation)
     pulses = [[Pulses(item.times, item.first, item.errors, None, 1e-6 * (i % 2))]
               for i, item in enumerate(observation.acquisitions)]
-    memory = {}
+    memory = Memory()
 
     def predicted(chosen, kept=None):
         found = expect(observation, lines, level, effects, pulses, group, chosen, memory=kept,
@@ -142,7 +142,7 @@ def test_acquisitions_are_predicted_alike_together_alone_and_from_memory(observa
     alone = np.concatenate([predicted([a]) for a in range(4)], axis=1)
     assert together == pytest.approx(alone, rel=1e-6)
     assert np.array_equal(predicted([2, 1], memory), together[:, [2, 1]])
-    assert len(memory) == 4
+    assert len(memory.shown) == 4
 
 
 def test_uncertain_pulse_errors_do_not_attenuate(observation, rng):

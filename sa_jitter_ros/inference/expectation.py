@@ -7,41 +7,41 @@ each other with the amplitudes that the channel has.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
-from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.cycle_reader import kept_apart
 from sa_jitter_ros.inference.observation import Acquisition, Observation
-from sa_jitter_ros.prediction.amplitude_distribution import (
-    AmplitudeDistribution, normal_distribution)
-from sa_jitter_ros.prediction.amplitudes import component_gain, line_variance
+from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
+from sa_jitter_ros.prediction.amplitudes import (
+    Amplitudes, component_gain, known_amplitudes, line_variance, unit_amplitudes)
 from sa_jitter_ros.prediction.angle_error import (
-    AngleErrorProcess, GaussianAngleError, IndependentPulseJitter, joint_characteristic,
-    unit_nodes)
+    AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses, random_processes
+from sa_jitter_ros.prediction.influence import (
+    Influence, known_errors, mean_period, Pulses, random_processes)
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.prediction.moments import AverageMoments, cycle_moments
-from sa_jitter_ros.prediction.scenario_moments import scenario_moments
+from sa_jitter_ros.prediction.moments import cycle_moments
+from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 
 Array = NDArray[Any]
 
-#: What was predicted for effects and an acquisition: moments and noise (line,).
-Memory = dict[tuple[tuple[Effect, ...], int], tuple[AverageMoments, Array]]
+Distribution = AmplitudeDistribution | SampledDistribution
 
 #: What resampling leaves of uncertainty in an amplitude, in parts of it.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
-_MOST_KEPT = 20_000  # acquisitions, of a few kB each
+_MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
+# Draws of all lines of all acquisitions together: as many as take less time than the moments.
+_MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
 # Speeds closer than this are the same.
 _SPEED_STEP = 1e-3
 _SHARPEST = 2.0
-_LEAST = 1e-300
 
 
 @dataclass(frozen=True)
@@ -62,23 +62,124 @@ class Lines:
 
 
 @dataclass(frozen=True)
+class _Shown:
+    """
+    What averages show of unit components, one entry per row: a line of an acquisition.
+
+    `index` (row,) are places among all lines of all acquisitions, `order` indices of orders;
+    `shift` is added to the component and `noise`, E|n|^2, to the sum. `scenario` (row,) is the
+    acquisition's own where its pulses are known, None where they are not.
+    """
+
+    amplitudes: Amplitudes
+    scenario: NDArray[np.intp] | None
+    index: NDArray[np.intp]
+    order: NDArray[np.intp]
+    shift: Array
+    noise: Array
+
+    def distribution(self, rows: Array, noise: Array, most: int) -> Distribution:
+        """Return the distribution of some rows with as much noise."""
+        order, shift = self.order[rows], self.shift[rows]
+        if self.scenario is None:
+            return self.amplitudes.distribution(order, shift=shift, noise=noise, most=most)
+        return self.amplitudes.distribution_in(self.scenario[rows], order, shift=shift,
+                                               noise=noise)
+
+
+class Memory:
+    """What was predicted for effects and an acquisition, as long as it takes little room."""
+
+    def __init__(self) -> None:
+        """Begin with nothing."""
+        self.shown: dict[tuple[tuple[Influence, ...], int], list[_Shown]] = {}
+        self._drawn = 0
+
+    def make_room(self) -> None:
+        """Forget everything where it is too much."""
+        if len(self.shown) > _MOST_KEPT or self._drawn > _MOST_DRAWN:
+            self.shown.clear()
+            self._drawn = 0
+
+    def count(self, amplitudes: Amplitudes) -> None:
+        """Count the draws that are kept with these amplitudes."""
+        if amplitudes.draws is not None:
+            self._drawn += amplitudes.draws.size
+
+
+@dataclass(frozen=True)
 class Expectation:
     """
     Predicted distributions of the lines, arrays (acquisition, line).
 
     `attenuation` and `attenuation_variance` are those of raw over corrected amplitude, without
     noise; `amplitude` and `amplitude_variance` those of the raw amplitude over its level, noise
-    and unsteadiness included, of which `distribution` (flattened) is the distribution.
+    and unsteadiness included, of which `cdf` is the distribution function.
     """
 
-    attenuation: Array
-    attenuation_variance: Array
-    amplitude: Array
-    amplitude_variance: Array
-    distribution: AmplitudeDistribution
+    shown: tuple[_Shown, ...] = field(repr=False)
+    noise: Array
+
+    @cached_property
+    def attenuation(self) -> Array:
+        """Return E|X|."""
+        return self._gathered(self._bare, 'mean')
+
+    @cached_property
+    def attenuation_variance(self) -> Array:
+        """Return Var|X|, and what resampling leaves of uncertainty."""
+        return self._gathered(self._bare, 'variance') + RESOLUTION**2
+
+    @cached_property
+    def amplitude(self) -> Array:
+        """Return E|X + n|."""
+        return self._gathered(self._full, 'mean')
+
+    @cached_property
+    def amplitude_variance(self) -> Array:
+        """Return Var|X + n|."""
+        return self._gathered(self._full, 'variance')
+
+    def cdf(self, amplitude: Array) -> Array:
+        """Return P(|X + n| <= amplitude) for an amplitude (acquisition, line) each."""
+        values = np.empty(self.noise.size)
+        for item, distribution in zip(self.shown, self._full):
+            values[item.index] = distribution.cdf(amplitude.ravel()[item.index][:, None])[:, 0]
+        return values.reshape(self.noise.shape)
+
+    def mean_cdf(self, acquisitions: Sequence[int], line: int, amplitude: Array) -> Array:
+        """Return the mean of P(|X + n| <= amplitude) (k,) over some acquisitions."""
+        places = np.asarray(acquisitions) * self.noise.shape[1] + line
+        total = np.zeros(len(amplitude))
+        for item in self.shown:
+            rows = np.flatnonzero(np.isin(item.index, places))
+            if rows.size:
+                noise = self.noise.ravel()[item.index[rows]]
+                total += item.distribution(rows, noise, self._most).cdf(amplitude).sum(axis=0)
+        return total / len(places)
+
+    @cached_property
+    def _bare(self) -> list[Distribution]:
+        return [item.distribution(np.arange(item.index.size), np.zeros(item.index.size),
+                                  self._most) for item in self.shown]
+
+    @cached_property
+    def _full(self) -> list[Distribution]:
+        return [item.distribution(np.arange(item.index.size), self.noise.ravel()[item.index],
+                                  self._most) for item in self.shown]
+
+    @property
+    def _most(self) -> int:
+        return max(_FEWEST_DRAWS, _MOST_VALUES // self.noise.size)
+
+    def _gathered(self, distributions: Sequence[Distribution], name: str) -> Array:
+        values = np.empty(self.noise.size)
+        for item, distribution in zip(self.shown, distributions):
+            values[item.index] = getattr(distribution, name)
+        return values.reshape(self.noise.shape)
 
 
-def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Effect],
+def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Influence],
            pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int], *,
            unsteadiness: float = 0.0, memory: Memory | None = None) -> Expectation:
     """
@@ -89,32 +190,56 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
     `unsteadiness` is what the amplitudes scatter by themselves, in parts of the level. `memory`
     keeps what was computed, for calls that differ in `effects`, `chosen` and `unsteadiness` only.
     """
-    memory = {} if memory is None else memory
-    if len(memory) > _MOST_KEPT:
-        memory.clear()
+    memory = Memory() if memory is None else memory
+    memory.make_room()
     key = tuple(effects)
     alike: dict[float, list[int]] = {}
     for a in chosen:
-        if (key, a) not in memory:
+        if (key, a) not in memory.shown:
             speed = _speed(observation.acquisitions[a], observation.model)
             alike.setdefault(speed, []).append(a)
     for speed, some in alike.items():
         setting = _setting(observation, speed, effects)
-        found = iter(setting.moments([item for a in some for item in pulses[a]]))
+        found = iter(setting.shown([item for a in some for item in pulses[a]]))
         for a in some:
-            each = _of_lines(observation.acquisitions[a], lines, [next(found) for _ in pulses[a]],
-                             group)
-            memory[key, a] = each.scaled(setting.gain[lines.order]), setting.noise[lines.order]
-    rows = [memory[key, a] for a in chosen]
-    moments = AverageMoments(*(np.concatenate([getattr(each, name) for each, _ in rows])
-                               for name in ('mean', 'variance', 'pseudo_variance')))
-    noise = np.array([noise for _, noise in rows]) / level**2
+            memory.shown[key, a] = [
+                _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
+                for i, _ in enumerate(pulses[a])]
+        for amplitudes in setting.made:
+            memory.count(amplitudes)
+    shown = _together([[replace(item, index=item.index + n * lines.count)
+                        for item in memory.shown[key, a]] for n, a in enumerate(chosen)])
+    noise = np.zeros(len(chosen) * lines.count)
+    for item in shown:
+        noise[item.index] = item.noise
     own = 2.0 * (unsteadiness**2 + RESOLUTION**2)  # half of it along the radius
-    bare = normal_distribution(moments)
-    full = normal_distribution(moments.with_noise((noise + own).ravel()))
-    shape = noise.shape
-    return Expectation(bare.mean.reshape(shape), bare.variance.reshape(shape) + RESOLUTION**2,
-                       full.mean.reshape(shape), full.variance.reshape(shape), full)
+    return Expectation(shown, noise.reshape(len(chosen), -1) / level**2 + own)
+
+
+def _together(rows: Sequence[Sequence[_Shown]]) -> tuple[_Shown, ...]:
+    """Return what is shown by the same amplitudes in one."""
+    alike: dict[tuple[int, bool], list[_Shown]] = {}
+    for item in chain.from_iterable(rows):
+        alike.setdefault((id(item.amplitudes), item.scenario is None), []).append(item)
+    found = []
+    for items in alike.values():
+        own = [item.scenario for item in items if item.scenario is not None]
+        index, order, shift, noise = (
+            np.concatenate([getattr(item, name) for item in items])
+            for name in ('index', 'order', 'shift', 'noise'))
+        found.append(_Shown(items[0].amplitudes, np.concatenate(own) if own else None, index,
+                            order, shift, noise))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Amplitudes of unit components, in which scenario, and what comes on top of each order."""
+
+    amplitudes: Amplitudes
+    scenario: int | None
+    leakage: Array  # (order, source)
+    shift: Array  # (order,)
 
 
 @dataclass(frozen=True)
@@ -122,15 +247,16 @@ class _Setting:
     """What is predicted at one speed; `gain` and `noise` (order,), E|n|^2 of peak amplitudes."""
 
     observation: Observation
-    effects: Sequence[Effect]
+    effects: Sequence[Influence]
     processes: tuple[AngleErrorProcess, ...]
     gain: Array
     noise: Array
+    made: list[Amplitudes] = field(default_factory=list)
 
-    def moments(self, pulses: Sequence[Pulses]) -> list[tuple[AverageMoments, Array]]:
-        """Return what unit components show of themselves and (order, source) of each other."""
+    def shown(self, pulses: Sequence[Pulses]) -> list[_Source]:
+        """Return what unit components show of themselves and of each other, for all `pulses`."""
         known = [known_errors(self.observation.model, self.effects, item) for item in pulses]
-        found: dict[int, tuple[AverageMoments, Array]] = {}
+        found: dict[int, _Source] = {}
         alike: dict[tuple[float, ...], list[int]] = {}
         for i, (item, errors) in enumerate(zip(pulses, known)):
             if errors is None:
@@ -143,7 +269,7 @@ class _Setting:
             found.update(zip(some, rows))
         return [found[i] for i in range(len(pulses))]
 
-    def _of_known_pulses(self, errors: Array, like: Pulses) -> list[tuple[AverageMoments, Array]]:
+    def _of_known_pulses(self, errors: Array, like: Pulses) -> list[_Source]:
         """Return what is predicted with known `errors` (acquisition, pulse), unsure alike."""
         model = self.observation.model
         blur, unsure = 0.0, self.processes
@@ -154,25 +280,28 @@ class _Setting:
                     like.unknown_std, like.unknown_correlation).processes(model))
         doubt = IndependentPulseJitter(Normal(blur), weights=model.weights)
         unsure = (*unsure, doubt) if blur else unsure
-        each = _aligned(scenario_moments(model, unsure, errors), model, unsure)
+        amplitudes = known_amplitudes(model, unsure, errors, gain=self.gain)
+        self.made.append(amplitudes)
         leakage = _leakage(self.observation, unsure, errors)
-        mean = each.mean
+        shift = np.zeros_like(amplitudes.each.mean)
         if blur:
-            mean = mean * _sharpening(self.observation.orders, doubt)
+            shift = amplitudes.each.mean * (_sharpening(self.observation.orders, doubt) - 1.0)
             leakage = leakage * np.resize(_sharpening(self.observation.sources, doubt),
                                           leakage.shape[2])
-        return [(AverageMoments(*row), leaks) for *row, leaks in zip(
-            mean, each.variance, each.pseudo_variance, leakage)]
+        return [_Source(amplitudes, i, *row) for i, row in enumerate(zip(leakage, shift))]
 
     @cached_property
-    def _of_unknown_pulses(self) -> tuple[AverageMoments, Array]:
-        """What is predicted where nothing is known of the pulses."""
-        none = np.zeros((1, self.observation.model.trigger_cycles + 1))
-        return (_unknown(self.observation, self.effects, self.processes),
-                _leakage(self.observation, self.processes, none)[0])
+    def _of_unknown_pulses(self) -> _Source:
+        """What is predicted where nothing is known of the pulses: what `predict` returns."""
+        model = self.observation.model
+        amplitudes = unit_amplitudes(model, self.effects)
+        self.made.append(amplitudes)
+        none = np.zeros((1, model.trigger_cycles + 1))
+        return _Source(amplitudes, None, _leakage(self.observation, self.processes, none)[0],
+                       np.zeros(len(model.orders)))
 
 
-def _setting(observation: Observation, speed: float, effects: Sequence[Effect]) -> _Setting:
+def _setting(observation: Observation, speed: float, effects: Sequence[Influence]) -> _Setting:
     model = replace(observation.model, trigger_speed=speed)
     return _Setting(replace(observation, model=model), effects, random_processes(model, effects),
                     component_gain(model, effects), line_variance(model, effects))
@@ -207,50 +336,6 @@ def _nodes(count: int) -> tuple[Array, Array]:
     return unit_nodes(count)
 
 
-def _unknown(observation: Observation, effects: Sequence[Effect],
-             processes: Sequence[AngleErrorProcess]) -> AverageMoments:
-    """Return the moments (order,) where nothing is known of the pulses of one acquisition."""
-    model = observation.model
-    known = [item for item in (effect.scenarios(model) for effect in effects) if item is not None]
-    if known:
-        each = scenario_moments(model, processes, known[0])
-        mean = each.mean.mean(axis=0)
-        spread = each.mean - mean
-        size = np.mean(np.abs(each.mean), axis=0)  # the phase of an average does not count
-        variance = np.mean(each.variance + np.abs(spread) ** 2, axis=0) + np.abs(mean)**2 - size**2
-        return AverageMoments(size.astype(complex), np.maximum(variance, 0.0),
-                              np.mean(each.pseudo_variance, axis=0))
-    moments = cycle_moments(model.orders, processes, nodes=_NODES)
-    return _aligned(moments.averaged(model.trigger_cycles), model, processes)
-
-
-def _aligned(moments: AverageMoments, model: DeclaredModel,
-             processes: Sequence[AngleErrorProcess]) -> AverageMoments:
-    """
-    Return the moments (..., order) of averages that are turned back by their mean angle error.
-
-    The amplitude does not know that angle, which slow errors turn a whole average by; the
-    distribution of the amplitude is near the normal one only without it. E|X|^2 stays as it is.
-    """
-    count, (u, w) = model.trigger_cycles, _nodes(_NODES)
-    common = 0.0
-    for process in processes:
-        if isinstance(process, GaussianAngleError):
-            within = [w @ process.covariance(u[:, None], u, lag) @ w
-                      for lag in range(min(process.correlation_length, count - 1) + 1)]
-            share = (1.0 - np.arange(len(within)) / count) * np.where(
-                np.arange(len(within)) > 0, 2.0, 1.0)
-            common += float(share @ within) / count
-    turn = np.exp((2.0 * np.pi * np.asarray(model.orders)) ** 2 * common)
-    square = (moments.pseudo_variance + moments.mean**2) * turn**2
-    mean = moments.mean * np.minimum(np.sqrt(turn), np.sqrt(moments.mean_square) / np.maximum(
-        np.abs(moments.mean), _LEAST))
-    variance = np.maximum(moments.mean_square - np.abs(mean) ** 2, 0.0)
-    pseudo = square - mean**2
-    most = variance / np.maximum(np.abs(pseudo), _LEAST)
-    return AverageMoments(mean, variance, pseudo * np.minimum(most, 1.0))
-
-
 def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
              ) -> Array:
     """
@@ -280,24 +365,18 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     return table
 
 
-def _of_lines(item: Acquisition, lines: Lines, rows: Sequence[tuple[AverageMoments, Array]],
-              group: Array) -> AverageMoments:
-    """Return the moments (line,) of unit components, with leakage."""
-    mean = np.zeros(lines.count, complex)
-    variance = np.zeros(lines.count)
-    pseudo = np.zeros(lines.count, complex)
-    for i, (moments, leakage) in enumerate(rows):
-        amplitude = item.corrected
-        if leakage.shape[1] > amplitude.shape[1]:
-            amplitude = np.concatenate((amplitude, amplitude.conj()), axis=1)
-        own = leakage.shape[0]
-        foreign = leakage - np.where(np.eye(*leakage.shape, dtype=np.bool_), leakage, 0.0)
-        with np.errstate(divide='ignore', invalid='ignore'):
-            extra = (amplitude @ foreign.T) / amplitude[:, :own]
-        extra = np.where(np.isfinite(extra), extra, 0.0)
-        here = np.flatnonzero(group[lines.channel] == i)
-        channel, order = lines.channel[here], lines.order[here]
-        mean[here] = moments.mean[order] + extra[channel, order]
-        variance[here] = moments.variance[order]
-        pseudo[here] = moments.pseudo_variance[order]
-    return AverageMoments(mean, variance, pseudo)
+def _of_lines(item: Acquisition, lines: Lines, source: _Source, channels: Array,
+              setting: _Setting) -> _Shown:
+    """Return what an acquisition shows on the lines of some `channels` (channel,), a mask."""
+    amplitude, leakage = item.corrected, source.leakage
+    if leakage.shape[1] > amplitude.shape[1]:
+        amplitude = np.concatenate((amplitude, amplitude.conj()), axis=1)
+    foreign = leakage - np.where(np.eye(*leakage.shape, dtype=np.bool_), leakage, 0.0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        extra = (amplitude @ foreign.T) / amplitude[:, :len(leakage)]
+    extra = np.where(np.isfinite(extra), extra, 0.0)
+    here = np.flatnonzero(channels[lines.channel])
+    order = lines.order[here]
+    shift = source.shift[order] + setting.gain[order] * extra[lines.channel[here], order]
+    scenario = None if source.scenario is None else np.full(here.size, source.scenario)
+    return _Shown(source.amplitudes, scenario, here, order, shift, setting.noise[order])

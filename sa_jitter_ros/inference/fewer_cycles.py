@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.scoring import Bench
 
@@ -42,7 +43,7 @@ def fewer_cycles(bench: Bench, count: int) -> Bench:
               for rows in bench.pulses for start in starts]
     return replace(bench, observation=replace(observation, model=model, acquisitions=acquisitions),
                    pulses=pulses, fit=places(bench.fit), held_out=places(bench.held_out),
-                   memory={})
+                   memory=Memory())
 
 
 def _part(observation: Observation, item: Acquisition, start: int, count: int) -> Acquisition:

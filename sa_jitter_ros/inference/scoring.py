@@ -61,7 +61,7 @@ class Bench:
     held_out: tuple[int, ...]
     declared: tuple[Effect, ...]
     untold: Mapping[str, str] = field(default_factory=dict)
-    memory: Memory = field(default_factory=dict, repr=False)
+    memory: Memory = field(default_factory=Memory, repr=False)
     fewer: 'Bench | None' = None
 
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
@@ -121,7 +121,6 @@ class Bench:
         """Return the residual of the held-out acquisitions."""
         attenuation, variance, amplitude = self.observed(self.held_out)
         expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
-        probability = expected.distribution.cdf(amplitude.reshape(-1, 1)).reshape(amplitude.shape)
         moved = []
         for others in _moved(effects, findings):
             other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
@@ -132,7 +131,8 @@ class Bench:
                 float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
-            expected.amplitude, expected.amplitude_variance, probability, sensitivities=moved)
+            expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
+            sensitivities=moved)
 
 
 def _moved(effects: Sequence[Effect], findings: Sequence[Finding]) -> Iterator[list[Effect]]:

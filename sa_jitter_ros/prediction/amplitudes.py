@@ -41,10 +41,8 @@ _FEW_CYCLES_OF_SCENARIOS = 20
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
 _SCENARIOS, _SEED = 256, 11
 _DRAWS, _FEWEST = 8192, 64  # values in all scenarios, in one
-_FEWEST_KNOWN = 256  # draws of an average with known errors: 6 % of its standard deviation
 _SCENARIO_NODES = 32
 _WORK = 20_000_000_000  # multiplications of phasors, about a second
-_VALUES, _FEWEST_VALUES = 4_000_000, 4096  # of a sampled distribution of many rows, and of a row
 
 
 @dataclass(frozen=True)
@@ -54,8 +52,8 @@ class Amplitudes:
 
     `moments` (order,) are those over all scenarios, `each` (scenario, order) those in each, with
     the third cumulants `plain` k(X, X, X) and `mixed` k(X, X, conj X). Where they are too few
-    numbers for the distribution, `draws` (order, draw) are equally likely values of X, of the
-    scenarios in turn, and `noise` (draw,) is circular of variance 1.
+    numbers for the distribution, `draws` are equally likely values of X, (order, draw) of all
+    scenarios or (order, scenario, draw) of each, and `noise` (draw,) is circular of variance 1.
     """
 
     moments: AverageMoments
@@ -65,19 +63,21 @@ class Amplitudes:
     draws: Array | None = field(default=None, repr=False)
     noise: Array | None = field(default=None, repr=False)
 
-    def distribution(self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0
-                     ) -> AmplitudeDistribution | SampledDistribution:
+    def distribution(
+        self, order: ArrayLike, *, shift: ArrayLike = 0.0, noise: ArrayLike = 0.0,
+        most: int | None = None,
+    ) -> AmplitudeDistribution | SampledDistribution:
         """
         Return the distribution of abs(X + shift + n) over all scenarios, one entry per row.
 
         `order` (row,) are indices of orders; `shift` is complex and `noise` is E|n|^2, one each or
-        (row,).
+        (row,). Of each row no more than `most` draws are used.
         """
         rows = np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)
         own = self.moments.of((rows,)).shifted(shift).with_noise(noise)
         if self.draws is not None:
-            return self._sampled(self.draws[rows], own, shift, noise)
+            return self._sampled(self.draws[rows, :most], own, shift, noise)
         count = len(self.each.mean)
         curved = self._curved((slice(None), rows), shift, noise)
         if count == 1:
@@ -86,17 +86,17 @@ class Amplitudes:
         return SampledDistribution(np.moveaxis(values, 1, 0).reshape(rows.size, -1),
                                    own.mean_square)
 
-    def distribution_in(self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
-                        noise: ArrayLike = 0.0) -> AmplitudeDistribution | SampledDistribution:
-        """Return the same for rows that have a scenario each; `scenario` (row,) are indices."""
+    def distribution_in(
+        self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
+        noise: ArrayLike = 0.0,
+    ) -> AmplitudeDistribution | SampledDistribution:
+        """Return the same for rows that are in a scenario each; `scenario` (row,) are indices."""
         rows = np.asarray(scenario), np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)
         if self.draws is None:
             return self._curved(rows, shift, noise)
-        count = len(self.each.mean)
-        draws = self.draws.reshape(len(self.draws), -1, count)[rows[1], :, rows[0]]
-        return self._sampled(draws, self.each.of(rows).shifted(shift).with_noise(noise), shift,
-                             noise)
+        moments = self.each.of(rows).shifted(shift).with_noise(noise)
+        return self._sampled(self.draws[rows[::-1]], moments, shift, noise)
 
     @property
     def skew(self) -> Array:
@@ -112,10 +112,9 @@ class Amplitudes:
     def _sampled(self, draws: Array, moments: AverageMoments, shift: Array, noise: Array
                  ) -> SampledDistribution:
         assert self.noise is not None
-        count = max(_FEWEST_VALUES, _VALUES // max(len(draws), 1))
         size = np.sqrt(noise).astype(np.float32)
-        values = np.abs(draws[:, :count] + shift.astype(np.complex64)[..., None]
-                        + size[..., None] * self.noise[:draws.shape[1]][:count])
+        values = np.abs(draws + shift.astype(np.complex64)[..., None]
+                        + size[..., None] * self.noise[:draws.shape[1]])
         return SampledDistribution(values, moments.mean_square)
 
 
@@ -265,10 +264,9 @@ def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[Ang
                 gain: Array, errors: Array | None = None, *, apart: bool = False) -> Amplitudes:
     """Return the amplitudes with draws, in each scenario as many where they are kept `apart`."""
     cycles = None if errors is None else errors * model.fundamental_frequency
-    draws, noise = drawn_averages(
-        model.orders, processes, model.trigger_cycles, weights=model.weights,
-        known=None if cycles is None else lambda n: cycles[np.arange(n) % len(cycles)],
-        count=_FEWEST_KNOWN * len(found.each.mean) if apart else None)
+    known = None if apart or cycles is None else lambda n: cycles[np.arange(n) % len(cycles)]
+    draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles, known=known,
+                                  weights=model.weights, each=cycles if apart else None)
     return replace(found, draws=_grown(draws, gain), noise=noise)
 
 
@@ -302,8 +300,8 @@ def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: A
 
 
 def _grown(draws: Array, gain: Array) -> Array:
-    """Return draws (order, draw) of the component with its gain, in their precision."""
-    return np.asarray(draws * gain.astype(np.complex64)[:, None])
+    """Return draws (order, ...) of the component with its gain, in their precision."""
+    return np.asarray((draws.T * gain.astype(np.complex64)).T)
 
 
 def _combined(known: Sequence[Array]) -> Array:

@@ -26,6 +26,7 @@ _SEED = 20190215
 _BUDGET = 3_000_000  # phasors in one distribution
 _FEWEST, _MOST = 4096, 65536
 _COARSEST = 512  # fewest draws of long averages
+_IN_EACH = 256  # draws in a scenario that counts by itself: 6 % of its standard deviation
 LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
 _MOST_POINTS = 1000  # of a process drawn at once
 _LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
@@ -92,15 +93,16 @@ def can_be_sampled(
 
 def drawn_averages(
     orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
-    weights: PulseWeights = LINEAR, known: KnownErrors | None = None, count: int | None = None,
+    weights: PulseWeights = LINEAR, known: KnownErrors | None = None, each: Array | None = None,
 ) -> tuple[Array, Array]:
     """
     Return complex averages (order, draw) of `trigger_cycles` cycles, and noise (draw,), E|n|^2 1.
 
     Both are of single precision. `processes` `can_be_sampled`; `weights` are those of the angle
     law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come on top of
-    the random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1.
-    `count` is how many averages to draw, by default as many as take a fraction of a second.
+    the random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1. The
+    errors `each` (scenario, n) come on top of the same random ones each, so that draws are
+    (order, scenario, draw).
     """
     g = np.asarray(orders, float)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
@@ -108,7 +110,8 @@ def drawn_averages(
     bare = weights is LINEAR and not inside
     u, w = _LINEAR_RULE if weights is LINEAR else _BENT_RULE
     w = w.astype(np.float32)
-    count = count or _affordable(g.size * (trigger_cycles + 3) * (1 if bare else u.size), g.size)
+    count = _IN_EACH if each is not None else _affordable(
+        g.size * (trigger_cycles + 3) * (1 if bare else u.size), g.size)
     rng = np.random.default_rng(_SEED)
     shape = (trigger_cycles + weights.pulses - 1, count)
     errors: Array = np.zeros(shape)
@@ -121,18 +124,24 @@ def drawn_averages(
              if hasattr(process, 'draw_angle')]
     gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_gain')]
-    angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
-                            + sum(extra))).astype(np.float32) if not bare else errors
     swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
-    draws = np.empty((g.size, count), np.complex64)
-    for row, order in zip(draws, g):
-        if bare:
-            real, imag = cycle_amplitudes((order * errors).astype(np.float32))
-        else:
-            turned = np.float32(order) * angle
-            real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
-        row[:] = real.mean(axis=0) + 1j * imag.mean(axis=0)
-    return draws, noise[0] + 1j * noise[1]
+
+    def averages(errors: Array) -> Array:
+        angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
+                                + sum(extra))).astype(np.float32) if not bare else errors
+        draws = np.empty((g.size, count), np.complex64)
+        for row, order in zip(draws, g):
+            if bare:
+                real, imag = cycle_amplitudes((order * errors).astype(np.float32))
+            else:
+                turned = np.float32(order) * angle
+                real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
+            row[:] = real.mean(axis=0) + 1j * imag.mean(axis=0)
+        return draws
+
+    found = averages(errors) if each is None else np.stack(
+        [averages(errors + row[:, None]) for row in weights.padded(each, trigger_cycles)], axis=1)
+    return found, noise[0] + 1j * noise[1]
 
 
 def _affordable(phasors: int, orders: int) -> int:

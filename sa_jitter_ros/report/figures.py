@@ -1,7 +1,7 @@
 """The figures of a report: residual over orders, distributions, and the evidence of effects."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 import io
 from typing import Any
 
@@ -13,7 +13,6 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
-from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
 
@@ -150,8 +149,7 @@ def _distribution_figure(trace: Trace) -> Figure:
             reach = 3.0 * np.sqrt(expected.amplitude_variance[held_out, line].mean())
             x = np.linspace(max(0.0, min(low, mean.min() - reach)), max(high, mean.max() + reach),
                             _POINTS)
-            distribution = _rows(expected.distribution, held_out * trace.lines.count + line)
-            one.plot(x, distribution.cdf(x).mean(axis=0), color=colour, label=label)
+            one.plot(x, expected.mean_cdf(trace.held_out, line, x), color=colour, label=label)
         one.set(title=f'order {order:g}, {channel}', xlabel='amplitude / mean level',
                 ylabel='cumulative share')
         one.legend(fontsize='x-small')
@@ -162,8 +160,7 @@ def _distribution_figure(trace: Trace) -> Figure:
 def _probability_panel(trace: Trace, axes: Axes) -> None:
     """Draw the share of all amplitudes below each predicted probability."""
     for label, colour, expected, residual in _versions(trace):
-        probability = expected.distribution.cdf(trace.amplitude.reshape(-1, 1)).reshape(
-            trace.amplitude.shape)[list(trace.held_out)].ravel()
+        probability = expected.cdf(trace.amplitude)[list(trace.held_out)].ravel()
         _observed_share(axes, probability, color=colour, label=f'{label}: KS {residual.ks:.3f}')
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
     axes.set(title='all lines', xlabel='predicted probability',
@@ -178,12 +175,6 @@ def _most_telling(trace: Trace) -> list[int]:
             for rows in [np.flatnonzero(trace.lines.order == order)]]
     best = sorted(best, key=lambda line: -size[line])[:_MOST_PANELS]
     return sorted(best, key=lambda line: int(trace.lines.order[line]))
-
-
-def _rows(distribution: AmplitudeDistribution, index: Array) -> AmplitudeDistribution:
-    """Return the distribution of some entries."""
-    return AmplitudeDistribution(*(getattr(distribution, item.name)[index]
-                                   for item in fields(distribution)))
 
 
 def _observed_share(axes: Axes, sample: Array, *, color: str = MEASURED,

@@ -1,0 +1,135 @@
+"""What the loop scores with is what the predictor publishes, conditional on known pulses."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.inference.expectation import expect, Lines, RESOLUTION
+from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.prediction.influence import Influence, Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
+from scipy import stats
+from validation.monte_carlo import AveragedSignal
+
+ORDERS = (19.0, 38.0, 57.0)
+MODEL = DeclaredModel(
+    keyphasor_rate=5000.0, trigger_speed=16.6, trigger_cycles=40, orders=ORDERS, ratio=2.0,
+    noise_std=0.5, sample_rate=20_000.0)  # lines of the trigger cycle: no mirror image leaks
+LINES = Lines(np.arange(3), np.arange(3))
+LEVELS = np.linspace(0.02, 0.98, 49)
+EFFECTS = {
+    'declared jitter alone': {},
+    'random pulse errors': {'excess_jitter': {'std': 4e-5}},
+    'a slow motion': {'phase_wander': {'std': 0.01, 'bandwidth': 0.1}},
+    'a slow gain and noise': {'amplitude_modulation': {'std': 0.1},
+                              'additive_noise': {'std': 1.0}},
+    'scenarios': {'target_geometry': {'pulse_angles': [0.0, 0.02, -0.01]},
+                  'clock_skew': {'skew': 1e-4}},
+    'scenarios of averages that are drawn': {'keyphasor_quantisation': {
+        'clock_rate': 5000.0, 'period_std': 3e-6}},
+    'an interpolator': {'interpolation_loss': {'method': 'linear'}},
+}
+
+
+@dataclass(frozen=True)
+class Unknown(Influence):
+    """An effect of whose pulse errors the pulses at hand tell nothing."""
+
+    name = 'unknown'
+    effect: Influence
+
+    def __getattribute__(self, name):
+        if name in ('effect', 'pattern', '__class__', '__hash__', '__eq__', '__dict__'):
+            return object.__getattribute__(self, name)
+        return getattr(object.__getattribute__(self, 'effect'), name)
+
+
+@dataclass(frozen=True)
+class Resolution(Influence):
+    """What resampling leaves of uncertainty, which the loop counts as noise."""
+
+    name = 'resolution'
+
+    def line_variance(self, model):
+        return 2.0 * RESOLUTION**2
+
+
+def observed(model, count=1):
+    """Return acquisitions at an even speed; channels show one order each, nothing leaks."""
+    times = model.trigger_period * np.arange(model.trigger_cycles + 1.0)
+    missing = np.zeros(model.trigger_cycles, int)
+    nothing = np.zeros((3, 3))
+    cycles = np.tile(np.eye(3, dtype=complex), (2, 1, 1))
+    item = Acquisition(0, times, missing, times, 0.0 * times, 0.0 * times, cycles, cycles, nothing,
+                       nothing, 0.0 * missing, 0.0, True, '')
+    orders = np.array(model.orders)
+    return Observation(model, count * (item,), orders, orders, ('a', 'b', 'c'),
+                       RecordPulses.unbroken(times), model.sample_rate, False, model.trigger_speed)
+
+
+def expected(model, effects, pulses):
+    """Return what the loop expects of acquisitions with these pulses."""
+    return expect(observed(model, len(pulses)), LINES, np.ones(3), effects,
+                  [[item] for item in pulses], np.zeros(3, int), range(len(pulses)))
+
+
+@pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
+@pytest.mark.parametrize('cycles', [5, 40])
+@pytest.mark.parametrize('name', EFFECTS)
+def test_loop_scores_with_the_published_distribution(name, cycles, law):
+    model = replace(MODEL, trigger_cycles=cycles, angle_law=law)
+    effects = [make_effect(key, **values) for key, values in EFFECTS[name].items()]
+    count = cycles + 1 + model.weights.before + model.weights.after
+    found = expected(model, [Unknown(effect) for effect in effects],
+                     [Pulses(np.full(count, np.nan))])
+    published = predict(model, [*effects, Resolution()])
+    np.testing.assert_allclose(found.amplitude[0], published.mean_attenuation, rtol=1e-6)
+    np.testing.assert_allclose(found.amplitude_variance[0], published.variance, rtol=1e-5)
+    for p, quantile in zip(LEVELS, published.ppf(LEVELS).T):
+        np.testing.assert_allclose(found.cdf(quantile[None])[0], p, atol=2.0 / 4096)  # draws
+        np.testing.assert_allclose(found.cdf(quantile[None])[0],
+                                   published.cdf(quantile[:, None])[:, 0], atol=1e-4)
+    bare = predict(replace(model, noise_std=0.0), [
+        effect for effect in effects if effect.name != 'additive_noise'])
+    np.testing.assert_allclose(found.attenuation[0], bare.mean_attenuation, rtol=1e-6)
+    np.testing.assert_allclose(found.attenuation_variance[0], bare.variance + RESOLUTION**2,
+                               rtol=1e-5)
+
+
+@pytest.mark.parametrize('wander', [False, True])
+@pytest.mark.parametrize(('cycles', 'bias', 'off'), [(5, 0.04, 5e-3), (40, 0.01, 1e-3)])
+def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, off, wander, rng):
+    """It is curved, which few cycles are `off` from; under slow errors it is of 256 draws."""
+    model = replace(MODEL, trigger_cycles=cycles)
+    geometry = make_effect('target_geometry', pulse_angles=[0.0, 0.02, -0.01])
+    effects, draws = [geometry], 20_000
+    errors = model.distribution.draw(rng, (draws, cycles + 1))
+    if wander:  # so slow that it shifts all pulses alike, which no amplitude shows
+        effects.append(make_effect('correlated_jitter', std=2e-4, correlation=0.99))
+        steps = rng.standard_normal((draws, cycles + 1)) * np.sqrt(1.0 - 0.99**2)
+        steps[:, 0] /= np.sqrt(1.0 - 0.99**2)
+        for k in range(1, cycles + 1):
+            steps[:, k] += 0.99 * steps[:, k - 1]
+        errors = errors + 2e-4 * steps
+    pulses = [Pulses(np.full(cycles + 1, np.nan), first=first) for first in (1, 2)]
+    found = expected(model, effects, pulses)
+    noise = np.sqrt(2.0) * np.sqrt(found.noise[0, 0] / 4.0) * (
+        rng.standard_normal(draws) + 1j * rng.standard_normal(draws))
+    for a, item in enumerate(pulses):
+        known = errors + geometry.pattern(model, item)
+        for line, order in enumerate(ORDERS):
+            signal = AveragedSignal(cycles, model.cycle_length, order)
+            amplitude = np.abs(signal.whole_trigger_cycles(known * model.fundamental_frequency))
+            error = amplitude.std() / np.sqrt(256 if wander else draws)
+            assert found.attenuation[a, line] == pytest.approx(amplitude.mean(),
+                                                               abs=off + 4.5 * error)
+            assert np.sqrt(found.attenuation_variance[a, line]) == pytest.approx(
+                amplitude.std(), rel=0.15 if wander else 12.0 * off)
+            noisy = np.sort(np.abs(signal.whole_trigger_cycles(
+                known * model.fundamental_frequency) + noise))
+            distance = stats.kstest(noisy, lambda x, a=a, line=line: found.mean_cdf(
+                [a], line, x)).statistic
+            assert distance < bias + 1.95 / np.sqrt(256 if wander else draws)
