@@ -292,7 +292,7 @@ def malformed():
     yield 'nothing', empty, 'empty block'
     short = messages.Float64MultiArray(data=[0.0, 12800.0])
     short.layout.data_offset = 3
-    yield 'short', short, '2 elements cannot hold 3 header elements'
+    yield 'short', short, '2 elements received, at least 3 header elements'
     deep = good(MACHINE.block(0, 100))
     deep.layout.dim.append(deep.layout.dim[0])
     yield 'three dimensions', deep, "['channel', 'sample', 'channel']"
