@@ -41,6 +41,7 @@ autodoc_member_order = 'bysource'
 autodoc_typehints = 'description'
 
 myst_heading_anchors = 3
+smartquotes = False  # '' in a docstring is an empty string
 
 rosdoc2_settings = {'override_theme': False}
 html_theme = 'alabaster'
