@@ -22,7 +22,7 @@ class MessageError(SaJitterError):
 
 
 class RecordingError(SaJitterError):
-    """A file that is broken, unsafe or lacks what a recording needs."""
+    """A file that is broken or unsafe, or has not all fields of a recording."""
 
 
 class ModelError(SaJitterError):

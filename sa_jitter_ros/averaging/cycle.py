@@ -22,14 +22,14 @@ from scipy.fft import next_fast_len
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
+_MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
 
 
 @dataclass(frozen=True)
 class CycleSamples:
     """
-    The samples of one trigger cycle, with what interpolation needs on either side.
+    The samples of one trigger cycle, and those on either side that interpolation needs.
 
     `samples` (sample, channel) at `rate` (Hz); the first is `lead` s after `start_time` (s). These
     are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
@@ -132,8 +132,8 @@ def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> 
     step = exact_cycles(cycles).denominator
     if step > _SMALL_NUMBER:
         step = 1
-    multiple = math.ceil(min(max(needed, 8.0), MAX_POINTS) / step)
-    return min(step * int(next_fast_len(multiple, real=True)), MAX_POINTS)
+    multiple = math.ceil(min(max(needed, 8.0), _MAX_POINTS) / step)
+    return min(step * int(next_fast_len(multiple, real=True)), _MAX_POINTS)
 
 
 def waveform_cutoff(points: int, cycles: float, period: float, rate: float) -> float:

@@ -16,7 +16,7 @@ ComplexArray = NDArray[np.complex128]
 
 # The orders that leak contain leakage of each other: iterations until this is negligible.
 _PASSES = 6
-# Lines of the average beside an order that show the noise: beyond the main lobe of the window.
+# Lines of the average next to an order that show the noise: beyond the main lobe of the window.
 _LOBE, _AROUND = 3, 150
 _OUTLIER = 3.0  # times the noise
 _MEDIAN_FROM = 8  # spectral lines from which on the median is used, which scatters more

@@ -186,7 +186,6 @@ class PulseErrorFit:
     orders: FloatArray
     amplitudes: ComplexArray
     noise: FloatArray
-    iterations: int
 
 
 @dataclass(frozen=True)
@@ -209,9 +208,7 @@ class PulseErrorProblem:
         ripple = np.zeros(count)
         share = np.zeros((len(model.orders), channels))
         prior = expected**-2
-        iterations, converged = 0, False
-        while not converged and iterations < _ITERATIONS:
-            iterations += 1
+        for _ in range(_ITERATIONS):
             response = model.response(errors, ripple, self.chosen)
             amplitudes = least_squares(response.signal, model.coefficients)
             fitted = response.signal @ real_parts(amplitudes)
@@ -234,23 +231,23 @@ class PulseErrorProblem:
             diagonal = np.zeros(count + 1)
             diagonal[:-1] += _dot(first, first)
             diagonal[1:] += _dot(last, last)
-            beside = _dot(first, last)
+            off_diagonal = _dot(first, last)
             pull = -prior * errors
             pull[:-1] += _dot(first, residual)
             pull[1:] += _dot(last, residual)
-            step = _solve(diagonal + prior, beside, pull)
+            step = _solve(diagonal + prior, off_diagonal, pull)
             if self.with_ripple:
                 ripple = ripple + (parts[2] - parts[0] * step[:-1] - parts[1] * step[1:]) / size
             step -= step.mean()
             errors = errors + step
-            standard_errors = _standard_errors(diagonal + prior, beside)
+            standard_errors = _standard_errors(diagonal + prior, off_diagonal)
             information = np.add.reduceat((first**2 + last**2).sum(axis=0), model.blocks)
             share = information / information.sum()
-            converged = np.max(np.abs(step)) < 0.02 * np.min(standard_errors)
+            if np.max(np.abs(step)) < 0.02 * np.min(standard_errors):
+                break
         unit = np.mean(np.sum(response.signal[:, :, :len(orders)] ** 2, axis=1), axis=0)
         noise = np.sqrt(2.0 * variance[self.chosen] / unit[:, None])
-        return PulseErrorFit(errors, standard_errors, ripple, orders, amplitudes, noise,
-                             iterations)
+        return PulseErrorFit(errors, standard_errors, ripple, orders, amplitudes, noise)
 
     def scan(self, width: float) -> FloatArray:
         """
@@ -309,18 +306,18 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum('kdc,kdc->k', a, b))
 
 
-def _solve(diagonal: FloatArray, beside: FloatArray, right: FloatArray) -> FloatArray:
-    return np.asarray(solveh_banded(np.stack((np.append(0.0, beside), diagonal)), right))
+def _solve(diagonal: FloatArray, off_diagonal: FloatArray, right: FloatArray) -> FloatArray:
+    return np.asarray(solveh_banded(np.stack((np.append(0.0, off_diagonal), diagonal)), right))
 
 
-def _standard_errors(diagonal: FloatArray, beside: FloatArray) -> FloatArray:
+def _standard_errors(diagonal: FloatArray, off_diagonal: FloatArray) -> FloatArray:
     """Return standard errors from a tridiagonal normal matrix, for errors with mean 0."""
     count = len(diagonal)
     down, up = diagonal.copy(), diagonal.copy()  # pivots of elimination from either end
-    square = beside**2
+    square = off_diagonal**2
     for k in range(1, count):
         down[k] -= square[k - 1] / down[k - 1]
         up[-1 - k] -= square[-k] / up[-k]
-    common = _solve(diagonal, beside, np.ones(count))
+    common = _solve(diagonal, off_diagonal, np.ones(count))
     variance = 1.0 / (down + up - diagonal) - 2.0 * common / count + common.sum() / count**2
     return np.asarray(np.sqrt(variance))

@@ -16,7 +16,6 @@ delay common to all pulses cannot be recovered: the errors have mean zero.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
 
 import numpy as np
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
@@ -53,10 +52,9 @@ class PulseErrorRecovery:
     `errors` (pulse,) are measured minus true times (s) with mean zero. If they are not `accepted`
     they are all zero, and `reason` says why. `standard_errors` (pulse,) are theirs (s, NaN if
     nothing could be fitted). `orders` are those used; `amplitudes` (channel, order) their complex
-    peak amplitudes without the errors, at angle 0; `attenuation` (order,) the amplitude of a unit
-    component with the errors (Camerini et al. 2019, Eq. 26 with N_i = r); `noise` (channel, order)
-    the standard deviation of the complex amplitude of one cycle. `ripple` (cycle,) is the factor
-    of u (1 - u) in the error inside a cycle (s), zero unless `with_ripple`.
+    peak amplitudes without the errors, at angle 0; `noise` (channel, order) the standard deviation
+    of the complex amplitude of one cycle. `ripple` (cycle,) is the factor of u (1 - u) in the
+    error inside a cycle (s), zero unless `with_ripple`.
     """
 
     errors: FloatArray
@@ -65,10 +63,8 @@ class PulseErrorRecovery:
     reason: str
     orders: FloatArray
     amplitudes: ComplexArray
-    attenuation: FloatArray
     noise: FloatArray
     ripple: FloatArray
-    iterations: int
 
 
 def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_length: float,
@@ -113,8 +109,7 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
         count, _, channels = cycles.shape
         return PulseErrorRecovery(
             np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.empty(0),
-            np.empty((channels, 0), np.complex128), np.empty(0), np.empty((channels, 0)),
-            np.zeros(count), 0)
+            np.empty((channels, 0), np.complex128), np.empty((channels, 0)), np.zeros(count))
 
     errors = fit.errors * float(np.mean(periods)) / cycle_length
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
@@ -124,12 +119,9 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
     errors -= errors.mean()
     standard_errors = fit.standard_errors * seconds
     reason = _refusal(errors, standard_errors, periods, declared_standard_deviation, gain)
-    turns = np.multiply.outer(fit.orders, fit.errors)
-    gains = np.exp(1j * pi * (turns[:, :-1] + turns[:, 1:])) * np.sinc(np.diff(turns))
     return PulseErrorRecovery(
         np.zeros_like(errors) if reason else errors, standard_errors, not reason, reason,
-        fit.orders, fit.amplitudes.T, np.abs(gains.mean(axis=1)), fit.noise.T,
-        fit.ripple * periods / cycle_length, fit.iterations)
+        fit.orders, fit.amplitudes.T, fit.noise.T, fit.ripple * periods / cycle_length)
 
 
 def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, declared: float

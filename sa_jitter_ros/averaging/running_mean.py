@@ -190,10 +190,10 @@ class ExponentialMean:
             self._variance = np.zeros(values.shape)
         else:
             step = values - self._mean
-            anew = np.isnan(self._mean)
-            self._mean = np.where(anew, values, self._mean + weight * step)
+            undefined = np.isnan(self._mean)
+            self._mean = np.where(undefined, values, self._mean + weight * step)
             self._variance = np.where(
-                anew, 0.0, (1.0 - weight) * (self._variance + weight * _power(step)))
+                undefined, 0.0, (1.0 - weight) * (self._variance + weight * _power(step)))
         self._squared_weights = (1.0 - weight) ** 2 * self._squared_weights + weight**2
 
     @property

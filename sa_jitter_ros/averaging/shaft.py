@@ -219,9 +219,9 @@ class ShaftAverager:
         assert isinstance(self._amplitude_mean, SlidingMean)
         self._amplitude_mean.forget(self._amplitude_mean.count - self.settings.trigger_cycles)
         whole = math.ceil(self._angle(self._cycle - self.settings.trigger_cycles))
-        gone = min(max(whole - self._first_whole, 0), self._wave_mean.count)
-        self._wave_mean.forget(gone)
-        self._first_whole += gone
+        outside = min(max(whole - self._first_whole, 0), self._wave_mean.count)
+        self._wave_mean.forget(outside)
+        self._first_whole += outside
 
     def _result(self) -> Average:
         settings = self.settings
@@ -248,7 +248,7 @@ class ShaftAverager:
         return average
 
     def _estimated_noise(self) -> FloatArray:
-        """Return the noise of the mean; in a sliding window, from every eighth of it on, anew."""
+        """Return the noise of the mean; a sliding window renews it after every eighth of it."""
         if self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
             amplitudes = self._window()

@@ -15,7 +15,7 @@ from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.samples import finite_spans, SampleBlock
 
 FloatArray = NDArray[np.float64]
-Span = tuple[int, int]  # first index, and the one behind the last
+_Span = tuple[int, int]  # first index, and the one behind the last
 
 SAME_RATE = 1e-9  # relative difference of sampling rates that are equal to rounding
 _KEPT = 200  # spans that are remembered
@@ -52,17 +52,17 @@ class Segment:
 
     @property
     def index(self) -> int:
-        """Index of the first sample held."""
+        """Index of the first sample."""
         return self._index + self._begin
 
     @property
     def end_index(self) -> int:
-        """Index after the last sample held."""
+        """Index after the last sample."""
         return self._index + self._end
 
     @property
     def samples(self) -> FloatArray:
-        """Samples held (sample, channel), without a copy."""
+        """Samples (sample, channel), without a copy."""
         return self._data[self._begin:self._end]
 
     @property
@@ -72,23 +72,23 @@ class Segment:
 
     @property
     def end_time(self) -> float:
-        """Time of the last sample held."""
+        """Time of the last sample."""
         return self.clock.time_of(self.end_index - 1)
 
     def position(self, time: float) -> float:
-        """Position of a time (s) in samples from the first one held."""
+        """Position of a time (s) in samples from the first one."""
         return (time - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
 
     def append(self, samples: FloatArray) -> None:
         """Add samples (channel, sample) behind the last one."""
         count = samples.shape[1]
         if self._end + count > len(self._data):
-            held = self.samples
-            size = max(2 * (len(held) + count), 1024)
-            data = np.empty((size, held.shape[1]))
-            data[:len(held)] = held
+            kept = self.samples
+            size = max(2 * (len(kept) + count), 1024)
+            data = np.empty((size, kept.shape[1]))
+            data[:len(kept)] = kept
             self._index, self._data = self.index, data
-            self._begin, self._end = 0, len(held)
+            self._begin, self._end = 0, len(kept)
         self._data[self._end:self._end + count] = samples.T
         self._end += count
 
@@ -124,32 +124,32 @@ class SampleLedger:
     kept.
     """
 
-    _lost: list[Span] = field(default_factory=list)
-    _dropped: list[Span] = field(default_factory=list)
+    _lost: list[_Span] = field(default_factory=list)
+    _dropped: list[_Span] = field(default_factory=list)
 
-    def lose(self, span: Span) -> int:
+    def lose(self, span: _Span) -> int:
         """Record a gap of the index; return how many samples are lost."""
-        left = [span]
+        lost = [span]
         for dropped in self._dropped:
-            left = _without(left, dropped)
-        self._lost = (self._lost + left)[-_KEPT:]
-        return _size(left)
+            lost = _without(lost, dropped)
+        self._lost = (self._lost + lost)[-_KEPT:]
+        return _size(lost)
 
-    def drop(self, span: Span) -> int:
+    def drop(self, span: _Span) -> int:
         """Record samples that are not used; return how many of them were not counted as lost."""
         before, self._lost = _size(self._lost), _without(self._lost, span)
         self._dropped = [*self._dropped, span][-_KEPT:]
         return span[1] - span[0] - (before - _size(self._lost))
 
 
-def _without(spans: list[Span], gone: Span) -> list[Span]:
-    """Return the spans without the indices in `gone`."""
+def _without(spans: list[_Span], removed: _Span) -> list[_Span]:
+    """Return the spans without the indices in `removed`."""
     pieces = (piece for first, end in spans
-              for piece in ((first, min(end, gone[0])), (max(first, gone[1]), end)))
+              for piece in ((first, min(end, removed[0])), (max(first, removed[1]), end)))
     return [(first, end) for first, end in pieces if first < end]
 
 
-def _size(spans: list[Span]) -> int:
+def _size(spans: list[_Span]) -> int:
     return sum(end - first for first, end in spans)
 
 
@@ -282,9 +282,9 @@ class VibrationTimeline:
         """
         found, away, following = max(earliest, self.epoch), np.inf, np.inf
         for epoch in sorted({item.epoch for item in self.segments}, reverse=True):
-            held = [item for item in self.segments if item.epoch == epoch]
-            begin = min(item.start_time for item in held)
-            end = max(item.end_time for item in held)
+            segments = [item for item in self.segments if item.epoch == epoch]
+            begin = min(item.start_time for item in segments)
+            end = max(item.end_time for item in segments)
             distance = max(begin - time, time - end - max(end - following, 0.0), 0.0)
             if epoch >= earliest and distance <= away:
                 found, away = epoch, distance

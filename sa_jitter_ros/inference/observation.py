@@ -33,7 +33,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 
-MOST_SAMPLES = 200_000_000
+_MOST_SAMPLES = 200_000_000
 #: A line is above the noise if its coherence from cycle to cycle exceeds that of noise so often.
 CHANCE = 4
 _OTHER_MACHINE = 5.0
@@ -142,9 +142,9 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     keyphasor, ModelError if the declared model does not fit the recording, SignalError if there is
     no reference keyphasor and the pulse errors cannot be recovered.
     """
-    if recording.samples * recording.channels > MOST_SAMPLES:
+    if recording.samples * recording.channels > _MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
-                             f'most {MOST_SAMPLES} values are read; cut the recording')
+                             f'most {_MOST_SAMPLES} values are read; cut the recording')
     if model.trigger_cycles <= CHANCE:
         raise ModelError(f'trigger_cycles is {model.trigger_cycles}: the coherence of a line from '
                          f'cycle to cycle needs at least {CHANCE + 1}; raise trigger_cycles')

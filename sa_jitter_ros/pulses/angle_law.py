@@ -73,8 +73,8 @@ class PulseWeights:
         """Return the errors (..., n) of all pulses that the law uses, see `path`."""
         if errors.shape[-1] != cycles + 1:
             return errors
-        beside = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
-        return np.pad(errors, beside, mode='edge')
+        widths = [(0, 0)] * (errors.ndim - 1) + [(self.before, self.after)]
+        return np.pad(errors, widths, mode='edge')
 
     def covariance(self, autocovariance: Callable[[Array], Array]) -> Covariance:
         """Return the covariance of the angle error, from Cov[eps_k, eps_{k+i}] at lags i."""

@@ -317,7 +317,7 @@ def detect_pulses(
         minimum_difference=minimum_difference)
     samples = np.asarray(tach)
     if samples.ndim != 1 or samples.dtype.kind not in 'fiub':
-        detector.update(samples, start_time, sample_rate)  # raises what is wrong with it
+        detector.update(samples, start_time, sample_rate)  # raises the error
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
     pulses = pulses_in_blocks(detector, [block])
     if not pulses.size:

@@ -25,7 +25,7 @@ from sa_jitter_ros.pulses.target import DOUBLE, Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter
 
 FloatArray = npt.NDArray[np.float64]
-_CALM = 4  # regular pulses in a row after which they may come in chunks
+_CALM = 4  # regular pulses in a row, after which they are judged in chunks
 _AGREEING = 4
 _LOST = 8
 _STANDSTILL = 1e9  # intervals; the ratio of a gap to denormal ones is infinite

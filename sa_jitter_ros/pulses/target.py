@@ -138,6 +138,6 @@ class ToothedWheel:
 
     def _tolerances(self, steps: IntArray) -> FloatArray:
         gap = steps > 1
-        beside = np.roll(gap, 1) | np.roll(gap, -1)
-        tolerance = np.where(beside, max(self._tolerance, _BESIDE_GAP), self._tolerance)
+        next_to_gap = np.roll(gap, 1) | np.roll(gap, -1)
+        tolerance = np.where(next_to_gap, max(self._tolerance, _BESIDE_GAP), self._tolerance)
         return np.where(gap, np.minimum(_BESIDE_GAP, _ACROSS_GAP / steps), tolerance)

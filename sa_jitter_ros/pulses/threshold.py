@@ -119,8 +119,8 @@ class SchmittTrigger:
         # The last crossing before the decision has the direction of the change, even if noise
         # made the signal cross the threshold several times inside the band.
         last = np.searchsorted(after, confirmed, side='right') - 1
-        held = np.nan if self._crossing is None else self._crossing
-        found = np.where(last >= 0, np.append(positions, held)[last], held)
+        unconfirmed = np.nan if self._crossing is None else self._crossing
+        found = np.where(last >= 0, np.append(positions, unconfirmed)[last], unconfirmed)
         found = np.where(np.isnan(found), index + confirmed, found)
         if after.size:
             self._crossing = float(positions[-1])

@@ -29,8 +29,8 @@ IMU = 'sensor_msgs/msg/Imu'
 TIME_REFERENCE = 'sensor_msgs/msg/TimeReference'
 SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
 PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
-MAX_GAP = 3600.0  # s
-MAX_LOST = 1 << 29  # samples of all channels that a gap may hold
+_MAX_GAP = 3600.0  # s
+_MAX_LOST = 1 << 29  # largest gap, in samples of all channels
 SAME_RATE = 1e-6  # relative
 _IMU_AXES = 'xyz'
 _FILL = 65_536
@@ -140,10 +140,10 @@ class _Run:
             first = self.first = self.first or block
             self._check(first, block)
             missing = block.index - first.index - self.received
-            if missing > min(MAX_GAP * block.sample_rate, MAX_LOST / max(len(block.samples), 1)):
+            if missing > min(_MAX_GAP * block.sample_rate, _MAX_LOST / max(len(block.samples), 1)):
                 raise RecordingError(
                     f'{self.topic}: {missing} samples are missing before index {block.index}, '
-                    f'more than {MAX_GAP:g} s or {MAX_LOST} values; split the bag')
+                    f'more than {_MAX_GAP:g} s or {_MAX_LOST} values; split the bag')
             for start in range(0, missing, _FILL):
                 yield np.full((len(block.samples), min(_FILL, missing - start)), np.nan)
             fresh = block.samples[:, max(-missing, 0):]

@@ -17,7 +17,7 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
 
-MAX_LINE = 1 << 20
+_MAX_LINE = 1 << 20
 _TIME_NAMES = ('time', 't', 'time_s', 'time [s]', 'time (s)')
 
 
@@ -78,7 +78,7 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     """
     with recording_errors(path):
         with _open(path) as file:
-            first = file.readline(MAX_LINE).strip()
+            first = file.readline(_MAX_LINE).strip()
         delimiter = next((mark for mark in ';\t,' if mark in first), ',')
         names = [name.strip() for name in next(csv.reader([first], delimiter=delimiter), [])]
         has_header = not all(_is_number(name, delimiter) for name in names)
@@ -123,11 +123,11 @@ def _open(path: Path) -> TextIO:
 def _rows(file: TextIO, delimiter: str, has_header: bool) -> Iterator[str]:
     """Iterate over the rows with data, with decimal points."""
     if has_header:
-        file.readline(MAX_LINE)
-    while line := file.readline(MAX_LINE):
-        if not line.endswith('\n') and len(line) >= MAX_LINE:
-            raise RecordingError(f'a line is longer than {MAX_LINE} characters: give a table with '
-                                 'one sample per row')
+        file.readline(_MAX_LINE)
+    while line := file.readline(_MAX_LINE):
+        if not line.endswith('\n') and len(line) >= _MAX_LINE:
+            raise RecordingError(f'a line is longer than {_MAX_LINE} characters: give a table '
+                                 'with one sample per row')
         if not line.isspace():
             yield line.replace(',', '.') if delimiter == ';' else line
 
@@ -135,15 +135,15 @@ def _rows(file: TextIO, delimiter: str, has_header: bool) -> Iterator[str]:
 def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
            start: int) -> FloatArray:
     """Return rows as `row` x `column`, without rows an empty array."""
-    held = list(lines)
-    if not held:
+    rows = list(lines)
+    if not rows:
         return np.empty((0, len(columns)))
     try:
-        return np.loadtxt(held, delimiter=delimiter, usecols=columns, ndmin=2, comments=None,
+        return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2, comments=None,
                           dtype=np.float64)
     except ValueError as error:
         reason = str(error).split(';')[0]
-        raise RecordingError(f'rows {start} to {start + len(held)}: {reason}') from error
+        raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}') from error
 
 
 def _extent(path: Path, delimiter: str, has_header: bool,

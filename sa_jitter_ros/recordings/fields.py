@@ -97,7 +97,7 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
 
 
 def converted_fields(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return fields of `CONVERTED` as `Recording` holds them; raises RecordingError."""
+    """Return fields of `CONVERTED` in the types of `Recording`; raises RecordingError."""
     return {name: CONVERTED[name](name, np.asarray(value)) for name, value in values.items()}
 
 

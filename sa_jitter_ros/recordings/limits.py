@@ -22,10 +22,10 @@ from sa_jitter_ros.errors import RecordingError, SaJitterError
 FloatArray = NDArray[np.float64]
 
 MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
-MAX_TIME = 1e15  # s, as 30 million years
-MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
+_MAX_TIME = 1e15  # s, as 30 million years
+_MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
-MAX_INFLATION = 200  # unpacked over packed size; of measured signals it is below 10
+_MAX_INFLATION = 200  # unpacked over packed size; of measured signals it is below 10
 _BLOCK = 1 << 17
 _MAGIC, _SKIPPABLE = 0xFD2FB528, 0x184D2A50
 _REPEATED, _COMPRESSED = 1, 2
@@ -41,9 +41,9 @@ def check_rate(name: str, rate: float, error: type[SaJitterError]) -> None:
 def check_times(name: str, times: float | FloatArray, error: type[SaJitterError]) -> None:
     """Raise `error` for finite times (s) beyond the limits."""
     values = np.atleast_1d(times)
-    wrong = values[np.isfinite(values) & (np.abs(values) > MAX_TIME)]
+    wrong = values[np.isfinite(values) & (np.abs(values) > _MAX_TIME)]
     if wrong.size:
-        raise error(f'{name} is {wrong[0]} s: must be within {MAX_TIME:g} s of 0; give seconds '
+        raise error(f'{name} is {wrong[0]} s: must be within {_MAX_TIME:g} s of 0; give seconds '
                     'since the start of the measurement or since 1970')
 
 
@@ -52,19 +52,19 @@ def check_samples(samples: FloatArray, error: type[SaJitterError]) -> None:
     if not samples.size:
         return
     peak = max(float(samples.max()), -float(samples.min()))
-    if peak <= MAX_SAMPLE:
+    if peak <= _MAX_SAMPLE:
         return
-    wrong = samples[np.isfinite(samples) & (np.abs(samples) > MAX_SAMPLE)]  # NaN has no order
+    wrong = samples[np.isfinite(samples) & (np.abs(samples) > _MAX_SAMPLE)]  # NaN has no order
     if wrong.size:
-        raise error(f'sample of {wrong[0]}: must be within {MAX_SAMPLE:g} of 0; check the '
+        raise error(f'sample of {wrong[0]}: must be within {_MAX_SAMPLE:g} of 0; check the '
                     'unit and the scale')
 
 
 def check_inflation(name: str, packed: int, size: int, remedy: str) -> None:
     """Raise RecordingError if `packed` bytes unpack to a `size` that no measurement has."""
-    if size > max(IN_MEMORY_BYTES, MAX_INFLATION * packed):
+    if size > max(IN_MEMORY_BYTES, _MAX_INFLATION * packed):
         raise RecordingError(f'{name}: {packed} bytes unpack to {size}, more than '
-                             f'{MAX_INFLATION} times as many, which no measured signal does: '
+                             f'{_MAX_INFLATION} times as many, which no measured signal does: '
                              f'{remedy}')
 
 

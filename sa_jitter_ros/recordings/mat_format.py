@@ -28,7 +28,7 @@ from sa_jitter_ros.recordings.fields import (
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
-Buffer = bytes | mmap.mmap
+_Buffer = bytes | mmap.mmap
 
 _MATRIX, _COMPRESSED = 14, 15
 _CELL, _CHAR, _NUMERIC = 1, 4, range(6, 16)
@@ -90,7 +90,7 @@ class _Reader:
     def __init__(self, order: str) -> None:
         self._order = order
 
-    def variables(self, whole: Buffer) -> Iterator[tuple[str, RawArray]]:
+    def variables(self, whole: _Buffer) -> Iterator[tuple[str, RawArray]]:
         """Iterate over names and arrays of the variables that are fields of a recording."""
         start = 128
         while start + 8 <= len(whole):
@@ -110,7 +110,7 @@ class _Reader:
                     yield matrix.name, self._array(
                         data, self._matrix(data, self._element(data, 0, len(data))))
 
-    def _element(self, data: Buffer, start: int, limit: int | None) -> _Element:
+    def _element(self, data: _Buffer, start: int, limit: int | None) -> _Element:
         """Read the tag at `start`, of an element that ends at `limit` or before."""
         kind, size = struct.unpack_from(f'{self._order}2I', data, start)
         if kind >> 16:  # the small format: four bytes of data within the tag
@@ -126,7 +126,7 @@ class _Reader:
         """Return where the element after one at `start` begins, 8 bytes aligned."""
         return max(start + 8, element.stop + (start - element.stop) % 8)
 
-    def _matrix(self, data: Buffer, element: _Element) -> _Matrix:
+    def _matrix(self, data: _Buffer, element: _Element) -> _Matrix:
         limit = min(element.stop, len(data))
         places, at = [], element.start
         for _ in range(3):
@@ -139,7 +139,7 @@ class _Reader:
         return _Matrix(data[name.start:name.stop].decode('ascii', 'replace'), kind,
                        tuple(shape.tolist()), at, element.stop)
 
-    def _array(self, data: Buffer, matrix: _Matrix) -> RawArray:
+    def _array(self, data: _Buffer, matrix: _Matrix) -> RawArray:
         limit = size_limit(matrix.name)
         if not matrix.shape or min(matrix.shape) < 0 or 8 * prod(matrix.shape) > limit:
             raise RecordingError(f'{matrix.name} of shape {matrix.shape}: exceeds its limit of '
@@ -164,7 +164,7 @@ class _Reader:
         array = np.frombuffer(data, dtype, count, part.start) if count else np.empty(0)
         return array.reshape(matrix.shape, order='F')
 
-    def _cells(self, data: Buffer, matrix: _Matrix) -> Iterator[str]:
+    def _cells(self, data: _Buffer, matrix: _Matrix) -> Iterator[str]:
         """Iterate over the texts of a cell array."""
         at = matrix.content
         for _ in range(prod(matrix.shape)):
@@ -175,7 +175,7 @@ class _Reader:
             yield ''.join(self._text(data, cell).tolist())
             at = self._after(element, at)
 
-    def _text(self, data: Buffer, matrix: _Matrix) -> RawArray:
+    def _text(self, data: _Buffer, matrix: _Matrix) -> RawArray:
         """Return the rows of a character matrix."""
         part = self._element(data, matrix.content, matrix.stop)
         if part.stop - part.start > MAX_FIELD_BYTES:
@@ -190,23 +190,23 @@ class _Reader:
         return np.array([text[row::rows] for row in range(rows)])
 
 
-def _inflate(whole: Buffer, element: _Element, size: int) -> Buffer:
+def _inflate(whole: _Buffer, element: _Element, size: int) -> _Buffer:
     """Unpack a compressed variable of `size` bytes, into a mapped file if it is large."""
     packed = element.stop - element.start
     check_inflation('a variable', packed, size, "save it with '-v6', which does not compress")
-    unpack, at, left = zlib.decompressobj(), element.start, size
+    unpack, at, remaining = zlib.decompressobj(), element.start, size
     with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as spool:
-        while left > 0 and (at < element.stop or unpack.unconsumed_tail):
+        while remaining > 0 and (at < element.stop or unpack.unconsumed_tail):
             piece = unpack.unconsumed_tail
             if not piece:
                 piece = whole[at:min(at + _STEP, element.stop)]
                 at += len(piece)
-            data = unpack.decompress(piece, min(left, _STEP))
-            left -= len(data)
+            data = unpack.decompress(piece, min(remaining, _STEP))
+            remaining -= len(data)
             spool.write(data)
-        if left > 0:
-            raise RecordingError(f'{left} of {size} bytes of a compressed variable are missing: '
-                                 'the file is truncated or broken; copy it again')
+        if remaining > 0:
+            raise RecordingError(f'{remaining} of {size} bytes of a compressed variable are '
+                                 'missing: the file is truncated or broken; copy it again')
         if size > IN_MEMORY_BYTES:
             spool.flush()
             return mmap.mmap(spool.fileno(), 0, access=mmap.ACCESS_READ)

@@ -70,7 +70,7 @@ def decode_array(message: Any, labels: tuple[str, ...],
 
 
 def whole(name: str, value: float) -> int:
-    """Return a count that a message holds as a float; raises `MessageError`."""
+    """Return a count that a message contains as a float; raises `MessageError`."""
     if not (math.isfinite(value) and 0.0 <= value <= 2.0**53 and value == math.floor(value)):
         raise MessageError(f'{name} is {value}: send a whole number >= 0')
     return int(value)

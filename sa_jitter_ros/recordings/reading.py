@@ -16,7 +16,7 @@ from sa_jitter_ros.recordings.npz_format import open_npz
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 from sa_jitter_ros.recordings.wav_format import open_wav
 
-SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
+_SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
 
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
@@ -53,7 +53,7 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     Raises
     ------
     ParameterError
-        If `fields` holds an unknown name.
+        If `fields` has an unknown name.
     RecordingError
         If the file is missing, broken, unsafe or incomplete, in one line that starts with the
         path.
@@ -83,9 +83,9 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
         if not path.exists():
             raise RecordingError('no such file or folder: check the path')
         suffix = 'bag' if path.is_dir() else path.suffix.lower()
-        if suffix not in ('bag', *SUFFIXES):
+        if suffix not in ('bag', *_SUFFIXES):
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
-                                 f'{", ".join(SUFFIXES)} or a rosbag2 folder; convert it')
+                                 f'{", ".join(_SUFFIXES)} or a rosbag2 folder; convert it')
         given = converted_fields({key: value for key, value in fields.items()
                                   if value is not None})
         if suffix in ('.npz', '.mat'):

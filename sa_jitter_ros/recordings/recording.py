@@ -16,7 +16,7 @@ from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 
-MAX_CHANNELS = 4096
+_MAX_CHANNELS = 4096
 MAX_PULSES = 50_000_000
 
 
@@ -97,7 +97,7 @@ class Recording:
     description
         Free text.
     acquisitions
-        How many separate acquisitions the file holds (this is one of them).
+        Number of separate acquisitions in the file (this is one of them).
     remarks
         How the reader repaired the data, one sentence each.
     path
@@ -143,10 +143,10 @@ class Recording:
     def __post_init__(self) -> None:
         """Check that the parts fit each other, and fill in names and units."""
         channels = self.vibration.channels
-        if not 1 <= channels <= MAX_CHANNELS or self.vibration.samples < 1:
+        if not 1 <= channels <= _MAX_CHANNELS or self.vibration.samples < 1:
             raise RecordingError(
                 f'vibration of {channels} channels x {self.vibration.samples} samples: needs 1 '
-                f'to {MAX_CHANNELS} channels and at least one sample')
+                f'to {_MAX_CHANNELS} channels and at least one sample')
         check_rate('sample_rate', self.sample_rate, RecordingError)
         _check_positive('ratio', self.ratio)
         if not math.isfinite(self.start_time):
@@ -197,7 +197,7 @@ class Recording:
         """
         Iterate over the vibration with bounded memory.
 
-        Each block is `channel` x `sample`; all but the last hold `samples_per_block` samples.
+        Each block is `channel` x `sample`; all but the last have `samples_per_block` samples.
         Raises RecordingError if the file is found to be broken.
         """
         return self._checked(self.vibration, samples_per_block)
@@ -317,7 +317,7 @@ def _check_pulse_times(name: str, times: FloatArray | None) -> None:
         raise RecordingError(
             f'{name} of shape {times.shape}: needs one row of at most {MAX_PULSES} times')
     if not np.isfinite(times).all():
-        raise RecordingError(f'{name}: holds NaN or infinity; remove those pulses')
+        raise RecordingError(f'{name}: contains NaN or infinity; remove those pulses')
     check_times(name, times, RecordingError)
     backwards = np.flatnonzero(np.diff(times) < 0)
     if backwards.size:

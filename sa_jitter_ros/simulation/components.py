@@ -10,7 +10,7 @@ from sa_jitter_ros.simulation.random_streams import FloatArray, RandomStream
 
 ComplexArray = NDArray[np.complex128]
 
-MAX_WIDTH = 0.15  # revolutions; beyond it more than two neighbouring bursts overlap
+_MAX_WIDTH = 0.15  # revolutions; beyond it more than two neighbouring bursts overlap
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class ChippedTooth:
         if self.order != int(self.order) or self.order < 0:
             raise ParameterError(f'order {self.order} of a chipped tooth: give a whole number, '
                                  'at least 0')
-        if not 0 < self.width <= MAX_WIDTH:
+        if not 0 < self.width <= _MAX_WIDTH:
             raise ParameterError(f'width {self.width} of a chipped tooth: must be positive and at '
-                                 f'most {MAX_WIDTH} revolutions')
+                                 f'most {_MAX_WIDTH} revolutions')
 
     def burst(self, angle: FloatArray) -> FloatArray:
         """Return the burst of unit amplitude at some angles of the shaft, revolutions."""

@@ -21,12 +21,12 @@ from sa_jitter_ros.simulation.random_streams import (
 from scipy.interpolate import CubicSpline
 from scipy.special import ndtri
 
-MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones
+_MAX_CORRELATION = 0.9999  # beyond it a pulse depends on too many earlier ones
 JITTER_DISTRIBUTIONS = ('uniform', 'normal', 'triangular', 'table')
-GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # relative, irrational: all fractions occur evenly
+_GRID_OFFSET = 1e-3 * (np.sqrt(5.0) - 1.0)  # relative, irrational: all fractions occur evenly
 _SPLINE_MARGIN = 32  # samples; there the end acts on the spline by 0.268^32: below rounding
 
-Interpolator = Callable[[FloatArray, FloatArray], FloatArray]
+_Interpolator = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 def _per_pulse(draw: Callable[[int, int], FloatArray], index: IndexArray) -> FloatArray:
@@ -95,8 +95,8 @@ class CorrelatedJitter(Effect):
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('correlated_jitter.std', self.std, minimum=0)
-        require_number('correlated_jitter.correlation', self.correlation, above=-MAX_CORRELATION,
-                       below=MAX_CORRELATION)
+        require_number('correlated_jitter.correlation', self.correlation, above=-_MAX_CORRELATION,
+                       below=_MAX_CORRELATION)
 
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the delay of each pulse."""
@@ -270,7 +270,7 @@ def spline(samples: FloatArray, positions: FloatArray) -> FloatArray:
 
 
 # Name of the averager's method: its function and the samples that it needs on either side.
-INTERPOLATORS: Mapping[str, tuple[Interpolator, int]] = {
+INTERPOLATORS: Mapping[str, tuple[_Interpolator, int]] = {
     'linear': (linear, 1), 'cubic': (cubic, 2), 'spline': (spline, _SPLINE_MARGIN)}
 
 
@@ -293,8 +293,8 @@ class InterpolationLoss(Effect):
     def sampled(self, setting: Setting, signal: Signal, start: int, stop: int) -> FloatArray:
         """Return the interpolated samples."""
         interpolate, margin = INTERPOLATORS[self.method]
-        rate = setting.sample_rate * (1.0 + GRID_OFFSET)
-        positions = np.arange(start, stop) * (1.0 + GRID_OFFSET)
+        rate = setting.sample_rate * (1.0 + _GRID_OFFSET)
+        positions = np.arange(start, stop) * (1.0 + _GRID_OFFSET)
         first = math.floor(positions[0]) - margin
         grid = np.arange(first, math.floor(positions[-1]) + 1 + margin + 1)
         return interpolate(signal(grid / rate), positions - first)

@@ -7,7 +7,7 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import IndexArray, require_number
 from sa_jitter_ros.simulation.random_streams import FloatArray
 
-WAVEFORMS = ('ttl', 'sine')
+_WAVEFORMS = ('ttl', 'sine')
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,9 +74,9 @@ class Keyphasor:
         require_number('duty', self.duty, above=0, below=0.6)
         require_number('rise_time', self.rise_time, minimum=0)
         require_number('keyphasor noise_std', self.noise_std, minimum=0)
-        if self.waveform not in WAVEFORMS:
+        if self.waveform not in _WAVEFORMS:
             raise ParameterError(f'keyphasor waveform {self.waveform!r}: must be one of '
-                                 f'{", ".join(WAVEFORMS)}')
+                                 f'{", ".join(_WAVEFORMS)}')
 
     @property
     def trigger_pulses(self) -> int:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.random_streams import FloatArray, SinusoidSum, ZERO
 
-MAX_FLUCTUATION = 0.9  # of the upper bound, which is about ten standard deviations
-MAX_TORSION = 0.5
+_MAX_FLUCTUATION = 0.9  # of the upper bound, which is about ten standard deviations
+_MAX_TORSION = 0.5
 _PICARD_STEPS = 6
 _NEWTON_STEPS = 6
 
@@ -86,14 +86,14 @@ class Motion:
         if (speeds < 0).any() or speeds[-1] == 0:
             raise ParameterError(f'speeds {speeds.tolist()} Hz: must not be negative, nor the '
                                  'last one 0')
-        if self.fluctuation.bound > MAX_FLUCTUATION:
+        if self.fluctuation.bound > _MAX_FLUCTUATION:
             raise ParameterError(
                 f'speed fluctuation may reach {self.fluctuation.bound:.3g} of the speed: at most '
-                f'{MAX_FLUCTUATION}; lower its standard deviation')
+                f'{_MAX_FLUCTUATION}; lower its standard deviation')
         twist = sum(abs(item.order * item.amplitude) for item in self.torsion)
-        if not twist <= MAX_TORSION:
+        if not twist <= _MAX_TORSION:
             raise ParameterError(f'torsion changes the speed by up to {twist:.3g} of its value: '
-                                 f'at most {MAX_TORSION}; lower order or amplitude')
+                                 f'at most {_MAX_TORSION}; lower order or amplitude')
         steps = np.diff(times) * (speeds[1:] + speeds[:-1]) / 2.0
         object.__setattr__(self, '_times', times)
         object.__setattr__(self, '_speeds', speeds)
@@ -153,11 +153,12 @@ class Motion:
     def _profile_time(self, angles: FloatArray) -> FloatArray:
         angles = angles - self.start_angle
         at = self._segment(angles, self._angles)
-        begin, left = self._speeds[at], angles - self._angles[at]
+        begin, angle_behind = self._speeds[at], angles - self._angles[at]
         slopes = np.append(np.diff(self._speeds) / np.diff(self._times), 0.0)
-        end = np.sqrt(np.maximum(begin**2 + 2.0 * slopes[at] * left, 0.0))
-        mean_speed = np.where(left < 0.0, self.nominal_speed, (begin + end) / 2.0)
-        return np.asarray(self._times[at] + left / np.where(left == 0.0, 1.0, mean_speed))
+        end = np.sqrt(np.maximum(begin**2 + 2.0 * slopes[at] * angle_behind, 0.0))
+        mean_speed = np.where(angle_behind < 0.0, self.nominal_speed, (begin + end) / 2.0)
+        seconds = angle_behind / np.where(angle_behind == 0.0, 1.0, mean_speed)
+        return np.asarray(self._times[at] + seconds)
 
 
 def _invert(function: Callable[[FloatArray], FloatArray],

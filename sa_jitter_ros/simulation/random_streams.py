@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 FloatArray = NDArray[np.float64]
 
 CHUNK = 1024
-LINES = 48  # sinusoids of a random function
+_LINES = 48  # sinusoids of a random function
 _NEGLIGIBLE = 1e-17  # correlation below the resolution of a float64
 
 
@@ -144,7 +144,7 @@ def band_limited(*, std: float, band: tuple[float, float], seed: int, name: str)
         raise ParameterError(f'{name}: band is {low} to {high} Hz, must be 0 < low < high')
     if not 0.0 <= std < np.inf:
         raise ParameterError(f'{name}: standard deviation is {std}, must be at least 0')
-    places, phases = RandomStream(seed, name, rows=2).uniform(0, LINES)
-    frequencies = low + (np.arange(LINES) + places) * (high - low) / LINES
-    return SinusoidSum(np.full(LINES, std * np.sqrt(2.0 / LINES)), frequencies,
+    places, phases = RandomStream(seed, name, rows=2).uniform(0, _LINES)
+    frequencies = low + (np.arange(_LINES) + places) * (high - low) / _LINES
+    return SinusoidSum(np.full(_LINES, std * np.sqrt(2.0 / _LINES)), frequencies,
                        2.0 * np.pi * phases)
