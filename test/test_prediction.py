@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from processes import gaussian_pulse_jitter
 import pytest
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
-from sa_jitter_ros.prediction.angle_error import (
-    gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
+from sa_jitter_ros.prediction.angle_error import GaussianAngleError, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.influence import Gain, Influence
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.amplitude_distribution import (
-    curved_distribution, normal_distribution)
+from sa_jitter_ros.prediction.amplitude_distribution import curved_distribution
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import average_cumulants, third_cumulants
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
@@ -13,8 +12,8 @@ from sa_jitter_ros.prediction.sampled_distribution import (
     drawn_averages, SampledDistribution)
 from scipy import stats
 from validation.analytic import (
-    approximate_cycle_moments, inversion_cdf, laguerre_distribution, squared_amplitude_cumulants,
-    uniform_mean)
+    approximate_cycle_moments, inversion_cdf, laguerre_distribution, normal_distribution,
+    squared_amplitude_cumulants, uniform_mean)
 from validation.monte_carlo import AveragedSignal, monte_carlo
 
 QUANTILES = np.array([0.001, 0.05, 0.5, 0.95, 0.999])

@@ -4,12 +4,11 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.distributions import (
-    Empirical, Normal, PulseErrorDistribution, Sum, Triangular, Uniform)
+    Empirical, Normal, PulseErrorDistribution, Triangular, Uniform)
 from scipy import stats
 
 SKEWED = np.random.default_rng(3).exponential(1e-5, 500)
-DISTRIBUTIONS = [Uniform(3e-5), Normal(1e-5), Triangular(1e-5), Empirical(SKEWED),
-                 Sum(Uniform(2e-5), Normal(4e-6), Empirical(SKEWED))]
+DISTRIBUTIONS = [Uniform(3e-5), Normal(1e-5), Triangular(1e-5), Empirical(SKEWED)]
 FREQUENCIES = np.array([-4e4, -1e3, 0.0, 100.0, 1e3, 1e4, 3.3e4, 1.2e5])
 
 
@@ -37,8 +36,7 @@ def test_variance_is_the_curvature_of_the_characteristic_function(distribution):
 
 
 def test_bounded_distributions_fill_their_width_and_no_more(rng):
-    for distribution in (Uniform(2.0), Triangular(0.5), Empirical(SKEWED),
-                         Sum(Uniform(1.0), Uniform(2.0))):
+    for distribution in (Uniform(2.0), Triangular(0.5), Empirical(SKEWED)):
         draws = distribution.draw(rng, 200_000)
         assert 0.95 * distribution.width < np.ptp(draws) <= distribution.width * (1.0 + 1e-12)
     assert stats.norm.cdf(-0.5 * Normal(1.0).width) < 4e-5
@@ -60,14 +58,6 @@ def test_a_constant_table_is_no_jitter():
     assert np.all(Empirical([2e-6, 2e-6]).characteristic_function([[1e3, 2e6]]) == 1.0)
 
 
-def test_a_sum_multiplies_and_adds():
-    distribution = Sum(Uniform(2e-5), Normal(4e-6))
-    assert distribution.variance == pytest.approx(4e-10 / 12.0 + 1.6e-11)
-    np.testing.assert_allclose(
-        distribution.characteristic_function(FREQUENCIES),
-        np.sinc(FREQUENCIES * 2e-5) * np.exp(-2.0 * (np.pi * FREQUENCIES * 4e-6) ** 2))
-
-
 @pytest.mark.parametrize(('make', 'message'), [
     (lambda: Uniform(-1e-6), 'width is -1e-06 s'),
     (lambda: Uniform(float('nan')), 'width is nan s'),
@@ -77,7 +67,6 @@ def test_a_sum_multiplies_and_adds():
     (lambda: Empirical([[1.0, 2.0]]), r'shape \(1, 2\)'),
     (lambda: Empirical([1.0, float('nan')]), r'table\[1\] is nan'),
     (lambda: Empirical(['a', 'b']), 'holds a value that is no number'),
-    (lambda: Sum(), 'a sum of 0 distributions'),
 ])
 def test_what_is_no_distribution_is_refused(make, message):
     with pytest.raises(ModelError, match=message):

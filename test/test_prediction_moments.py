@@ -1,12 +1,12 @@
 """Exact moments: closed forms, published values, Monte Carlo, and every combination of effects."""
 
 import numpy as np
+from processes import gaussian_pulse_jitter
 import pytest
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.angle_error import (
-    gaussian_pulse_jitter, GaussianAngleError, IndependentPulseJitter)
+from sa_jitter_ros.prediction.angle_error import GaussianAngleError, IndependentPulseJitter
 from sa_jitter_ros.prediction.cumulants import third_cumulants
-from sa_jitter_ros.prediction.distributions import Empirical, Normal, Sum, Triangular, Uniform
+from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import cycle_moments, noise_line_variance
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
@@ -33,7 +33,7 @@ def assert_moments(draws, moments, index=0):
             (centred.real, 0.0), (centred.imag, 0.0),
             (centred.real**2, moments.real_variance[index]),
             (centred.imag**2, moments.imag_variance[index]),
-            (centred.real * centred.imag, moments.covariance[index]),
+            (centred.real * centred.imag, 0.5 * moments.pseudo_variance.imag[index]),
             (np.abs(draws) ** 2, moments.mean_square[index])]:
         tolerance = 4.5 * sample.std() / np.sqrt(n) + 1e-12
         assert sample.mean() == pytest.approx(expected, abs=tolerance)
@@ -73,7 +73,7 @@ def test_small_jitter_has_the_limits_of_a_taylor_series():
 
 
 @pytest.mark.parametrize('distribution', [
-    Uniform(0.9), Triangular(0.2), EXPONENTIAL, Sum(Uniform(0.5), Normal(0.1))],
+    Uniform(0.9), Triangular(0.2), EXPONENTIAL, Normal(0.15)],
     ids=lambda distribution: type(distribution).__name__)
 @pytest.mark.parametrize('cycles', [1, 3, 8])
 def test_moments_and_third_cumulants_agree_with_monte_carlo(distribution, cycles, rng):
@@ -191,8 +191,6 @@ def test_noise_in_one_line_of_an_average_in_peak_units(rng):
     (lambda jitter: cycle_moments([np.nan], jitter), 'orders hold nan'),
     (lambda jitter: cycle_moments([1.0], jitter).averaged(0), 'trigger_cycles is 0'),
     (lambda jitter: cycle_moments([1.0], jitter).averaged(2.5), 'trigger_cycles is 2.5'),
-    (lambda jitter: gaussian_pulse_jitter([1.0, 0.9]), 'spectrum as low as'),
-    (lambda jitter: gaussian_pulse_jitter([]), 'list of finite numbers'),
 ])
 def test_bad_input_is_refused(call, message):
     with pytest.raises(ModelError, match=message):

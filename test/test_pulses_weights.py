@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from processes import gaussian_pulse_jitter
 import pytest
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.effects.band import ACCELERATION_BAND
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.angle_error import gaussian_pulse_jitter, IndependentPulseJitter
+from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Uniform
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import cycle_moments

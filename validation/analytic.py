@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.moments import (
@@ -129,6 +130,17 @@ def approximate_cycle_moments(spread: ArrayLike) -> CycleMoments:
         - 2.0 * x * (x**4 - 180.0 * x**2 + 2145.0) * cos) / (2160.0 * x**3)
     return CycleMoments(mean.astype(complex), np.array([real + imag, real_lag + imag_lag]),
                         np.array([real - imag, real_lag - imag_lag]))
+
+
+def normal_distribution(moments: AverageMoments) -> AmplitudeDistribution:
+    """Return the exact distribution of |X| for a normal X: the quadratic form of Eq. 34."""
+    turn = np.exp(0.5j * np.angle(-moments.pseudo_variance))  # the axis of the smaller variance
+    mean = moments.mean * turn.conj()
+    gap = np.abs(moments.pseudo_variance)
+    zero = np.zeros(mean.size)
+    small = np.maximum(0.5 * (moments.variance - gap), 0.0)
+    return AmplitudeDistribution(mean.real, mean.imag, np.sqrt(small),
+                                 np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
 
 
 def squared_amplitude_cumulants(moments: AverageMoments, count: int) -> Array:

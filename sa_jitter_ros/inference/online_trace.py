@@ -23,9 +23,9 @@ from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAv
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.trace import require_acquisitions, Trace, trace_bench
+from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.prediction.moments import noise_line_variance
 
 Array = NDArray[Any]
 
@@ -162,12 +162,10 @@ def _measured_noise(observation: Observation, lines: Lines) -> MeasuredNoise:
     """Return the noise of each order beyond the declared one, the mean over its channels."""
     model = observation.model
     power = 2.0 * np.mean(np.asarray(observation.stacked('noise')) ** 2, axis=0)
-    known = (noise_line_variance(model.noise_std, model.sample_rate, model.duration)
-             if model.noise_std else 0.0)
     count = np.bincount(lines.order, minlength=observation.orders.size)
     total = np.bincount(lines.order, lines.of(power), observation.orders.size)
     return MeasuredNoise(tuple(
-        np.maximum(total / np.maximum(count, 1) - known, 0.0).tolist()))
+        np.maximum(total / np.maximum(count, 1) - line_variance(model, ()), 0.0).tolist()))
 
 
 def _scatter(observation: Observation, lines: Lines, level: Array) -> LineEvidence:

@@ -1,13 +1,10 @@
 """
 The distribution of the amplitude |X| from the moments of the complex amplitude X, for all orders.
 
-Two distributions share one form. `normal_distribution` is the exact one of |X| for a normal X of
-any mean and 2x2 covariance (singular ones too): the quadratic form of Eq. 34 of Camerini et al.
-2019, integrated over one principal axis with the other one in closed form. `curved_distribution`
-adds what the central limit theorem leaves out at order 1/sqrt(N_t): timing errors that turn X also
-shorten it, so X lies along an arc, and its radial part is skewed. Both follow from the third
-cumulants. At N_t = 20 the distribution function of the normal one is up to 0.06 off, that of the
-curved one 0.006 (symmetric jitter).
+The curved distribution adds to the normal one of X what the central limit theorem leaves out at
+order 1/sqrt(N_t): timing errors that turn X also shorten it, so X lies along an arc, and its
+radial part is skewed. Both follow from the third cumulants. At N_t = 20 the distribution function
+of a normal X is up to 0.06 off, the curved one 0.006 (symmetric jitter).
 """
 
 from collections.abc import Callable
@@ -25,14 +22,14 @@ from scipy.special import ndtr, ndtri
 Array = NDArray[Any]
 
 _REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
-_AXIS, _AXIS_WEIGHTS = np.polynomial.legendre.leggauss(48)
-_HERMITE, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(32)
+_AXIS, _AXIS_WEIGHTS = np.polynomial.legendre.leggauss(48)  # 1e-9 of a distribution function
+_HERMITE, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(32)  # 1e-5 of Var|X|, kinks apart
 _HERMITE_PAIRS = (np.multiply.outer(_HERMITE_WEIGHTS, _HERMITE_WEIGHTS)
                   / _HERMITE_WEIGHTS.sum() ** 2)
-_UNIT, _UNIT_WEIGHTS = unit_nodes(64)
-_MAXIMAL_SKEW = 2.0
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
-_ROOT_STEPS = 60
+_UNIT, _UNIT_WEIGHTS = unit_nodes(64)  # of amplitudes from 0 to the largest
+_MAXIMAL_SKEW = 2.0  # that of an exponential variable
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # the step that spreads points most evenly
+_ROOT_STEPS = 60  # bisection alone takes 50 to the last digit
 _ROOT_TOLERANCE = 1e-9  # of probability
 
 
@@ -44,7 +41,7 @@ class AmplitudeDistribution:
     across = mean_across + std_across Z and along = mean_along + slope (across - mean_across) +
     bend ((across - mean_across)^2 - std_across^2) + std_along T, with Z normal and T of unit
     variance and skewness `skew`: Wilson and Hilferty's cube of a normal variable, a gamma variable
-    to 1e-3. slope, bend and skew are 0 in the normal distribution.
+    to 1e-3. X is normal, exactly, where bend and skew are 0.
     """
 
     mean_along: Array
@@ -95,7 +92,7 @@ class AmplitudeDistribution:
         """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
         y = np.maximum(np.atleast_2d(np.asarray(amplitude, float)), 0.0)
         y = np.broadcast_to(y, (self.mean_along.size, y.shape[-1]))
-        if np.any(self.bend) or np.any(self.skew):
+        if np.any(self.slope) or np.any(self.bend) or np.any(self.skew):
             return self._curved_cdf(y)
         return self._normal_cdf(y)
 
@@ -146,17 +143,6 @@ class AmplitudeDistribution:
         """Return P(std_along T <= x)."""
         t = _ratio(x, self.std_along[:, None, None])
         return np.asarray(ndtr(_straight(t, self.skew[:, None, None])))
-
-
-def normal_distribution(moments: AverageMoments) -> AmplitudeDistribution:
-    """Return the exact distribution of |X| for a normal X with these moments."""
-    turn = np.exp(0.5j * np.angle(-moments.pseudo_variance))  # the axis of the smaller variance
-    mean = moments.mean * turn.conj()
-    gap = np.abs(moments.pseudo_variance)
-    zero = np.zeros(mean.size)
-    small = np.maximum(0.5 * (moments.variance - gap), 0.0)
-    return AmplitudeDistribution(mean.real, mean.imag, np.sqrt(small),
-                                 np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
 
 
 def curved_distribution(moments: AverageMoments, plain: Array, mixed: Array

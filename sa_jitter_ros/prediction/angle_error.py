@@ -21,7 +21,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.pulses.angle_law import Covariance, LINEAR, PulseWeights
 
@@ -166,31 +165,6 @@ def drawn_normal(
     factor = (axes[:, kept] * np.sqrt(size[kept])).astype(np.float32)
     z = rng.standard_normal((factor.shape[1], count), np.float32)
     return np.asarray((factor @ z).reshape(cycles, u.size, count))
-
-
-def gaussian_pulse_jitter(
-    autocovariance: Sequence[float], *, weights: PulseWeights = LINEAR,
-) -> GaussianPulseJitter:
-    """
-    Return correlated normal pulse errors seen through an angle law, by default the linear one.
-
-    `autocovariance[i]` = Cov[eps_k, eps_{k+i}] in fundamental cycles squared, 0 beyond the list.
-    Raises ModelError when no stationary sequence has it.
-    """
-    table = np.asarray(autocovariance, float)
-    if table.ndim != 1 or table.size == 0 or not np.all(np.isfinite(table)):
-        raise ModelError('autocovariance must be a list of finite numbers, lag 0 first; '
-                         f'it has the shape {table.shape}')
-    grid = np.arange(0, 4 * table.size + 1) / (8.0 * table.size)
-    spectrum = table[0] + 2.0 * np.cos(
-        2.0 * np.pi * np.outer(grid, np.arange(1, table.size))) @ table[1:]
-    if spectrum.min() < -1e-9 * abs(table[0]):
-        raise ModelError(f'autocovariance has a spectrum as low as {spectrum.min():.3g}: no '
-                         'random sequence has a negative one; lower the correlations')
-
-    return GaussianPulseJitter.through(
-        weights, lambda lags: np.append(table, 0.0)[np.minimum(np.abs(lags), table.size)],
-        table.size + weights.pulses - 2)
 
 
 def joint_characteristic(

@@ -147,8 +147,7 @@ def design(
 def loss_and_variation(model: DeclaredModel) -> tuple[Array, Array]:
     """Return the loss and the coefficient of variation of each of a model's orders."""
     prediction = predict(model)
-    return (1.0 - np.abs(prediction.moments.mean),
-            prediction.standard_deviation / prediction.mean_attenuation)
+    return prediction.loss, prediction.standard_deviation / prediction.mean_attenuation
 
 
 def required_keyphasor_rate(model: DeclaredModel, maximum_loss: float) -> float:
@@ -233,6 +232,12 @@ def detection_probability(
     for one downwards. The component alone changes; noise stays. A change of 0.1 makes the
     component 1.1 times as large. Raises ParameterError for a change that is not finite or below
     -1 and for a false-alarm rate outside (0, 1).
+
+    >>> model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    ...                       orders=(23.0, 46.0), noise_std=1.0, sample_rate=20e3)
+    >>> detection_probability(model, [0.02, 0.05], 0.01).round(2)
+    array([[0.57, 1.  ],
+           [0.53, 1.  ]])
     """
     if not 0.0 < false_alarm_rate < 1.0:
         raise ParameterError(f'false_alarm_rate is {false_alarm_rate}: give a probability between '

@@ -1,5 +1,5 @@
 """
-Distributions of the error of one keyphasor pulse: one interface, five of zero mean.
+Distributions of the error of one keyphasor pulse: one interface, all of zero mean.
 
 Errors are in seconds and a characteristic function takes a frequency in Hz, so that its value at
 ``g f`` is the mean phasor of order ``g`` of a shaft that turns at ``f``.
@@ -205,44 +205,6 @@ class Empirical:
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
         return np.asarray(rng.choice(self.table, shape))
-
-
-class Sum:
-    """The sum of independent errors, each with its own distribution."""
-
-    def __init__(self, *terms: PulseErrorDistribution) -> None:
-        """Take the distributions whose errors add; raise ModelError for none."""
-        if not terms:
-            raise ModelError('a sum of 0 distributions is no distribution: give at least one')
-        self.terms = terms
-
-    def __repr__(self) -> str:
-        """Show the terms."""
-        return f'Sum{self.terms!r}'
-
-    @property
-    def variance(self) -> float:
-        """Variance in s^2."""
-        return sum(term.variance for term in self.terms)
-
-    @property
-    def width(self) -> float:
-        """Full width of the support in s."""
-        return sum(term.width for term in self.terms)
-
-    def characteristic_function(self, frequency: ArrayLike) -> Array:
-        """Return the product of the characteristic functions."""
-        product = self.terms[0].characteristic_function(frequency)
-        for term in self.terms[1:]:
-            product = product * term.characteristic_function(frequency)
-        return product
-
-    def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
-        """Return independent errors in s."""
-        total = self.terms[0].draw(rng, shape)
-        for term in self.terms[1:]:
-            total = total + term.draw(rng, shape)
-        return total
 
 
 def is_number(value: object) -> bool:

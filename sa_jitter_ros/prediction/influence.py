@@ -117,7 +117,15 @@ class Influence(Protocol):
 
 @dataclass(frozen=True)
 class Gain(Influence):
-    """A known change of the components: `factor`, one or (order,), complex or real."""
+    """
+    A known change of the components: `factor`, one or (order,), complex or real.
+
+    >>> from sa_jitter_ros.prediction.prediction import predict
+    >>> model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    ...                       orders=(23.0, 46.0))
+    >>> (predict(model, [Gain(1.1)]).mean_attenuation / predict(model).mean_attenuation).round(3)
+    array([1.1, 1.1])
+    """
 
     name: ClassVar[str] = 'gain'
     factor: ArrayLike

@@ -31,6 +31,15 @@ class DeclaredModel:
     a distribution does not use (`jitter_std` of a uniform one, `jitter_table` of any but table)
     may stay set, so that the distribution can be switched. Raises ModelError for values that make
     no sense.
+
+    A shaft at 2.4 times the speed of the tach shaft, whose keyphasor sees six marks and triggers
+    at every third:
+
+    >>> model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    ...                       orders=(23.0, 46.0), ratio=2.4, pulses_per_revolution=6,
+    ...                       pulses_per_trigger=3)
+    >>> model.trigger_period, model.cycle_length, model.duration
+    (0.02, 1.2, 0.8)
     """
 
     keyphasor_rate: float

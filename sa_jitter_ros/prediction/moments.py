@@ -60,11 +60,6 @@ class AverageMoments:
         """Return Var Im X."""
         return np.asarray(0.5 * (self.variance - np.real(self.pseudo_variance)))
 
-    @property
-    def covariance(self) -> Array:
-        """Return Cov(Re X, Im X)."""
-        return np.asarray(0.5 * np.imag(self.pseudo_variance))
-
     def of(self, rows: Any) -> 'AverageMoments':
         """Return the moments of some entries, as an index of the arrays picks them."""
         return AverageMoments(self.mean[rows], self.variance[rows], self.pseudo_variance[rows])

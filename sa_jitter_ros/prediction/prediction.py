@@ -31,6 +31,16 @@ class Prediction:
 
     `mean_attenuation` = E|X| and `variance` = Var|X|, so mean^2 + variance = E|X|^2, which is
     exact. `moments` hold the complex amplitude itself, `distribution` its distribution function.
+
+    >>> result = predict(DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    ...                                orders=(23.0, 46.0)))
+    >>> np.round([result.mean_attenuation, result.standard_deviation, result.quantile_05], 3)
+    array([[0.997, 0.986],
+           [0.001, 0.002],
+           [0.996, 0.982]])
+    >>> result.cdf([0.985, 0.997]).round(2)  # P(|X| <= 0.985) and P(|X| <= 0.997), a row an order
+    array([[0.  , 0.8 ],
+           [0.31, 1.  ]])
     """
 
     model: DeclaredModel
