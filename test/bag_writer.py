@@ -8,9 +8,12 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
-from sa_jitter_ros.recordings.bag_format import FLOAT32, FLOAT64, TIME_REFERENCE
 from sa_jitter_ros.recordings.message_layouts import encode_time, INDEX_BASE
 from sa_jitter_ros.recordings.recording import FloatArray, Recording
+
+FLOAT64 = 'std_msgs/msg/Float64MultiArray'
+FLOAT32 = 'std_msgs/msg/Float32MultiArray'
+TIME_REFERENCE = 'sensor_msgs/msg/TimeReference'
 
 _Timed = tuple[float, str, Any]
 
@@ -33,7 +36,7 @@ def write_bag(path: str | os.PathLike[str], recording: Recording, *, storage: st
     storage
         'mcap' or 'sqlite3'.
     vibration_type
-        `FLOAT64` or `FLOAT32` (of `bag_format`).
+        `FLOAT64` or `FLOAT32`.
     tach_type
         `TIME_REFERENCE`, a message a pulse, or `FLOAT64`, a message a block.
     keyphasor

@@ -98,7 +98,7 @@ def test_reference_serves_unless_the_vibration_moves_against_it():
     assert [item.name for item in found.findings] == ['excess_jitter']
     swapped = replace(recording, pulse_times=recording.reference_pulse_times,
                       reference_pulse_times=recording.pulse_times)
-    with pytest.raises(RecordingError, match='the worse one'):
+    with pytest.raises(RecordingError, match='the reference keyphasor is worse'):
         observe(swapped, MODEL)
 
 
@@ -379,7 +379,7 @@ def test_command_writes_the_report(tmp_path, capsys):
     assert main(arguments) == 0
     printed = capsys.readouterr()
     assert 'missing effect: clock_skew' in printed.out
-    assert 'pinoin is no parameter' in printed.err
+    assert 'no such parameters: ' in printed.err
     content = json.loads((tmp_path / 'out' / 'report.json').read_text())
     assert content['verdict'] == 'traced'
     assert content['declared']['trigger_cycles'] == CYCLES

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
+from sa_jitter_ros.averaging.noise import attenuation
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 
@@ -97,15 +98,11 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         phase = 2.0 * np.pi * frequency * math.sqrt(np.mean(recovery.standard_errors**2))
         corrected = replace(corrected, amplitudes=np.where(
             phase <= _UNCERTAIN, corrected.amplitudes, np.nan))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        amplitude = np.abs(corrected.amplitudes)
-        attenuation = np.abs(raw.amplitudes) / amplitude
-        # The noise of the raw and of the corrected amplitude has the correlation `attenuation`.
-        error = corrected.noise / amplitude * np.sqrt(np.maximum(1.0 - attenuation**2, 0.0))
+    ratio, error = attenuation(raw.amplitudes, corrected.amplitudes, corrected.noise)
     return Correction(
         corrected.waveform, corrected.amplitudes, corrected.noise, recovery.errors,
-        recovery.standard_errors, recovery.accepted, recovery.reason, attenuation,
-        np.hypot(error, attenuation * phase**2 / 2.0), corrected.cycle_amplitudes)
+        recovery.standard_errors, recovery.accepted, recovery.reason, ratio,
+        np.hypot(error, ratio * phase**2 / 2.0), corrected.cycle_amplitudes)
 
 
 def _uncorrected(raw: Average, reason: str) -> Correction:

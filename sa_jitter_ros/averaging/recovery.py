@@ -31,8 +31,8 @@ _SAFE_TURNS, _MOST_TURNS = 0.5, 1.1
 _CERTAIN = 5.0
 # Prior of the last fit, in declared standard deviations: wide, for a negligible bias.
 _WEAK_PRIOR = 3.0
-# Largest standard error of an accepted recovery, in declared standard deviations.
-_WORTHWHILE = 0.7
+#: Largest standard error of an accepted recovery, in declared standard deviations.
+LARGEST_ERROR = 0.7
 # Amplitudes below this fraction of the RMS of a channel are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
@@ -143,10 +143,10 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
              declared: float, gain: float) -> str:
     """Return why the errors must not be used for a correction, '' if they can be used."""
     typical = float(np.sqrt(np.mean(standard_errors**2)))
-    if not typical < _WORTHWHILE * declared:
+    if not typical < LARGEST_ERROR * declared:
         return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
-                f'{_WORTHWHILE:g} of the declared jitter, {declared:.3g} s: the correction would '
-                'add more error than it removes; use stronger orders or a quieter channel')
+                f'{LARGEST_ERROR:g} of the declared jitter, {declared:.3g} s: the correction '
+                'would add more error than it removes; use stronger orders or a quieter channel')
     largest = float(np.max(np.abs(errors)))
     if len(periods) < _FEW_CYCLES and largest > _FAR * declared:
         return (f'a recovered error of {largest:.3g} s is more than {_FAR:g} times the declared '

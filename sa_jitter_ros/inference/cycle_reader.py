@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
-from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
+from sa_jitter_ros.averaging.recovery import (
+    LARGEST_ERROR, PulseErrorRecovery, recover_pulse_errors)
 from sa_jitter_ros.averaging.shaft import average_cycles
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
@@ -19,7 +20,6 @@ ComplexArray = NDArray[np.complex128]
 # Errors above this many declared standard deviations are recovered again with a wider prior, in
 # declared standard deviations: an effect may be larger than the declared jitter.
 _SUSPICIOUS, _WIDER = 1.3, 4.0
-_WORTHWHILE = 0.7  # as in the recovery, but relative to the recovered errors
 _LEAST = 1e-9
 _WHOLE = 1e-9
 _MARGIN = 40  # samples on either side of a cycle, for interpolation and corrected pulses
@@ -97,7 +97,7 @@ def recover(reader: CycleReader, pulses: FloatArray, model: DeclaredModel, rows:
 def _stands_out(recovery: PulseErrorRecovery) -> bool:
     """Whether the recovered errors, not only the expected ones, exceed their standard error."""
     power = float(np.mean(recovery.standard_errors**2))
-    return recovery.accepted and power < _WORTHWHILE**2 * (float(recovery.errors.var()) - power)
+    return recovery.accepted and power < LARGEST_ERROR**2 * (float(recovery.errors.var()) - power)
 
 
 def _strength(recovery: PulseErrorRecovery) -> float:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
-from sa_jitter_ros.averaging.noise import noise_floor, without_leakage
+from sa_jitter_ros.averaging.noise import attenuation, noise_floor, without_leakage
 from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
 from sa_jitter_ros.inference.cycle_reader import CycleReader, recover, ripple_error
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
@@ -93,15 +93,12 @@ class Acquisition:
     @property
     def attenuation(self) -> FloatArray:
         """Return raw over corrected amplitude (channel, order)."""
-        with np.errstate(divide='ignore', invalid='ignore'):
-            return np.asarray(np.abs(self.raw) / np.abs(self.corrected))
+        return attenuation(self.raw, self.corrected, self.noise)[0]
 
     @property
     def attenuation_standard_error(self) -> FloatArray:
-        """Return its standard error; the noise of both amplitudes has this correlation."""
-        with np.errstate(divide='ignore', invalid='ignore'):
-            share = np.sqrt(np.clip(1.0 - self.attenuation**2, 0.0, 1.0))
-            return np.asarray(self.noise / np.abs(self.corrected) * share)
+        """Return the standard error of the attenuation (channel, order)."""
+        return attenuation(self.raw, self.corrected, self.noise)[1]
 
 
 @dataclass(frozen=True)

@@ -18,20 +18,17 @@ from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
-    decode_pulse_array, decode_pulse_reference, SampleDecoder, TIME_TOLERANCE)
+    decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
+    TIME_REFERENCE, TIME_TOLERANCE)
 from sa_jitter_ros.recordings.recording import (
     FloatArray, MAX_PULSES, rechunk, Recording, recording_errors)
 from sa_jitter_ros.samples import SampleBlock
 
-FLOAT64 = 'std_msgs/msg/Float64MultiArray'
-FLOAT32 = 'std_msgs/msg/Float32MultiArray'
-IMU = 'sensor_msgs/msg/Imu'
-TIME_REFERENCE = 'sensor_msgs/msg/TimeReference'
-SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
-PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
+_SAMPLE_TYPES = (FLOAT64, FLOAT32, IMU)
+_PULSE_TYPES = (FLOAT64, TIME_REFERENCE)
 _MAX_GAP = 3600.0  # s
 _MAX_LOST = 1 << 29  # largest gap, in samples of all channels
-SAME_RATE = 1e-6  # relative
+_SAME_RATE = 1e-6  # relative
 _IMU_AXES = 'xyz'
 _FILL = 65_536
 
@@ -97,15 +94,16 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
                           '' if waveform else channel_map.tach)
     with recording_errors(path):
         with _reader(path) as reader:
-            vibration = _find_topic(reader, topics[0] if topics else '', 'vibration', SAMPLE_TYPES)
-            tach = _find_topic(reader, waveform, 'tach_waveform', SAMPLE_TYPES)
-            pulses = _find_topic(reader, '', 'tach_pulse', PULSE_TYPES)
+            vibration = _find_topic(
+                reader, topics[0] if topics else '', 'vibration', _SAMPLE_TYPES)
+            tach = _find_topic(reader, waveform, 'tach_waveform', _SAMPLE_TYPES)
+            pulses = _find_topic(reader, '', 'tach_pulse', _PULSE_TYPES)
             if not vibration:
                 raise RecordingError('no vibration topic among '
                                      f'{", ".join(sorted(reader.topics)) or "none"}')
             extent = _measure(reader, vibration, sample_rate)
             if sample_rate is not None and not math.isclose(extent.rate, sample_rate,
-                                                            rel_tol=SAME_RATE):
+                                                            rel_tol=_SAME_RATE):
                 raise RecordingError(f'sample_rate {sample_rate} Hz given, but the messages of '
                                      f'{vibration} say {extent.rate} Hz: leave it out')
             tach_extent = _measure(reader, tach, sample_rate) if tach else None
@@ -193,7 +191,7 @@ def _reader(path: Path) -> Iterator[Any]:
 
 def _find_topic(reader: Any, asked: str, role: str, types: tuple[str, ...]) -> str:
     """Return the topic of a role, '' if there is none."""
-    found = [name for name, info in reader.topics.items() if info.msgtype in types and (
+    found = [name for name in reader.topics if _type_of(reader, name) in types and (
         name == asked if asked else name.rsplit('/', 1)[-1] == role)]
     if asked and not found:
         raise RecordingError(f'no topic {asked} with a type of {", ".join(types)}: choose from '
@@ -204,6 +202,11 @@ def _find_topic(reader: Any, asked: str, role: str, types: tuple[str, ...]) -> s
     return found[0] if found else ''
 
 
+def _type_of(reader: Any, topic: str) -> str:
+    """Return the message type of a topic, as `std_msgs/Float64MultiArray`."""
+    return str(reader.topics[topic].msgtype).replace('/msg/', '/')
+
+
 def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
     """Read a topic once and return the extent of its samples."""
     run = _Run(topic)
@@ -211,7 +214,7 @@ def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
         pass
     if run.first is None:
         raise RecordingError(f'{topic} has no messages: record the topic')
-    imu = reader.topics[topic].msgtype == IMU
+    imu = _type_of(reader, topic) == IMU
     return _Extent(len(run.first.samples), run.received, run.first.sample_rate,
                    run.first.start_time, imu, run.remarks())
 
@@ -234,8 +237,8 @@ def _messages(reader: Any, topic: str) -> Iterator[Any]:
 
 def _blocks(reader: Any, topic: str, sample_rate: float | None) -> Iterator[SampleBlock]:
     """Iterate over the sample blocks of a topic, one per message."""
-    decoder = SampleDecoder(reader.topics[topic].msgtype.replace('/msg/', '/'),
-                            sample_rate=sample_rate or 0.0, imu_axis=_IMU_AXES)
+    decoder = SampleDecoder(_type_of(reader, topic), sample_rate=sample_rate or 0.0,
+                            imu_axis=_IMU_AXES)
     for message in _messages(reader, topic):
         with _message_errors(topic):
             block = decoder.decode(message)
