@@ -2,6 +2,7 @@
 
 import os
 import re
+import signal
 import subprocess
 import sys
 
@@ -172,6 +173,17 @@ def test_measured_recordings_give_averages_whose_loss_is_known(
     attenuation = np.array([float(row[-5]) for row in rows])
     assert len(rows) >= 5
     np.testing.assert_allclose(attenuation, 1.0, atol=0.01)
+
+
+def test_node_that_does_not_end_is_killed(monkeypatch):
+    deaf = subprocess.Popen([sys.executable, '-c', (
+        'import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); '
+        'print(flush=True); time.sleep(600)')], stdout=subprocess.PIPE)
+    assert deaf.stdout.readline() == b'\n'
+    monkeypatch.setattr(demo, 'STOP_TIMEOUT', 0.1)
+    demo.stop([deaf])
+    assert deaf.returncode == -signal.SIGKILL
+    deaf.stdout.close()
 
 
 @pytest.mark.parametrize('chosen', [None, 'OFF'])

@@ -34,6 +34,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 # The timeouts end a demo that hangs; a busy computer needs tens of seconds to start the nodes.
 START_TIMEOUT = 120.0  # s until the nodes have found each other
 SILENCE_TIMEOUT = 60.0  # s without a status of the node that plays the signals
+STOP_TIMEOUT = 20.0  # s until a node has ended
 LAST_AVERAGE = 3.0  # s without a new average after the end of the signals
 PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may contain thousands of pulses a second
 LIVE_ACQUISITIONS = 4  # averages in a residual
@@ -178,6 +179,22 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
             break
 
 
+def stop(children: Sequence[subprocess.Popen[bytes]]) -> None:
+    """
+    Stop the nodes, one after the other.
+
+    Fast DDS 2.14 may hang in the destruction of a participant while others disappear: a node that
+    does not end is killed.
+    """
+    for child in children:
+        child.terminate()
+        try:
+            child.wait(STOP_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+
+
 def report(plan: Plan, watcher: Watcher, output: Path) -> None:
     """Print the table and draw the figures."""
     amplitudes = watcher.amplitudes()
@@ -257,9 +274,6 @@ def main(args: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         return 130
     finally:
-        for child in children:
-            child.terminate()
-        for child in children:
-            child.wait()
+        stop(children)
         context.try_shutdown()
     return 0
