@@ -214,6 +214,15 @@ class RunningIndicators:
     Condition indicators of one average after another, with the history that na4 needs.
 
     The result after each update equals that of `condition_indicators` for all averages so far.
+
+    >>> running = RunningIndicators(GearSettings(mesh_orders=[19]))
+    >>> noise = np.random.default_rng(1)
+    >>> for growth in (1.0, 1.0, 2.0):
+    ...     running.update(growth * noise.normal(0.0, 0.1, (1, 512)))
+    ...     print(running.get()['na4'].round(1))
+    [3.2]
+    [3.9]
+    [12.7]
     """
 
     def __init__(self, settings: GearSettings | None = None) -> None:

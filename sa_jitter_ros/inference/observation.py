@@ -285,45 +285,47 @@ def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: Declared
 
 def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, first: int,
              sources: FloatArray, rows: tuple[int, ...]) -> Acquisition:
+    """Return the acquisition that begins at trigger pulse `first`."""
     count = model.trigger_cycles
     times = pulses.times[first:first + count + 1]
     missing = pulses.missing[first:first + count]
-    here = slice(pulses.number[first], pulses.number[first + count] + 1)
-    fixed, keep = pulses.bridged[here], numbered(missing)
-    recovery = recover(reader, fixed, model, rows, with_ripple=True, additional_orders=sources)
+    span = slice(pulses.number[first], pulses.number[first + count] + 1)
+    bridged, measured = pulses.bridged[span], numbered(missing)
+    recovery = recover(reader, bridged, model, rows, with_ripple=True, additional_orders=sources)
     with_ripple = recovery.accepted and not missing.any()
     if not recovery.accepted:
-        recovery = recover(reader, fixed, model, rows, with_ripple=False,
+        recovery = recover(reader, bridged, model, rows, with_ripple=False,
                            additional_orders=sources)
     errors = np.full(times.size, np.nan)
     standard_errors, ripple = errors.copy(), np.full(count, np.nan)
     ripple_uncertainty = float('nan')
-    better: FloatArray = fixed
+    corrected_pulses: FloatArray = bridged
     if recovery.accepted:
-        errors, standard_errors = recovery.errors[keep], recovery.standard_errors[keep]
+        errors, standard_errors = recovery.errors[measured], recovery.standard_errors[measured]
         if with_ripple:
             ripple, ripple_uncertainty = recovery.ripple, ripple_error(recovery, model)
-        better = fixed - recovery.errors
+        corrected_pulses = bridged - recovery.errors
     law = angle_law(model.angle_law)
-    near = slice(first - law.before, first + count + 1 + law.after)
-    clean_law = LINEAR_LAW  # the recovery is a model of the linear law
+    used = slice(first - law.before, first + count + 1 + law.after)
+    corrected_law = LINEAR_LAW  # the recovery is a model of the linear law
     if pulses.reference is not None:
-        clean_law = law
-        better = pulses.reference[here.start - law.before:here.stop + law.after]
-        errors = times - pulses.reference[here][keep]
+        corrected_law = law
+        corrected_pulses = pulses.reference[span.start - law.before:span.stop + law.after]
+        errors = times - pulses.reference[span][measured]
     errors = errors - errors.mean()
-    clear = with_ripple and np.mean(ripple**2) > _RIPPLE * ripple_uncertainty**2
-    corrected_ripple = ripple if pulses.reference is None and clear else None
-    raw = reader.average(reader.cycles(pulses.times[near], law=law), model, sources, law)
-    cycles = reader.cycles(better, law=clean_law, ripple=corrected_ripple)
-    corrected = reader.average(cycles, model, sources, clean_law)
-    clean = without_leakage(
+    ripple_is_clear = with_ripple and np.mean(ripple**2) > _RIPPLE * ripple_uncertainty**2
+    corrected_ripple = ripple if pulses.reference is None and ripple_is_clear else None
+    raw = reader.average(reader.cycles(pulses.times[used], law=law), model, sources, law)
+    cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
+    corrected = reader.average(cycles, model, sources, corrected_law)
+    clean_cycles = without_leakage(
         corrected.cycle_amplitudes, tuple(sources.tolist()), model.cycle_length,
         model.cycle_length * np.arange(len(cycles)))
-    floor = noise_floor(cycle_grid(cycles, method=reader.method, law=clean_law,
-                                   period=float(np.diff(fixed).max())),
+    floor = noise_floor(cycle_grid(cycles, method=reader.method, law=corrected_law,
+                                   period=float(np.diff(bridged).max())),
                         model.cycle_length, sources[:len(model.orders)],
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
-        first, times, missing, fixed, errors, standard_errors, raw.cycle_amplitudes, clean,
-        corrected.noise, floor, ripple, ripple_uncertainty, recovery.accepted, recovery.reason)
+        first, times, missing, bridged, errors, standard_errors, raw.cycle_amplitudes,
+        clean_cycles, corrected.noise, floor, ripple, ripple_uncertainty, recovery.accepted,
+        recovery.reason)

@@ -96,6 +96,13 @@ class ToothedWheel:
     The positions of the gaps are learnt from one revolution. With several gaps the index is unique
     if the widest gap, or the teeth in front of it, are unique. Otherwise the index may be another
     one after every loss of the match.
+
+    A wheel 8-1, whose pulses come every second except for the missing one after the fifth:
+
+    >>> wheel = ToothedWheel(teeth=8, missing=1, tolerance=0.25)
+    >>> lock = wheel.lock([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0])
+    >>> lock.slot, lock.steps.tolist(), lock.teeth.tolist()
+    (2, [1, 1, 1, 1, 1, 1, 2], [0, 1, 2, 3, 4, 5, 6])
     """
 
     def __init__(self, *, teeth: int, missing: int, tolerance: float) -> None:

@@ -32,7 +32,19 @@ class Setting:
 
 
 class Effect:
-    """Base class of the effects: it changes nothing, subclasses override what they change."""
+    """
+    Base class of the effects: it changes nothing, subclasses override what they change.
+
+    A keyphasor that is late by a constant time:
+
+    >>> from sa_jitter_ros.simulation import Gearbox, mesh
+    >>> class Late(Effect):
+    ...     def pulse_delay(self, setting, index, times):
+    ...         return np.full(times.shape, 1e-3)
+    >>> gearbox = Gearbox(mesh('shaft', 19), 20e3, effects=[Late()])
+    >>> float(gearbox.pulses(0.0, 1.0).errors.mean().round(6))
+    0.001
+    """
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation of the speed."""

@@ -54,6 +54,12 @@ class Keyphasor:
     noise_std
         White noise on the waveform, in units of the levels.
 
+    Examples
+    --------
+    >>> keyphasor = Keyphasor(low=0.0, high=5.0, duty=0.2)
+    >>> keyphasor.shape(np.array([0.0, 0.1, 0.3, 0.9]), 0.0)
+    array([5., 5., 0., 0.])
+
     """
 
     pulses_per_revolution: int = 1
