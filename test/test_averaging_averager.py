@@ -75,7 +75,7 @@ def test_without_trigger_cycles_all_make_one_average():
     assert np.abs(result.waveform[0] - truth).max() < 6.0 * result.standard_error.max()
 
 
-def test_every_unbroken_run_is_an_average_of_its_own():
+def test_every_unbroken_run_makes_an_average():
     with pytest.warns(sa.DataWarning, match='1 missing pulses'):
         found = sa.average(VIBRATION, RATE, np.delete(PULSES, 20), orders=[5])
     assert [item.trigger_cycles for item in found] == [19, 27]

@@ -118,7 +118,7 @@ class TestValues:
         assert wider['sideband_ratio'][0] == pytest.approx(0.6 / 3.0, rel=1e-9)
         assert wider['sideband_level_factor'][0] == pytest.approx(0.5 / deviation, rel=1e-9)
 
-    def test_one_line_left_has_the_moments_of_a_cosine(self):
+    def test_a_single_remaining_line_has_the_moments_of_a_cosine(self):
         """m4, m6, m8 of a cosine are 3/8, 5/16, 35/128; over powers of 1/2: 1.5, 2.5, 4.375."""
         average = cosines(512, {20: 1.0, 33: 1e-3})[None]
         found = condition_indicators(average, GearSettings([20]))
@@ -175,7 +175,7 @@ class TestValues:
 
 class TestUndefined:
 
-    def test_constants_and_pure_mesh_give_nan_where_nothing_is_left(self):
+    def test_constants_and_pure_mesh_give_nan_where_nothing_remains(self):
         flat = condition_indicators(np.full((1, 64), 0.1), GearSettings([19]))
         assert np.isnan(flat.values[0, 3:]).all()
         assert flat.values[0, :3] == pytest.approx([0.1, 0.1, 1.0])

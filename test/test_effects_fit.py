@@ -165,7 +165,7 @@ def test_wander_is_fitted_within_its_error(rng, bandwidth):
 
 @pytest.mark.parametrize(('top', 'memory'), [
     (0.15, 0.0), (SLOW_BAND[1], 0.0), (0.0, 0.0), (0.0, 0.8)])
-def test_whose_error_it_is_is_told_by_its_standard_error(rng, top, memory):
+def test_tach_or_source_is_decided_by_the_standard_error(rng, top, memory):
     """Motions of the source up to `top`, or pulse errors of a memory: shares of 1 and 0."""
     off = []
     for _ in range(40):
@@ -176,24 +176,24 @@ def test_whose_error_it_is_is_told_by_its_standard_error(rng, top, memory):
         assert test.decided
         assert test.tach_side == (top == 0.0)
         off.append((test.share - (top > 0.0)) / test.standard_error)
-    # What is declared is told from what is not by the spectrum of a few acquisitions, which
+    # What is declared is separated from the rest by the spectrum of a few acquisitions, which
     # errs by some standard errors on the side of the tach.
     assert abs(np.mean(off)) < 1.5
     assert np.std(off) < 1.5
 
 
 def test_all_acquisitions_tell_the_effect_and_half_of_them_its_size(rng):
-    """A memory is told by all acquisitions; what is fitted is that of the first."""
-    told = []
+    """All acquisitions decide whether there is a memory; it is fitted to the first."""
+    hits = []
     for _ in range(15):
         errors = declared(rng) + stationary(rng, 1e-8 * 0.5**LAGS)
         few = evidence_of(rng, errors[:4])
         found = EFFECTS['correlated_jitter'].fit(replace(few, whole=evidence_of(rng, errors)))
-        told.append(found.effect is not None)
+        hits.append(found.effect is not None)
         if found.effect is not None:
-            own = EFFECTS['correlated_jitter'].fit(replace(few, errors=few.errors))
-            assert own.effect is None or own.effect == found.effect
-    assert sum(told) >= 13
+            few_only = EFFECTS['correlated_jitter'].fit(replace(few, errors=few.errors))
+            assert few_only.effect is None or few_only.effect == found.effect
+    assert sum(hits) >= 13
 
 
 def test_acceleration_is_fitted_within_its_error(rng):
@@ -347,14 +347,14 @@ def test_independent_errors_beside_a_wander_do_not_swell_it(rng):
 
 def test_few_pulses_find_a_memory_or_leave_it_open(rng):
     """A memory that three acquisitions do not prove is named beside independent errors."""
-    told = []
+    hits = []
     for _ in range(15):
         evidence = evidence_of(rng, declared(rng)[:3] + stationary(rng, 1e-8 * 0.7**LAGS, 3))
         independent = EFFECTS['excess_jitter'].fit(evidence)
         assert bool(independent.rivals) == bool(independent.decider)
-        told.append(EFFECTS['correlated_jitter'].fit(evidence).effect is not None
+        hits.append(EFFECTS['correlated_jitter'].fit(evidence).effect is not None
                     or 'correlated_jitter' in independent.rivals)
-    assert sum(told) >= 13
+    assert sum(hits) >= 13
     independent = [EFFECTS['excess_jitter'].fit(evidence_of(
         rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))) for _ in range(15)]
     assert sum(bool(item.rivals) for item in independent) <= 4  # 5 % of them by chance
@@ -379,7 +379,7 @@ def test_rare_shocks_that_fade_are_no_correlated_jitter(rng):
     assert sum('distribution' in text for text in normal) <= 1
 
 
-def test_modulation_is_told_by_few_acquisitions(rng):
+def test_modulation_is_found_in_few_acquisitions(rng):
     """Without one, lines do not move together: false alarms are as rare as the p value says."""
     def fit(std):
         gain = std * stationary(rng, flat_band_correlation(LAGS, SLOW_BAND), 3)[:, :-1, None]

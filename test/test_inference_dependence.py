@@ -127,7 +127,7 @@ def test_missing_jitter_grows_with_order_and_the_effect_ends_that():
     assert after.p_value > 1e-3
 
 
-def test_dependence_judges_normal_errors_by_their_own_scatter(rng):
+def test_dependence_judges_normal_errors_by_their_scatter(rng):
     """A residual of nothing but chance changes certainly in one of a thousand at most."""
     bench = bench_of(recorded(seed=2, acquisitions=12), declared())
     runs, p_values = 60, []
@@ -159,9 +159,9 @@ def test_candidate_that_leaves_the_dependence_says_so(pickup):
 def test_still_moving_is_what_an_effect_leaves_nearly_all_of(pickup):
     before = [replace(item, change=0.05, p_value=1e-5) for item in pickup.dependences_before]
     assert still_moving(before, [replace(item, change=0.03) for item in before]) is None
-    left = still_moving(before, [replace(item, change=-0.045) for item in before])
-    assert left is not None
-    assert left.change == -0.045
+    remaining = still_moving(before, [replace(item, change=-0.045) for item in before])
+    assert remaining is not None
+    assert remaining.change == -0.045
     assert still_moving(before, [replace(item, p_value=0.01) for item in before]) is None
 
 

@@ -64,7 +64,7 @@ def beats(frequency, place):
 FREQUENCY = np.array([0.08, 0.16, 0.24, 0.32])
 
 
-def test_beat_is_found_among_what_else_moves_the_lines(rng):
+def test_beat_is_found_among_other_changes_of_the_lines(rng):
     cycle = np.arange(600)[:, None]
     beat = beats(FREQUENCY, (0.0873 * cycle) % 1.0)
     # Another shaft's orders: every line beats for itself, and far more than by interpolation.

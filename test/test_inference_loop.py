@@ -87,7 +87,7 @@ def test_observation_finds_the_true_errors_and_attenuation():
     assert np.all(np.diff(mean, axis=1) < 0.0)
 
 
-def test_reference_serves_unless_the_vibration_moves_against_it():
+def test_reference_keyphasor_is_used_unless_the_source_moves_relative_to_it():
     wander = make_effects({'phase_wander': {'std': 0.02}})
     moved = simulated(*wander, acquisitions=4, reference=True)
     assert not observe(moved, MODEL).against_reference

@@ -112,7 +112,7 @@ def lines_of(observation):
     return lines, level, np.zeros(2, int)
 
 
-def test_each_acquisition_is_predicted_at_its_own_speed(observation):
+def test_each_acquisition_is_predicted_at_its_speed(observation):
     slow = tuple(replace(item, times=1.25 * item.times) for item in observation.acquisitions)
     pulses = [[Pulses(item.times, item.first)] for item in slow]
     lines, level, group = lines_of(observation)

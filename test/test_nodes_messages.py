@@ -101,7 +101,7 @@ def test_a_message_without_dimensions_is_one_channel():
     assert (block.start_time, block.sample_rate, block.index) == (2.0, 100.0, 30)
 
 
-def test_labels_may_be_left_empty_and_name_their_fields():
+def test_labels_may_be_empty_and_name_their_fields():
     message = messages.encode_samples(SampleBlock(np.ones((1, 2)), 0.0, 1.0, 0))
     message.layout.dim[0].label = ''
     message.layout.dim[1].label = 'sample:first,second'

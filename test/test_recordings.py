@@ -655,7 +655,7 @@ def float64_block(index, *, time=None, rate=RATE, shape=(2, 100), sizes=None, of
     return make
 
 
-def test_repeats_in_a_bag_are_left_out(tmp_path):
+def test_repeats_in_a_bag_are_dropped(tmp_path):
     path = write_messages(tmp_path / 'bag', 'std_msgs/msg/Float64MultiArray',
                           [float64_block(index) for index in (500, 600, 600, 550, 650, 800)])
     opened = read(path)
@@ -795,7 +795,7 @@ def test_imu_bag_whose_stamps_jump_back_is_refused(tmp_path):
         read(bag, sample_rate=1000.0)
 
 
-def test_repeats_in_an_imu_bag_are_left_out(tmp_path):
+def test_repeats_in_an_imu_bag_are_dropped(tmp_path):
     messages = [imu(0.01 * k, 0.0, 0.0, k) for k in (0, 1, 1, 2, 3)]
     bag = write_messages(tmp_path / 'bag', 'sensor_msgs/msg/Imu', messages)
     opened = read(bag, sample_rate=100.0)

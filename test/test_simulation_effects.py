@@ -148,7 +148,7 @@ def test_phase_wander_attenuates_all_orders_of_a_shaft_alike():
     assert locked.real > 0.99
 
 
-def test_phase_wander_is_each_shafts_own():
+def test_phase_wander_differs_between_shafts():
     gearbox = Gearbox(tuple(Component(name, 4.0, (1.0,), (0.0,)) for name in 'ab'), 5000.0,
                       shafts={'a': 1.0, 'b': 2.0}, effects=(one('phase_wander', std=0.1),))
     first, second = np.angle(cycle_amplitudes(gearbox, (4.0, 8.0), 4000))

@@ -120,7 +120,7 @@ def _findings(numbers: dict[str, Any]) -> tuple[Finding, ...]:
     def ratios(name: str) -> tuple[float, float]:
         return numbers[name]['mean_ratio'], numbers[name]['variance_ratio']
 
-    def told(name: str) -> str:
+    def text(name: str) -> str:
         mean, variance = ratios(name)
         return f'mean x {mean:.4f}, variance x {variance:.3g}'
 
@@ -151,15 +151,15 @@ def _findings(numbers: dict[str, Any]) -> tuple[Finding, ...]:
                 'noise), and the trace is squared where the trace of the square belongs.'),
         Finding('Fig. 9', 'N_t hardly changes the expected value but much reduces the variance, '
                 'still steeply from 20 to 200',
-                f'D = 0.2, N_t 20 to 200: {told("N_t 20 to 200")}',
+                f'D = 0.2, N_t 20 to 200: {text("N_t 20 to 200")}',
                 agreement(abs(ratios('N_t 20 to 200')[0] - 1.0) < 0.01,
                           ratios('N_t 20 to 200')[1] < 0.2)),
         Finding('Fig. 9', 'D attenuates the expected value and raises the variance',
-                f'N_t = 100, D 0.1 to 0.4: {told("D 0.1 to 0.4")}',
+                f'N_t = 100, D 0.1 to 0.4: {text("D 0.1 to 0.4")}',
                 agreement(ratios('D 0.1 to 0.4')[0] < 0.8, ratios('D 0.1 to 0.4')[1] > 2.0)),
         Finding('Fig. 10', 'noise changes the variance more than the expected value, and more '
                 'averages reduce its impact',
-                f'D = 0.2, noise variance 0 to 0.5: {told(few)} at N_t = 20; {told(many)} at '
+                f'D = 0.2, noise variance 0 to 0.5: {text(few)} at N_t = 20; {text(many)} at '
                 f'N_t = 100; variance added {_added(numbers, FEW):.2e} and '
                 f'{_added(numbers, MANY):.2e}',
                 agreement(ratios(few)[1] > ratios(few)[0], ratios(many)[1] > ratios(many)[0],

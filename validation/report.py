@@ -41,7 +41,7 @@ def write(results: Sequence[Results], effort: Effort, command: str, folder: Path
                 'groups': {group.title: group.numbers for group in results},
                 'findings': [asdict(finding) for group in results for finding in group.findings]}
     (folder / 'validation.json').write_text(
-        json.dumps(_plain(document), indent=1, allow_nan=False) + '\n', encoding='utf-8')
+        json.dumps(_as_json(document), indent=1, allow_nan=False) + '\n', encoding='utf-8')
     (folder / 'validation.md').write_text(page(results, command), encoding='utf-8')
 
 
@@ -74,12 +74,12 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return '\n'.join('| ' + ' | '.join(row) + ' |' for row in body) + '\n'
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
     """Return a value with five significant digits and null for what is no number."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _as_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_as_json(item) for item in value]
     if isinstance(value, float):
         return float(f'{value:.5g}') if math.isfinite(value) else None
     return value

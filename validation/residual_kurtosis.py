@@ -92,9 +92,9 @@ def separation_factor(before: Sequence[Array], after: Sequence[Array]) -> Factor
     variance = 0.0
     for state in range(len(STATES)):
         count = len(after[state])
-        logs = [log_factor([[np.delete(part, left_out, axis=0) if k == state else part
+        logs = [log_factor([[np.delete(part, removed, axis=0) if k == state else part
                              for k, part in enumerate(pair)] for pair in (before, after)])
-                for left_out in range(count)]
+                for removed in range(count)]
         variance += (count - 1.0) * float(np.var(logs))
     centre, reach = log_factor([list(before), list(after)]), 1.96 * variance**0.5
     return Factor(float(np.exp(centre)), float(np.exp(centre - reach)),
@@ -102,7 +102,7 @@ def separation_factor(before: Sequence[Array], after: Sequence[Array]) -> Factor
 
 
 def detection(healthy: Array, faulty: Array) -> Detection:
-    """Return how well samples of both states can be told apart, of any shape."""
+    """Return how well samples of both states can be separated, of any shape."""
     healthy, faulty = healthy.ravel(), faulty.ravel()
     ordered = np.sort(healthy)
     below = np.searchsorted(ordered, faulty, 'left') + np.searchsorted(ordered, faulty, 'right')
