@@ -1,9 +1,8 @@
 """
-What an effect is: parameters with ranges, what it does to an average, and how it is fitted.
+What an effect is: an influence on the average that has parameters and can be fitted to evidence.
 
-An effect is one frozen dataclass whose fields are its parameters. It overrides the hooks it needs;
-what it leaves alone has no influence. Any number of effects combine, because each only names its
-independent contribution to the one angle error (THEORY, section 1).
+An effect is one frozen dataclass whose fields are its parameters. It overrides the hooks of
+`Influence` that it needs; what it leaves alone has no influence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -76,7 +75,7 @@ class Effect(Influence):
     """
     An effect that does nothing: the base of all.
 
-    Pulse errors are in s, measured minus true time; `name` is the one of the contract.
+    `name` is that of the parameters, `summary` says in a few words what the effect is.
     """
 
     name: ClassVar[str]

@@ -39,9 +39,9 @@ _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
 _FEW_CYCLES_OF_SCENARIOS = 20
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
-_SCENARIOS, _SEED = 256, 11
-_DRAWS, _FEWEST = 8192, 64  # values in all scenarios, in one
-_SCENARIO_NODES = 32
+_SCENARIOS, _SEED = 256, 11  # scenarios of several influences together; of which combinations
+_DRAWS, _FEWEST = 8192, 64  # evenly spread values in all scenarios, in one
+_SCENARIO_NODES = 32  # as `scenario_moments` takes at most
 _WORK = 20_000_000_000  # multiplications of phasors, about a second
 
 
