@@ -20,8 +20,8 @@ ComplexArray = NDArray[np.complex128]
 # Errors above this many declared standard deviations are recovered again with a wider prior, in
 # declared standard deviations: an effect may be larger than the declared jitter.
 _SUSPICIOUS, _WIDER = 1.3, 4.0
-_LEAST = 1e-9
-_WHOLE = 1e-9
+_LEAST = 1e-9  # s; smallest declared standard deviation for the recovery
+_WHOLE = 1e-9  # deviation from a whole number of cycles that is rounding
 _MARGIN = 40  # samples on either side of a cycle, for interpolation and corrected pulses
 _COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
 #: Variance of a fitted ripple, for noise of unit power over a cycle.

@@ -34,7 +34,7 @@ ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 
 _MOST_SAMPLES = 200_000_000
-#: A line is above the noise if its coherence from cycle to cycle exceeds that of noise so often.
+#: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
 CHANCE = 4
 _OTHER_MACHINE = 5.0
 # Acquisitions that test a reference keyphasor, largest noise over amplitude of the lines for it,

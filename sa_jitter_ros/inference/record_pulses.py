@@ -14,13 +14,13 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_SPEED_TOLERANCE = 0.1
-_MOST_SPURIOUS = 0.05
+_SPEED_TOLERANCE = 0.1  # of the declared speed, relative
+_MOST_SPURIOUS = 0.05  # fraction of the pulses
 # Marks of an undeclared target may deviate from even spacing by an eighth of an interval.
 _TOLERANCE = 0.3
-_FEWEST = 3
+_FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
-_SAME_RATE = 0.01
+_SAME_RATE = 0.01  # relative difference of a declared rate
 # Pulses used to align two keyphasors, and the fraction of the pulses that the reference must have.
 _ALIGNED, _COVERED = 15, 0.5
 _AS_MANY = 0.6  # fraction of the pulses: a reference with fewer has one pulse per trigger cycle

@@ -97,7 +97,7 @@ class ToothedWheel:
     if the widest gap, or the teeth in front of it, are unique. Otherwise the index may be another
     one after every loss of the match.
 
-    A wheel 8-1, whose pulses come every second except for the missing one after the fifth:
+    The pulses of a wheel 8-1 at one tooth per second; the one after the fifth pulse is missing:
 
     >>> wheel = ToothedWheel(teeth=8, missing=1, tolerance=0.25)
     >>> lock = wheel.lock([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0])
@@ -109,8 +109,8 @@ class ToothedWheel:
         self._teeth, self._present = teeth, teeth - missing
         if self._present < 2:
             raise ParameterError(
-                f'missing_teeth {missing} of {teeth} leave {self._present}: a wheel needs 2 or '
-                'more; a single tooth is pulses_per_revolution 1')
+                f'missing_teeth {missing} of {teeth} leaves {self._present} teeth: a wheel needs '
+                '2 or more; for a single tooth set pulses_per_revolution to 1')
         self._tolerance = tolerance
         self.memory = 2 * (self._present + 1)
 
