@@ -430,7 +430,7 @@ def test_diagnostics_contain_the_address_and_the_number_of_averages(bench, monke
     b = bench()
     level, text, values = b.diagnostics()
     assert level == DiagnosticStatus.OK
-    assert text == f'no data received yet on http://127.0.0.1:{b.port}/'
+    assert text == f'no data received yet; page at http://127.0.0.1:{b.port}/'
     assert set(DIAGNOSTIC_KEYS) <= values.keys()
     publish_all(b)
     assert b.diagnostics()[1].startswith('1 averages shown')

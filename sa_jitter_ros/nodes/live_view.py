@@ -160,7 +160,7 @@ class LiveView(MonitoringNode):
         state = 'no data received yet' if silence is None else (
             f'{self._averages} averages shown' if silence < 3.0 else
             f'no data for {silence:.0f} s')
-        return f'{state} on {self._server.address}', {
+        return f'{state}; page at {self._server.address}', {
             'address': self._server.address, 'averages': str(self._averages),
             'requests': str(self._server.requests),
             'requests_refused': str(self._server.refused)}

@@ -277,7 +277,8 @@ class ResidualAnalyser(MonitoringNode):
             topic = self.resolve_topic_name(f"{self._values['shaft']}/order_amplitude")
             return (f'nothing received on {topic} yet: is the parameter shaft one of the '
                     'averager?', values)
-        activity = self._activity or self._verdict or 'nothing compared yet'
+        verdict = f'last verdict: {self._verdict}' if self._verdict else 'nothing compared yet'
+        activity = self._activity or verdict
         return f'{count} of {size} averages; {activity}', values
 
 
