@@ -116,10 +116,11 @@ def test_declared_model_suffices():
 
 @pytest.mark.parametrize(('name', 'values', 'parameter'), [
     ('excess_jitter', {'std': 80e-6}, 'std'),
-    ('clock_skew', {'skew': 4e-4}, 'skew'),
+    pytest.param('clock_skew', {'skew': 4e-4}, 'skew', marks=pytest.mark.machines),
     pytest.param('speed_fluctuation', {'acceleration_std': 90.0}, 'acceleration_std',
                  marks=pytest.mark.machines),
-    ('missing_pulses', {'probability': 0.015}, 'probability'),
+    pytest.param('missing_pulses', {'probability': 0.015}, 'probability',
+                 marks=pytest.mark.machines),
 ])
 def test_effect_on_the_mean_is_traced(name, values, parameter):
     found = traced(*make_effects({name: values}))
@@ -133,6 +134,7 @@ def test_effect_on_the_mean_is_traced(name, values, parameter):
     assert after < max(before / 5.0, 2.5 * chance)  # few acquisitions
 
 
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'values', 'parameter', 'tolerance'), [
     ('additive_noise', {'std': 1.0}, 'std', 0.1),
     ('amplitude_modulation', {'std': 0.3}, 'std', 0.08),
@@ -148,6 +150,7 @@ def test_effect_on_the_scatter_is_traced(name, values, parameter, tolerance):
     assert content['error_after']['chi2_per_dof'] < 2.5
 
 
+@pytest.mark.machines
 def test_clock_is_traced_pulse_by_pulse():
     model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 2000.0})
     quantised = make_effects({'keyphasor_quantisation': {'clock_rate': 2000.0,
@@ -160,6 +163,7 @@ def test_clock_is_traced_pulse_by_pulse():
     assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
 
 
+@pytest.mark.machines
 def test_interpolation_is_traced_by_its_beat():
     content = report(traced(*make_effects({'interpolation_loss': {'method': 'linear'}})))
     assert content['verdict'] == 'traced'
@@ -190,6 +194,7 @@ def test_modulation_of_all_lines_alike_is_no_beat(rng):
     assert find_beat(radial[:8], np.array([0.08, 0.16, 0.24, 0.32])).method == ''
 
 
+@pytest.mark.machines
 def test_effect_of_no_module_stays_unexplained():
     content = report(traced(Hum()))
     assert content['verdict'] == 'unexplained'
