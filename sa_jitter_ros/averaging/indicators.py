@@ -276,7 +276,7 @@ def condition_indicators(
     """
     samples = np.asarray(average, float)
     if samples.ndim not in (2, 3):
-        raise SignalError(f'average of shape {samples.shape}: expected channels x points, or '
+        raise SignalError(f'average of shape {samples.shape}: give channels x points, or '
                           'averages x channels x points')
     history = samples if samples.ndim == 3 else samples[None]
     values, _ = _indicators(history, settings or GearSettings(), 0, np.zeros(()))

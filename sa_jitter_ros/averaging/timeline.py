@@ -330,7 +330,7 @@ class VibrationTimeline:
         self._odd = layout
         raise SignalError(
             f'block of {layout[0]} channels at {layout[1]:g} Hz in a stream of {self.layout[0]} '
-            f'at {self.layout[1]:g} Hz: keep both, or restart the source')
+            f'at {self.layout[1]:g} Hz: send the same layout, or restart the source')
 
     def _follows(self, block: SampleBlock, following: SampleBlock) -> bool:
         expected = block.start_time + block.samples.shape[1] / block.sample_rate

@@ -181,7 +181,8 @@ class KeyphasorDetector:
             raise SignalError(f'sample rate {sample_rate} Hz differs from {self._rate} Hz before: '
                               'reset the detector to begin a new stream')
         if not np.isfinite(start_time):
-            raise SignalError(f'start time {start_time} s of a block is not finite')
+            raise SignalError(f'start time {start_time} s of a block is not finite: give a time '
+                              'in s')
         block = self._sign * given.astype(np.float64)
         if not np.all(np.isfinite(block)):
             bad = int(np.argmin(np.isfinite(block)))

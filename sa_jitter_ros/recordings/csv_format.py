@@ -53,7 +53,8 @@ class CsvSource:
             while start < self.samples:
                 block = _parse(islice(lines, samples_per_block), self.delimiter, wanted, start)
                 if not len(block):
-                    raise RecordingError(f'ends at row {start} of {self.samples}')
+                    raise RecordingError(f'ends at row {start} of {self.samples}: the file was '
+                                         'cut while it was read; open it again')
                 if self.times is not None:
                     self._check_times(block[:, -1], start)
                 yield block[:, :self.channels].T
@@ -143,7 +144,8 @@ def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
                           dtype=np.float64)
     except ValueError as error:
         reason = str(error).split(';')[0]
-        raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}') from error
+        raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}; give numbers '
+                             'only') from error
 
 
 def _extent(path: Path, delimiter: str, has_header: bool,

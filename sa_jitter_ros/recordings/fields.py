@@ -75,7 +75,7 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
         if len(tach) != len(vibration):
             raise RecordingError(
                 f'tach of {len(tach)} rows for {len(vibration)} rows of vibration: a recording '
-                'has one tach, or one for every row where each row is an acquisition')
+                'has one row of tach, or one for every row of vibration if each is an acquisition')
         acquisitions = len(tach)
     if not 0 <= acquisition < acquisitions:
         raise RecordingError(

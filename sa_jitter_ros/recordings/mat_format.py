@@ -142,13 +142,14 @@ class _Reader:
     def _array(self, data: _Buffer, matrix: _Matrix) -> RawArray:
         limit = size_limit(matrix.name)
         if not matrix.shape or min(matrix.shape) < 0 or 8 * prod(matrix.shape) > limit:
-            raise RecordingError(f'{matrix.name} of shape {matrix.shape}: exceeds its limit of '
-                                 f'{limit} bytes')
+            raise RecordingError(f'{matrix.name} of shape {matrix.shape} exceeds its limit of '
+                                 f'{limit} bytes: split the recording')
         if matrix.kind == _CELL:
             cells = list(self._cells(data, matrix))
             size = 4 * len(cells) * max(map(len, cells), default=0)
             if size > limit:
-                raise RecordingError(f'{matrix.name}: {size} bytes exceed its limit of {limit}')
+                raise RecordingError(f'{matrix.name}: {size} bytes exceed its limit of {limit}: '
+                                     'shorten it')
             return np.array(cells)
         if matrix.kind == _CHAR:
             return self._text(data, matrix)

@@ -97,7 +97,8 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
                 f'{name}: {shape} of {dtype} needs {size} bytes, the file has '
                 f'{info.file_size - start}: it is truncated or broken; copy it again')
         if size > size_limit(name):
-            raise RecordingError(f'{name}: {size} bytes exceed its limit of {size_limit(name)}')
+            raise RecordingError(f'{name}: {size} bytes exceed its limit of {size_limit(name)}: '
+                                 'split the recording')
         order: Any = 'F' if fortran else 'C'
         if size <= IN_MEMORY_BYTES:
             data = stream.read(size)

@@ -145,7 +145,7 @@ class Recording:
         channels = self.vibration.channels
         if not 1 <= channels <= _MAX_CHANNELS or self.vibration.samples < 1:
             raise RecordingError(
-                f'vibration of {channels} channels x {self.vibration.samples} samples: needs 1 '
+                f'vibration of {channels} channels x {self.vibration.samples} samples: give 1 '
                 f'to {_MAX_CHANNELS} channels and at least one sample')
         check_rate('sample_rate', self.sample_rate, RecordingError)
         _check_positive('ratio', self.ratio)
@@ -315,7 +315,7 @@ def _check_pulse_times(name: str, times: FloatArray | None) -> None:
         return
     if times.ndim != 1 or times.size > MAX_PULSES:
         raise RecordingError(
-            f'{name} of shape {times.shape}: needs one row of at most {MAX_PULSES} times')
+            f'{name} of shape {times.shape}: give one row of at most {MAX_PULSES} times')
     if not np.isfinite(times).all():
         raise RecordingError(f'{name}: contains NaN or infinity; remove those pulses')
     check_times(name, times, RecordingError)

@@ -39,7 +39,8 @@ class WavSource:
                 count = min(samples_per_block, self.samples - start)
                 data = file.read(count * frame)
                 if len(data) != count * frame:
-                    raise RecordingError(f'ends inside sample {start + len(data) // frame}')
+                    raise RecordingError(f'ends inside sample {start + len(data) // frame}: it '
+                                         'was cut while it was read; open it again')
                 yield self._decode(data).reshape(count, self.channels).T
 
     def _decode(self, data: bytes) -> FloatArray:
