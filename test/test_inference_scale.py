@@ -190,6 +190,6 @@ def test_slow_errors_turn_averages_and_do_not_scatter_their_amplitude(observatio
                                * np.sinc(np.diff(turns)), axis=2))
     mean, std = amplitude.mean(axis=1), amplitude.std(axis=1)
     order = np.searchsorted(MODEL.orders, observation.orders[lines.order])
-    # The normal distribution leaves out the skewness of an average of 20 cycles.
-    assert found.attenuation[0] == pytest.approx(mean[order], abs=3e-3)
-    assert np.sqrt(found.attenuation_variance[0]) == pytest.approx(std[order], rel=0.25, abs=1e-3)
+    # Where cycles remember each other, averages are drawn, some thousand of them.
+    assert found.attenuation[0] == pytest.approx(mean[order], abs=1e-3)
+    assert np.sqrt(found.attenuation_variance[0]) == pytest.approx(std[order], rel=0.05, abs=1e-3)
