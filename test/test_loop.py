@@ -74,6 +74,17 @@ def test_written_report_is_the_report(found, tmp_path):
         tmp_path / 'a' / 'b').iterdir()}
 
 
+@pytest.mark.parametrize('name', ['pulse_times', 'reference_pulse_times'])
+def test_pulses_without_any_jitter_have_a_report(name, tmp_path):
+    """Their errors are all 0, and their intervals equal to rounding."""
+    machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6)), RATE, speed=((0.0, SPEED),),
+                      effects=(AdditiveNoise(0.02),), seed=3)
+    recording = Recording(ArraySource(machine.vibration(0, 20_000)), RATE,
+                          **{name: np.cumsum(np.full(98, 1.0 / SPEED))})
+    close_loop(recording, {**KEYWORDS, 'trigger_cycles': 10}).write(tmp_path)
+    assert (tmp_path / 'pulse_errors.png').is_file()
+
+
 @pytest.mark.machines
 def test_every_shaft_has_its_report(recording, found, tmp_path):
     """The ratio of the recording is that of one of the shafts."""

@@ -153,6 +153,8 @@ def _folded(evidence: Evidence, period: int) -> _Fold | None:
     log_p_value = float(stats.f.logsf(ratio, period - 1, (count - 1) * (period - 1)))
     left = np.array(errors) - mean[np.array(phases)]
     left = left - left.mean(axis=1, keepdims=True)
-    criterion = left.size * math.log(float(np.mean(left**2))) + period * math.log(left.size)
+    # Where the pulses are those of the reference keyphasor, all errors are 0.
+    variance = max(float(np.mean(left**2)), 1e-300)
+    criterion = left.size * math.log(variance) + period * math.log(left.size)
     error = float(np.sqrt(between * (period - 1) / period / count))
     return _Fold(mean, error, log_p_value, criterion)

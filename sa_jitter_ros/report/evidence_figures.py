@@ -20,6 +20,7 @@ Array = NDArray[Any]
 _MICRO = 1e6
 _MOST_POINTS = 3000
 _STEPS = 16  # positions in a trigger cycle
+_FINEST = 1e-6  # half the range of a histogram of relative intervals that are all equal
 
 
 def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
@@ -112,12 +113,13 @@ def _autocorrelation(axes: Axes, evidence: Evidence, versions: Sequence[Version]
     lags = np.arange(lags_of(evidence))
     rows = np.array([[np.mean(row[:row.size - k] * row[k:]) for k in lags] for row in errors])
     scale = rows[:, 0].mean()
-    error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows)) / scale
     for item in versions:
         axes.plot(lags, item.autocovariance / item.autocovariance[0], color=item.colour,
                   marker='_', label=item.label)
-    axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o', markersize=3,
-                  capsize=2, color=MEASURED, label='recovered')
+    if scale > 0.0:  # all errors are 0 where the pulses are those of the reference keyphasor
+        error = rows.std(axis=0, ddof=1) / np.sqrt(len(rows)) / scale
+        axes.errorbar(lags[1:], rows.mean(axis=0)[1:] / scale, yerr=error[1:], fmt='o',
+                      markersize=3, capsize=2, color=MEASURED, label='recovered')
     axes.set(title='autocorrelation', xlabel='lag [trigger pulses]', ylabel='correlation')
     legend_below(axes)
 
@@ -181,7 +183,10 @@ def _steadiness(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> 
 def _intervals(axes: Axes, evidence: Evidence) -> None:
     """Draw the histogram of the pulse intervals."""
     intervals = np.diff(evidence.record_times)
-    axes.hist(intervals / np.median(intervals), 60, color='0.6')
+    relative = intervals / np.median(intervals)
+    # Very steady intervals differ by rounding only: too little to be divided into bins.
+    ends = min(relative.min(), 1.0 - _FINEST), max(relative.max(), 1.0 + _FINEST)
+    axes.hist(relative, 60, range=ends, color='0.6')
     axes.set_yscale('log')
     axes.set_ylim(bottom=0.5)
     axes.set(title='pulse intervals', xlabel='interval / median interval', ylabel='number')
