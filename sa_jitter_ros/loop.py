@@ -6,7 +6,7 @@ that the declared model lacks if the residual is significant.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, MISSING, replace
 from functools import cached_property
 import math
 import os
@@ -16,7 +16,7 @@ from typing import Any
 import warnings
 
 from sa_jitter_ros.declaration import Declaration, read_declaration
-from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import Trace, trace
@@ -132,6 +132,10 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     show = progress or (lambda text: None)
     if isinstance(recordings, (str, os.PathLike, Recording)):
         recordings = [recordings]
+    if not isinstance(recordings, Sequence) or not all(
+            isinstance(item, (str, os.PathLike, Recording)) for item in recordings):
+        raise ModelError(f'recordings is {recordings!r}: give a path or a Recording, or a list '
+                         'of them')
     if not recordings:
         raise ModelError('no recording: give at least one')
     names = tuple(names) or tuple(_name(*item) for item in enumerate(recordings, 1))
@@ -184,6 +188,9 @@ def _declaration(declared: Declared, sample_rate: float) -> Declaration:
         return declared
     if isinstance(declared, DeclaredModel):
         return Declaration({_SHAFT: declared}, ())
+    if not isinstance(declared, (str, os.PathLike, Mapping)):
+        raise ModelError(f'declared is {declared!r}: give the path of a parameter file, a '
+                         'DeclaredModel or a mapping of the keywords of predict')
     if not isinstance(declared, Mapping):
         found = read_declaration(Path(declared), sample_rate=sample_rate)
         if found.unknown:
@@ -191,11 +198,15 @@ def _declaration(declared: Declared, sample_rate: float) -> Declaration:
                           f'parameters: {", ".join(found.unknown)}', stacklevel=3)
         return found
     known = {item.name for item in fields(DeclaredModel)}
+    needed = [item.name for item in fields(DeclaredModel) if item.default is MISSING]
     for name in declared.keys() - known - {'effects'}:
         raise ModelError(f'{name} is not a keyword of a declared model: give some of '
                          f'{", ".join(sorted(known))}, effects')
     values = {'sample_rate': sample_rate,
               **{name: value for name, value in declared.items() if value is not None}}
-    effects = values.pop('effects', {})
-    return Declaration({_SHAFT: DeclaredModel(**values)}, tuple(
-        make_effect(name, **parameters) for name, parameters in effects.items()))
+    effects = declared_effects(values.pop('effects', {}))
+    missing = [name for name in needed if name not in values]
+    if missing:
+        raise ModelError(f'the declared model has no {", ".join(missing)}: a model '
+                         f'needs at least {", ".join(needed)}')
+    return Declaration({_SHAFT: DeclaredModel(**values)}, effects)

@@ -1,10 +1,11 @@
 """
 Parameters: name, default, meaning, unit and range, the same for nodes, files and library.
 
-A `Parameter` converts and checks values; `nodes/parameters.py` declares it to ROS.
+A `Parameter` converts and checks values; `nodes/parameters.py` declares it to ROS. `number`,
+`whole_number` and `numbers` check the arguments of library functions.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 import math
 from numbers import Integral, Real
@@ -54,6 +55,7 @@ class Parameter:
 
     def convert(self, value: Any) -> Any:
         """Return the value as the type of this parameter; raises ParameterError."""
+        value = unwrapped(value)
         if self.is_list:
             if isinstance(value, (str, bytes)) or not hasattr(value, '__len__'):
                 raise ParameterError(f'{self.name} is {value!r}: give a list of '
@@ -62,6 +64,7 @@ class Parameter:
         return self._convert_one(value, self.name)
 
     def _convert_one(self, given: Any, name: str) -> Any:
+        given = unwrapped(given)
         kind, value = self.kind, given
         if kind is float and _is_a(Real, value):
             value = math.inf if abs(value) > _LARGEST else float(value)
@@ -96,6 +99,50 @@ class Parameter:
 def _is_a(kind: Any, value: Any) -> bool:
     """Return whether a value is a number of a kind; true and false are not."""
     return isinstance(value, kind) and not isinstance(value, bool)
+
+
+def unwrapped(value: Any) -> Any:
+    """
+    Return the Python value in a NumPy scalar or 0-d array; any other value as it is.
+
+    `numpy.load` returns each number of an `.npz` file as a 0-d array.
+    """
+    return value.item() if getattr(value, 'ndim', None) == 0 else value
+
+
+def number(name: str, value: Any) -> float:
+    """
+    Return the argument `name` of a function as a float; raises ParameterError.
+
+    >>> number('ratio', 2)
+    2.0
+    >>> number('ratio', '2')
+    Traceback (most recent call last):
+    ...
+    sa_jitter_ros.errors.ParameterError: ratio is '2': give a number
+    """
+    value = unwrapped(value)
+    if not _is_a(Real, value):
+        raise ParameterError(f'{name} is {value!r}: give a number')
+    return float(value)
+
+
+def whole_number(name: str, value: Any) -> int:
+    """Return the argument `name` of a function, 40 or 40.0, as an int; raises ParameterError."""
+    value = unwrapped(value)
+    if not (_is_a(Real, value) and math.isfinite(value) and value == int(value)):
+        raise ParameterError(f'{name} is {value!r}: give a whole number')
+    return int(value)
+
+
+def numbers(name: str, value: Any) -> tuple[float, ...]:
+    """Return the argument `name` of a function as a tuple of floats; raises ParameterError."""
+    value = unwrapped(value)
+    if _is_a(Real, value):
+        raise ParameterError(f'{name} is {value!r}: give a list of numbers, [{value!r}]')
+    if isinstance(value, (str, bytes)) or not isinstance(value, Iterable):
+        raise ParameterError(f'{name} is {value!r}: give a list of numbers')
+    return tuple(number(f'{name}[{i}]', item) for i, item in enumerate(value))
 
 
 #: Beyond this range one shaft hardly turns during an average of the other.

@@ -19,13 +19,13 @@ CORE = {
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
     'samples': {'numpy'},
-    'pulses': SCIENCE | {'errors', 'samples'},
+    'pulses': SCIENCE | {'errors', 'parameters', 'samples'},
     'averaging': SCIENCE | {'errors', 'parameters', 'pulses', 'samples'},
-    'prediction': SCIENCE | {'errors', 'pulses'},
+    'prediction': SCIENCE | {'errors', 'parameters', 'pulses'},
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {
         'effects', 'errors', 'parameter_file', 'parameters', 'prediction', 'pulses'},
-    'recordings': SCIENCE | {'errors', 'pulses', 'rosbags', 'samples'},
+    'recordings': SCIENCE | {'errors', 'parameters', 'pulses', 'rosbags', 'samples'},
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATE, SPEED = 2000.0, 25.0
 TIME = np.arange(4000) / RATE
@@ -156,6 +157,14 @@ def test_a_stream_may_end_without_an_average():
     ({'angle_law': 'cubic'}, "angle_law is 'cubic'"),
     ({'pulses_per_trigger': 2}, 'pulses_per_trigger is 2, more than the 1 '),
     ({'interval_tolerance': 0.7}, 'interval_tolerance 0.7'),
+    ({'orders': 12}, r'orders is 12: give a list of numbers, \[12\]'),
+    ({'orders': '12'}, "orders is '12': give a list of numbers"),
+    ({'orders': [1, 'b']}, r"orders\[1\] is 'b': give a number"),
+    ({'trigger_cycles': 9.5}, 'trigger_cycles is 9.5: give a whole number'),
+    ({'missing_teeth': 'two'}, "missing_teeth is 'two': give a whole number"),
+    ({'sample_rate': None}, 'sample_rate is None: give a number'),
+    ({'ratio': '2.5'}, "ratio is '2.5': give a number"),
+    ({'time_tolerance': []}, r'time_tolerance is \[\]: give a number'),
     ({'keyphasor_rate': -1.0}, 'keyphasor_rate is -1')])
 def test_parameters_that_cannot_be_used_are_refused(options, text):
     with pytest.raises(sa.ParameterError, match=text):
@@ -167,10 +176,52 @@ def test_parameters_that_cannot_be_used_are_refused(options, text):
     (VIBRATION[None], PULSES, 'shape'), (VIBRATION.astype(complex), PULSES, 'complex'),
     (['a', 'b'], PULSES, 'real numbers'), (VIBRATION, ['a'], 'real numbers'),
     (VIBRATION, PULSES[None], 'pulse times have'), (VIBRATION, [], 'make 0 whole'),
-    (VIBRATION[:, :0], PULSES, 'make 0 whole')])
+    (VIBRATION[:, :0], PULSES, 'make 0 whole'),
+    (VIBRATION, None, r'those of a recording are recording.keyphasor_pulses\(\)'),
+    (ArraySource(VIBRATION), PULSES, r'give all of them as an array, recording.read\(\)'),
+    (Recording(ArraySource(VIBRATION), RATE), PULSES, r'recording.read\(\)')])
 def test_arrays_that_cannot_be_used_are_refused(vibration, pulses, text):
     with pytest.raises(sa.SignalError, match=text):
         sa.average(vibration, RATE, pulses)
+
+
+@pytest.mark.parametrize(('pulses', 'text'), [
+    (1e3 * PULSES, 'span 1920 s, the vibration spans 2 s: the pulse times look like milliseconds; '
+     'divide them by 1000'),
+    (1e6 * PULSES, 'look like microseconds'),
+    (np.round(RATE * PULSES), 'look like sample indices; divide them by 2000'),
+    (60.0 * PULSES, 'span 115.2 s, the vibration spans 2 s: give pulse times in s'),
+    (1e-4 * PULSES, 'span 0.000192 s, the vibration spans 2 s: give pulse times in s'),
+    (1e9 + PULSES, 'set start_time to the time of the first sample on the clock of the pulses'),
+    (PULSES[::-1], '48 of 49 pulse times are earlier than the one before: give them in order')])
+def test_a_likely_mistake_is_named(pulses, text):
+    with pytest.raises(sa.SignalError, match=text):
+        sa.average(VIBRATION, RATE, pulses)
+
+
+def test_a_likely_mistake_is_named_beside_an_average():
+    with pytest.warns(sa.DataWarning, match='span 400 s, the vibration spans 2 s'):
+        sa.average(VIBRATION, RATE, np.arange(0.0, 400.5, 0.5))
+
+
+def test_orders_from_the_nyquist_frequency_on_are_named():
+    with pytest.warns(sa.DataWarning, match='no amplitude of orders 20, 30: the shaft turns at 50 '
+                      'Hz, and vibration sampled at 2000 Hz shows orders below 20 only'):
+        average, = sa.average(VIBRATION, RATE, PULSES, ratio=2.0, orders=[2, 20, 30])
+    assert np.array_equal(np.isnan(average.amplitudes[0]), [False, True, True])
+
+
+def test_whole_floats_numpy_scalars_and_0d_arrays_are_numbers():
+    numbers = {'ratio': 2.0, 'pulses_per_revolution': 1, 'pulses_per_trigger': 1,
+               'trigger_cycles': 10.0, 'keyphasor_rate': 1e3, 'samples_per_revolution': 64,
+               'missing_teeth': 0, 'maximum_missing': 3, 'interval_tolerance': 0.25,
+               'minimum_interval': 0.0, 'time_tolerance': 0.01, 'start_time': 0.0}
+    expected = sa.average(VIBRATION, RATE, PULSES, **numbers)
+    for kind in (np.array, np.float64):
+        same(expected, sa.average(VIBRATION, kind(RATE), PULSES,
+                                  **{name: kind(value) for name, value in numbers.items()}))
+    assert np.array_equal(sa.detect_pulses(WAVE, np.array(RATE), threshold=np.array(0.0)),
+                          sa.detect_pulses(WAVE, RATE, threshold=0.0))
 
 
 def test_a_block_of_other_channels_is_not_taken():

@@ -4,7 +4,10 @@ import json
 import subprocess
 import sys
 
+import numpy as np
+import pytest
 import sa_jitter_ros
+import sa_jitter_ros as sa
 
 SLOW = ('rclpy', 'matplotlib', 'scipy')
 
@@ -44,3 +47,35 @@ def test_all_errors_of_the_library_are_value_errors():
         if name.endswith('Error'):
             assert issubclass(getattr(sa_jitter_ros, name), sa_jitter_ros.SaJitterError)
     assert issubclass(sa_jitter_ros.SaJitterError, ValueError)
+
+
+MACHINE = {'keyphasor_rate': 10e3, 'trigger_speed': 25.0, 'trigger_cycles': 20, 'orders': [8.0]}
+
+
+def test_predict_and_design_take_the_numbers_of_an_npz_file():
+    """They are 0-d arrays."""
+    arrays = {name: np.array(value) for name, value in MACHINE.items()}
+    skew = {'clock_skew': {'skew': 1e-4}, 'target_geometry': {'pulse_angles': [0.0, 1e-3]}}
+    expected = sa.predict(**MACHINE, effects=skew)
+    found = sa.predict(**arrays, effects={
+        'clock_skew': {'skew': np.array(1e-4)},
+        'target_geometry': {'pulse_angles': np.array([0.0, 1e-3])}})
+    assert found.model == expected.model
+    assert np.array_equal(found.mean_attenuation, expected.mean_attenuation)
+    assert sa.design(**arrays).model == sa.design(**MACHINE).model
+
+
+@pytest.mark.parametrize(('function', 'arguments', 'text'), [
+    (sa.predict, {'effects': {'clock_skew': 1e-4}},
+     "clock_skew is 0.0001: give its parameters by name, {'clock_skew': {'skew': ...}}"),
+    (sa.predict, {'effects': ['clock_skew']}, "effects is ['clock_skew']: give a mapping"),
+    (sa.predict, {'trigger_speed': '25'}, "trigger_speed is '25': it must be finite"),
+    (sa.predict, {'jitter_table': 1e-5}, 'jitter_table is 1e-05: give a list of numbers, [1e-05]'),
+    (sa.design, {'others': 1.5}, 'others is 1.5: give a list of numbers, [1.5]'),
+    (sa.design, {'maximum_loss': '5 %'}, "maximum_loss is '5 %': give a number"),
+    (sa.detect_pulses, {'tach': np.zeros(9), 'sample_rate': 'fast'}, "is 'fast': give a number")])
+def test_arguments_of_a_wrong_type_are_named(function, arguments, text):
+    machine = {} if function is sa.detect_pulses else MACHINE
+    with pytest.raises(sa.SaJitterError) as caught:
+        function(**{**machine, **arguments})
+    assert text in str(caught.value)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros import json_values, loop
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.errors import ModelError, ParameterError, RecordingError
 from sa_jitter_ros.loop import close_loop
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -118,6 +118,14 @@ def test_unusable_input_is_named(recording, tmp_path):
         close_loop([], KEYWORDS)
     with pytest.raises(ModelError, match='pinoin is not a keyword of a declared model'):
         close_loop(recording, {**KEYWORDS, 'pinoin': 1.0})
+    with pytest.raises(ModelError, match='model has no trigger_speed, orders: a model needs'):
+        close_loop(recording, {'keyphasor_rate': 20e3, 'trigger_cycles': 20})
+    with pytest.raises(ParameterError, match='effect excess_jitter is 5e-05: give its parameters'):
+        close_loop(recording, {**KEYWORDS, 'effects': {'excess_jitter': 5e-5}})
+    with pytest.raises(ModelError, match='declared is None: give the path'):
+        close_loop(recording, None)
+    with pytest.raises(ModelError, match='recordings is 3: give a path or a Recording'):
+        close_loop(3, KEYWORDS)
     with pytest.raises(RecordingError, match='no such file'):
         close_loop(tmp_path / 'none.npz', KEYWORDS)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.parameters import RATIO
+from sa_jitter_ros.parameters import number, numbers, RATIO, whole_number
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import MissingPulses, PulseValidator
@@ -45,6 +45,10 @@ class AverageSettings:
 
     def __post_init__(self) -> None:
         """Check every value."""
+        for name in ('cycle_length', 'revolutions_per_trigger', 'keyphasor_rate'):
+            object.__setattr__(self, name, number(name, getattr(self, name)))
+        for name in ('trigger_cycles', 'samples_per_revolution'):
+            object.__setattr__(self, name, whole_number(name, getattr(self, name)))
         if not (math.isfinite(self.cycle_length) and self.cycle_length > 0.0):
             raise ParameterError(f'a trigger cycle is {self.cycle_length} fundamental cycles '
                                  'long: give a positive ratio')
@@ -96,6 +100,12 @@ class KeyphasorParameters:
 
     def __post_init__(self) -> None:
         """Check what `PulseValidator` does not check."""
+        for name in ('interval_tolerance', 'minimum_interval', 'time_tolerance'):
+            object.__setattr__(self, name, number(name, getattr(self, name)))
+        for name in ('pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth',
+                     'maximum_missing'):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, whole_number(name, getattr(self, name)))
         if (self.pulses_per_trigger or 0) > self.pulses_per_revolution:
             raise ParameterError(
                 f'pulses_per_trigger is {self.pulses_per_trigger}, more than the '
@@ -122,7 +132,7 @@ class KeyphasorParameters:
         other settings are those of `AverageSettings`.
         """
         if orders is not None:
-            settings['orders'] = tuple(float(order) for order in orders)
+            settings['orders'] = numbers('orders', orders)
         return AverageSettings(
             cycle_length=RATIO.convert(ratio) * self.revolutions_per_trigger,
             revolutions_per_trigger=self.revolutions_per_trigger, **settings)

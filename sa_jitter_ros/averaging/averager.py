@@ -17,6 +17,7 @@ from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
+from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.validation import MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -26,6 +27,7 @@ AngleLawName = Literal['linear', 'quadratic', 'spline']
 Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
 
 _PIECE = 1 << 18  # samples of a channel that are handed on at once, so that memory stays small
+_MUCH = 10.0  # pulses that span so many times the vibration are in another unit
 _ALL_CYCLES = 1 << 60  # more trigger cycles than a stream has
 _SHAFT = 'shaft'
 
@@ -75,6 +77,9 @@ class Averager:
         interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
         time_tolerance: float = 0.01, buffer_seconds: float = math.inf,
     ) -> None:
+        sample_rate = number('sample_rate', sample_rate)
+        start_time = number('start_time', start_time)
+        buffer_seconds = number('buffer_seconds', buffer_seconds)
         if not (np.isfinite(sample_rate) and sample_rate > 0.0):
             raise ParameterError(f'sample_rate is {sample_rate} Hz: give a positive rate')
         if not np.isfinite(start_time):
@@ -150,7 +155,7 @@ class Averager:
         return self._taken(self._stream.finish())
 
     def _checked(self, vibration: ArrayLike) -> NDArray[np.generic]:
-        samples = np.asarray(vibration)
+        samples = _array(vibration)
         if samples.ndim == 1:
             samples = samples[None]
         if samples.ndim != 2 or samples.dtype.kind not in 'fiu':
@@ -215,22 +220,76 @@ def average(
         missing_teeth=missing_teeth, missing_pulses=missing_pulses,
         maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
         minimum_interval=minimum_interval, time_tolerance=time_tolerance)
-    samples, pulses = np.asarray(vibration), np.asarray(pulse_times)
+    samples, pulses = _array(vibration), np.asarray(pulse_times)
+    if pulse_times is None:
+        raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '
+                          'are recording.keyphasor_pulses()')
     if samples.ndim == 2 and samples.shape[0] > samples.shape[1] > 0:
         raise SignalError(f'vibration has {samples.shape[0]} channels of {samples.shape[1]} '
                           'samples: give (channel, sample), transpose it')
     found = averager.update(samples, pulses) + averager.flush()
     discarded = _discarded(averager)
+    start, end = float(start_time), float(start_time + samples.shape[-1] / sample_rate)
+    likely = _likely_mistake(pulses, start, end, float(sample_rate))
     if not found:
-        counts, end = averager.counts, start_time + samples.shape[-1] / sample_rate
+        counts = averager.counts
         wanted = '' if trigger_cycles is None else f' of the {trigger_cycles} of an average'
         raise SignalError(
-            f'{pulses.size} pulses and vibration from {start_time:g} s to {end:g} s make '
+            f'{pulses.size} pulses and vibration from {start:g} s to {end:g} s make '
             f'{counts["trigger_cycles"]} whole trigger cycles{wanted}: '
-            + (discarded or 'lower trigger_cycles, or give more pulses'))
+            + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
     if discarded:
-        warnings.warn(discarded, DataWarning, stacklevel=2)
+        warnings.warn(f'{likely}; {discarded}' if likely else discarded, DataWarning, stacklevel=2)
+    beyond = _beyond_nyquist(found, float(ratio), float(sample_rate))
+    if beyond:
+        warnings.warn(beyond, DataWarning, stacklevel=2)
     return found
+
+
+def _likely_mistake(pulses: NDArray[np.generic], start: float, end: float, rate: float) -> str:
+    """Return what is probably wrong with pulse times that do not fit the vibration, else ''."""
+    times = pulses[np.isfinite(pulses)].astype(np.float64)
+    if times.size < 2 or end <= start:
+        return ''
+    backwards = int(np.count_nonzero(np.diff(times) < 0.0))
+    if 2 * backwards >= times.size:
+        return (f'{backwards} of {times.size} pulse times are earlier than the one before: give '
+                'them in order of time, numpy.sort(pulse_times)')
+    duration, span = end - start, float(np.ptp(times))
+    spans = f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s'
+    if span > _MUCH * duration:
+        units = {'sample indices': rate, 'milliseconds': 1e3, 'microseconds': 1e6}
+        unit = min(units, key=lambda name: abs(math.log(span / (units[name] * duration))))
+        if 0.5 < span / (units[unit] * duration) < 2.0:
+            return (f'{spans}: the pulse times look like {unit}; divide them by '
+                    f'{units[unit]:g} to have seconds')
+        return f'{spans}: give pulse times in s, and sample_rate in Hz'
+    if span * _MUCH**2 < duration:
+        return f'{spans}: give pulse times in s, and sample_rate in Hz'
+    if times.max() < start or times.min() > end:
+        return (f'the pulses come from {times.min():.6g} s to {times.max():.6g} s, when there is '
+                'no vibration: set start_time to the time of the first sample on the clock of the '
+                'pulses')
+    return ''
+
+
+def _beyond_nyquist(found: Sequence[Average], ratio: float, rate: float) -> str:
+    """Return which orders have no amplitude because they are too high, '' if all have one."""
+    speed = ratio * max(average.trigger_speed for average in found)
+    orders = found[0].orders[found[0].orders * speed >= 0.5 * rate]
+    if not orders.size:
+        return ''
+    return (f'no amplitude of orders {", ".join(f"{g:g}" for g in orders)}: the shaft turns at '
+            f'{speed:.5g} Hz, and vibration sampled at {rate:g} Hz shows orders below '
+            f'{0.5 * rate / speed:.5g} only; drop these orders, or check ratio and sample_rate')
+
+
+def _array(vibration: ArrayLike) -> NDArray[np.generic]:
+    """Return vibration as an array; raise SignalError for a `Recording` or a source of one."""
+    if hasattr(vibration, 'blocks'):
+        raise SignalError(f'vibration is of type {type(vibration).__name__}, which reads samples '
+                          'block by block: give all of them as an array, recording.read()')
+    return np.asarray(vibration)
 
 
 _CAUSES = {

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from sa_jitter_ros.effects.registry import make_effect
+from sa_jitter_ros.effects.registry import declared_effects
+from sa_jitter_ros.parameters import numbers
 from sa_jitter_ros.prediction import prediction
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import require_orders
@@ -51,7 +52,6 @@ def predict(
         orders=tuple(require_orders(orders).tolist()), ratio=ratio,
         pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
         jitter_distribution=jitter_distribution, jitter_std=jitter_std,
-        jitter_table=tuple(jitter_table), noise_std=noise_std, sample_rate=sample_rate,
-        angle_law=angle_law)
-    return prediction.predict(
-        model, [make_effect(name, **values) for name, values in effects.items()])
+        jitter_table=numbers('jitter_table', jitter_table), noise_std=noise_std,
+        sample_rate=sample_rate, angle_law=angle_law)
+    return prediction.predict(model, declared_effects(effects))

@@ -8,6 +8,7 @@ library, predictor, simulator, loop and report find it.
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 from sa_jitter_ros.effects.additive_noise import AdditiveNoise
 from sa_jitter_ros.effects.amplitude_modulation import AmplitudeModulation
 from sa_jitter_ros.effects.clock_skew import ClockSkew
@@ -22,6 +23,7 @@ from sa_jitter_ros.effects.phase_wander import PhaseWander
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.parameters import unwrapped
 
 EFFECTS: Mapping[str, type[Effect]] = {kind.name: kind for kind in (
     ExcessJitter, KeyphasorQuantisation, CorrelatedJitter, TargetGeometry, SpeedFluctuation,
@@ -37,8 +39,34 @@ def make_effect(name: str, **parameters: Any) -> Effect:
     for key in parameters:
         if key not in known:
             raise ParameterError(f'effect {name} has no {key!r}: it has {", ".join(known)}')
-    return EFFECTS[name](**{key: tuple(value) if isinstance(value, list) else value
-                            for key, value in parameters.items()})
+    return EFFECTS[name](**{key: _value(value) for key, value in parameters.items()})
+
+
+def declared_effects(effects: Mapping[str, Any]) -> tuple[Effect, ...]:
+    """
+    Return the effects of a mapping of their names to their parameters; raises ParameterError.
+
+    >>> declared_effects({'excess_jitter': {'std': 2e-5}})
+    (ExcessJitter(std=2e-05),)
+    """
+    if not isinstance(effects, Mapping):
+        raise ParameterError(f'effects is {effects!r}: give a mapping of names of effects to '
+                             "their parameters, {'excess_jitter': {'std': 2e-5}}")
+    for name, parameters in effects.items():
+        if name in EFFECTS and not isinstance(parameters, Mapping):
+            first = next(iter(parameter_ranges(EFFECTS[name])))
+            raise ParameterError(f'effect {name} is {parameters!r}: give its parameters by name, '
+                                 f'{{{name!r}: {{{first!r}: ...}}}}')
+    return tuple(make_effect(name, **(parameters if name in EFFECTS else {}))
+                 for name, parameters in effects.items())
+
+
+def _value(value: Any) -> Any:
+    """Return the value of a parameter, a list as a tuple."""
+    value = unwrapped(value)
+    if isinstance(value, (list, np.ndarray)):
+        return tuple(unwrapped(item) for item in value)
+    return value
 
 
 def enabled_effects(values: Mapping[str, Any]) -> tuple[Effect, ...]:

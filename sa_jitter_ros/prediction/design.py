@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.parameters import number, numbers, unwrapped
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.comb import Leakage, leakage
 from sa_jitter_ros.prediction.influence import Gain
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.prediction.moments import cycle_moments
+from sa_jitter_ros.prediction.moments import cycle_moments, require_orders
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.optimize import brentq
 
@@ -103,8 +104,10 @@ def design(
     >>> found.loss.round(4).tolist()
     [0.0076, 0.03]
     """
-    _require_limit('maximum_loss', maximum_loss)
-    _require_limit('maximum_variation', maximum_variation)
+    _require_limit('maximum_loss', number('maximum_loss', maximum_loss))
+    _require_limit('maximum_variation', number('maximum_variation', maximum_variation))
+    keyphasor_rate, trigger_cycles = unwrapped(keyphasor_rate), unwrapped(trigger_cycles)
+    change, false_alarm_rate = unwrapped(change), unwrapped(false_alarm_rate)
     if (change is None) != (false_alarm_rate is None):
         name, missing = (('change', 'false_alarm_rate') if false_alarm_rate is None
                          else ('false_alarm_rate', 'change'))
@@ -118,7 +121,7 @@ def design(
     model = DeclaredModel(
         keyphasor_rate=_ANY_RATE if keyphasor_rate is None else keyphasor_rate,
         trigger_cycles=1 if trigger_cycles is None else trigger_cycles,
-        trigger_speed=trigger_speed, orders=tuple(orders), ratio=ratio,
+        trigger_speed=trigger_speed, orders=tuple(require_orders(orders).tolist()), ratio=ratio,
         pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger or 0,
         jitter_distribution=jitter_distribution, noise_std=noise_std, sample_rate=sample_rate)
     interfering = _interfering_orders(model, others, tones)
@@ -260,7 +263,7 @@ def _interfering_orders(
 ) -> Array:
     """Return the orders of everything that interferes; raise ParameterError for what cannot."""
     for name, given, unit in (('others', others, ''), ('tones', tones, ' Hz')):
-        for value in given:
+        for value in numbers(name, given):
             if not (math.isfinite(value) and value > 0.0):
                 raise ParameterError(f'{name} hold {value:g}{unit}: give finite numbers above 0')
     orders = np.array([*others, *(tone / model.fundamental_frequency for tone in tones)])

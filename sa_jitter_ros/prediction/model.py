@@ -1,11 +1,12 @@
 """The declared model: what is known about keyphasor, machine and average before measuring."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 import math
 
 import numpy as np
 from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.prediction.distributions import (
     Empirical,
     is_number,
@@ -58,6 +59,8 @@ class DeclaredModel:
 
     def __post_init__(self) -> None:
         """Check every value and every combination."""
+        for item in fields(self):
+            object.__setattr__(self, item.name, unwrapped(getattr(self, item.name)))
         for name in ('keyphasor_rate', 'trigger_speed', 'ratio'):
             _require(name, getattr(self, name), lambda value: value > 0.0, 'above 0')
         for name in ('jitter_std', 'noise_std', 'sample_rate'):
@@ -68,7 +71,8 @@ class DeclaredModel:
                  lambda value: value >= 0 and float(value).is_integer(),
                  'whole, 0 (all of a revolution) or above')
         require_cycles(self.trigger_cycles)
-        object.__setattr__(self, 'trigger_cycles', int(self.trigger_cycles))
+        for name in ('trigger_cycles', 'pulses_per_revolution', 'pulses_per_trigger'):
+            object.__setattr__(self, name, int(getattr(self, name)))
         object.__setattr__(self, 'orders', tuple(require_orders(self.orders).tolist()))
         if not isinstance(self.jitter_table, Iterable):
             raise ModelError(f'jitter_table is {self.jitter_table}: give a list of pulse errors '
@@ -140,4 +144,4 @@ class DeclaredModel:
 
 def _require(name: str, value: float, holds: Callable[[float], bool], limit: str) -> None:
     if not (is_number(value) and math.isfinite(value) and holds(value)):
-        raise ModelError(f'{name} is {value}: it must be finite and {limit}')
+        raise ModelError(f'{name} is {value!r}: it must be finite and {limit}')

@@ -15,6 +15,7 @@ import warnings
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
+from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
 from sa_jitter_ros.samples import SampleBlock
 
@@ -313,9 +314,13 @@ def detect_pulses(
     True
     """
     detector = KeyphasorDetector(
-        threshold=threshold, hysteresis=hysteresis, polarity=polarity, edge=edge,
-        interpolate=interpolate, minimum_interval=minimum_interval, learning_time=learning_time,
-        minimum_difference=minimum_difference)
+        threshold=None if threshold is None else number('threshold', threshold),
+        hysteresis=number('hysteresis', hysteresis), polarity=polarity, edge=edge,
+        interpolate=interpolate, minimum_interval=number('minimum_interval', minimum_interval),
+        learning_time=number('learning_time', learning_time),
+        minimum_difference=number('minimum_difference', minimum_difference))
+    sample_rate = number('sample_rate', sample_rate)
+    start_time = number('start_time', start_time)
     samples = np.asarray(tach)
     if samples.ndim != 1 or samples.dtype.kind not in 'fiub':
         detector.update(samples, start_time, sample_rate)  # raises the error

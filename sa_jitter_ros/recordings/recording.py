@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
 from sa_jitter_ros.samples import SampleBlock
@@ -142,6 +143,9 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Check that the parts fit each other, and fill in names and units."""
+        for name in ('sample_rate', 'start_time', 'tach_rate', 'pulses_per_revolution',
+                     'pulses_per_trigger', 'ratio'):
+            object.__setattr__(self, name, unwrapped(getattr(self, name)))
         channels = self.vibration.channels
         if not 1 <= channels <= _MAX_CHANNELS or self.vibration.samples < 1:
             raise RecordingError(
