@@ -38,6 +38,24 @@ class Loop:
     Result of `close_loop`; `str` makes a summary of it.
 
     `traces` are the arrays behind the report, by the name of the shaft.
+
+    A machine whose pulses have no other error than that of a keyphasor sampled at 5 kHz, as
+    declared:
+
+    >>> import sa_jitter_ros as sa
+    >>> from sa_jitter_ros.recordings.recording import ArraySource
+    >>> from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+    >>> machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8)), 5000.0, speed=((0.0, 25.0),),
+    ...                   effects=(DeclaredJitter('uniform', 2e-4 / 12**0.5), AdditiveNoise(0.05)),
+    ...                   seed=3)
+    >>> recording = sa.Recording(ArraySource(machine.vibration(0, 20_000)), 5000.0,
+    ...                          pulse_times=machine.pulses(0.0, 4.0).times)
+    >>> loop = sa.close_loop(recording, {'keyphasor_rate': 5e3, 'trigger_speed': 25.0,
+    ...                                  'trigger_cycles': 10, 'orders': [8, 16]})
+    >>> loop
+    Loop(none; 1 recording)
+    >>> loop.verdict, loop.report['missing_effects']
+    ('none', [])
     """
 
     traces: Mapping[str, Trace]
@@ -65,6 +83,16 @@ class Loop:
     def verdict(self) -> str:
         """Return `none`, `traced` or `unexplained`; with several shafts the last that occurs."""
         return max((trace.verdict for trace in self.traces.values()), key=_VERDICTS.index)
+
+    def __repr__(self) -> str:
+        """Return one line: the verdict and the missing effects of each shaft."""
+        found = []
+        for shaft, item in self.traces.items():
+            names = ', '.join(finding.name for finding in item.findings)
+            found.append((f'{shaft}: ' if len(self.traces) > 1 else '') + item.verdict
+                         + (f' ({names})' if names else ''))
+        count = len(self.recordings)
+        return f'Loop({"; ".join(found)}; {count} recording{"s" * (count > 1)})'
 
     def __str__(self) -> str:
         """Return a summary in a few lines."""

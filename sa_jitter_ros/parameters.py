@@ -145,6 +145,17 @@ def numbers(name: str, value: Any) -> tuple[float, ...]:
     return tuple(number(f'{name}[{i}]', item) for i, item in enumerate(value))
 
 
+def listed(values: Iterable[float], digits: int = 4) -> str:
+    """
+    Return numbers as a short text, of many the first ones and the last one.
+
+    >>> listed([19, 38]), listed(range(1, 200))
+    ('19, 38', '1, 2, 3, 4, ..., 199')
+    """
+    texts = [f'{value:.{digits}g}' for value in values]
+    return ', '.join(texts if len(texts) <= 6 else [*texts[:4], '...', texts[-1]])
+
+
 #: Beyond this range one shaft hardly turns during an average of the other.
 RATIO = Parameter('ratio', 1.0, 'speed of the shaft of interest / speed of the tach shaft',
                   minimum=1e-3, maximum=1e3)

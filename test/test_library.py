@@ -1,5 +1,6 @@
 """The front door: what `import sa_jitter_ros` gives, and what it loads."""
 
+from dataclasses import replace
 import json
 import subprocess
 import sys
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 import sa_jitter_ros
 import sa_jitter_ros as sa
+from sa_jitter_ros.recordings.recording import ArraySource
 
 SLOW = ('rclpy', 'matplotlib', 'scipy')
 
@@ -79,3 +81,24 @@ def test_arguments_of_a_wrong_type_are_named(function, arguments, text):
     with pytest.raises(sa.SaJitterError) as caught:
         function(**{**machine, **arguments})
     assert text in str(caught.value)
+
+
+def test_every_result_is_one_short_line_in_a_notebook():
+    rate, orders = 5000.0, range(1, 41)
+    vibration = np.random.default_rng(3).normal(0.0, 1.0, (3, 20_000))
+    pulses = np.arange(100) / 25.0
+    average, = sa.average(vibration, rate, pulses, orders=orders, correct_jitter=True)
+    refused = average.correction
+    accepted = replace(refused, accepted=True)
+    recording = sa.Recording(ArraySource(vibration), rate, pulse_times=pulses, path='rig.npz')
+    model = {**MACHINE, 'orders': orders}
+    results = [average, refused, accepted, recording, sa.predict(**model), sa.design(**model)]
+    for result in results:
+        text = repr(result)
+        assert text.startswith(f'{type(result).__name__}(')
+        assert '\n' not in text
+        assert len(text) < 200, text
+    assert 'refused: ' in repr(refused)
+    assert repr(recording) == (
+        "Recording('rig.npz', 3 channels of 20000 samples at 5000 Hz (4 s), 100 pulse_times, "
+        'ratio 1)')

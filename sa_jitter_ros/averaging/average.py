@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.parameters import number, numbers, RATIO, whole_number
+from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 from sa_jitter_ros.pulses.validation import MissingPulses, PulseValidator
@@ -182,6 +182,14 @@ class Correction:
     attenuation_standard_error: FloatArray
     cycle_amplitudes: ComplexArray
 
+    def __repr__(self) -> str:
+        """Return one line: whether it was accepted, the size of the errors, what is left."""
+        if not self.accepted:
+            return f'Correction(refused: {self.reason})'
+        size = 1e6 * math.sqrt(np.mean(self.pulse_errors**2))
+        return (f'Correction(accepted, {self.pulse_errors.size} pulse errors of {size:.3g} us '
+                f'RMS, attenuation {listed(self.attenuation.ravel(), 3)})')
+
 
 @dataclass(frozen=True)
 class Average:
@@ -208,6 +216,8 @@ class Average:
     >>> average, = sa.average(vibration, 5e3, np.arange(50) / 25.0, orders=[3.0])
     >>> average.trigger_cycles, round(average.trigger_speed, 6), average.waveform.shape
     (49, 25.0, (1, 216))
+    >>> average
+    Average(sequence 0, 49 trigger cycles at 25 Hz from 0 s to 1.96 s, waveform (1, 216), orders 3)
     >>> abs(average.amplitudes).round(3), np.angle(average.amplitudes).round(3)
     (array([[2.]]), array([[1.]]))
     """
@@ -229,3 +239,12 @@ class Average:
     pulses: FloatArray
     cycle_amplitudes: ComplexArray
     correction: Correction | None = None
+
+    def __repr__(self) -> str:
+        """Return one line: cycles, speed, times, shape of the waveform, orders."""
+        corrected = '' if self.correction is None else (
+            ', corrected' if self.correction.accepted else ', correction refused')
+        return (f'Average(sequence {self.sequence}, {self.trigger_cycles} trigger cycles at '
+                f'{self.trigger_speed:.5g} Hz from {self.start_time:.6g} s to '
+                f'{self.end_time:.6g} s, waveform {self.waveform.shape}, orders '
+                f'{listed(self.orders)}{corrected})')

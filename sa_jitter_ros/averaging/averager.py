@@ -17,7 +17,7 @@ from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
-from sa_jitter_ros.parameters import number
+from sa_jitter_ros.parameters import listed, number
 from sa_jitter_ros.pulses.validation import MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -279,7 +279,7 @@ def _beyond_nyquist(found: Sequence[Average], ratio: float, rate: float) -> str:
     orders = found[0].orders[found[0].orders * speed >= 0.5 * rate]
     if not orders.size:
         return ''
-    return (f'no amplitude of orders {", ".join(f"{g:g}" for g in orders)}: the shaft turns at '
+    return (f'no amplitude of orders {listed(orders)}: the shaft turns at '
             f'{speed:.5g} Hz, and vibration sampled at {rate:g} Hz shows orders below '
             f'{0.5 * rate / speed:.5g} only; drop these orders, or check ratio and sample_rate')
 

@@ -8,14 +8,14 @@ average (`comb`), and all of them how small a change one average shows (`detecti
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.parameters import number, numbers, unwrapped
+from sa_jitter_ros.parameters import listed, number, numbers, unwrapped
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.comb import Leakage, leakage
 from sa_jitter_ros.prediction.influence import Gain
@@ -48,6 +48,14 @@ class Design:
     (order,), in the sequence of `orders`, as has `detection`, the probability that one average
     shows the change asked for (None where none was). `leakage` holds what is left of interfering
     components (None where there are none), its `orders` those of `others`, then those of `tones`.
+
+    >>> import sa_jitter_ros as sa
+    >>> found = sa.design(orders=[19, 38], trigger_speed=25.0, maximum_loss=0.02)
+    >>> found  # doctest: +NORMALIZE_WHITESPACE
+    Design(keyphasor_rate 7011 Hz, trigger_cycles 1, orders 19, 38, loss 0.00502, 0.02,
+    variation 0.00149, 0.00596)
+    >>> found.keyphasor_rate, found.loss.round(3).tolist()
+    (7011.0, [0.005, 0.02])
     """
 
     keyphasor_rate: float
@@ -57,7 +65,13 @@ class Design:
     variation: Array
     leakage: Leakage | None
     detection: Array | None
-    model: DeclaredModel = field(repr=False)
+    model: DeclaredModel
+
+    def __repr__(self) -> str:
+        """Return one line: the two settings and what they mean for each order."""
+        return (f'Design(keyphasor_rate {self.keyphasor_rate:.5g} Hz, trigger_cycles '
+                f'{self.trigger_cycles}, orders {listed(self.orders)}, loss '
+                f'{listed(self.loss, 3)}, variation {listed(self.variation, 3)})')
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,13 @@ and quantiles of the amplitude of a unit component for every order.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.parameters import listed
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.amplitudes import line_variance, unit_amplitudes
 from sa_jitter_ros.prediction.influence import Influence
@@ -32,8 +33,13 @@ class Prediction:
     `mean_attenuation` = E|X| and `variance` = Var|X|, so mean^2 + variance = E|X|^2, which is
     exact. `moments` hold the complex amplitude itself, `distribution` its distribution function.
 
-    >>> result = predict(DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
-    ...                                orders=(23.0, 46.0)))
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> result = sa.predict(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
+    ...                     orders=[23, 46])
+    >>> result  # doctest: +NORMALIZE_WHITESPACE
+    Prediction(40 trigger cycles at 25 Hz, keyphasor 10000 Hz, orders 23, 46,
+    mean attenuation 0.997, 0.986)
     >>> np.round([result.mean_attenuation, result.standard_deviation, result.quantile_05], 3)
     array([[0.997, 0.986],
            [0.001, 0.002],
@@ -51,8 +57,14 @@ class Prediction:
     quantile_05: Array
     quantile_50: Array
     quantile_95: Array
-    moments: AverageMoments = field(repr=False)
-    distribution: AmplitudeDistribution | SampledDistribution = field(repr=False)
+    moments: AverageMoments
+    distribution: AmplitudeDistribution | SampledDistribution
+
+    def __repr__(self) -> str:
+        """Return one line: the average, the keyphasor and what is left of each order."""
+        return (f'Prediction({self.trigger_cycles} trigger cycles at {self.trigger_speed:.5g} Hz, '
+                f'keyphasor {self.keyphasor_rate:.5g} Hz, orders {listed(self.order)}, '
+                f'mean attenuation {listed(self.mean_attenuation, 3)})')
 
     @property
     def trigger_speed(self) -> float:

@@ -114,6 +114,8 @@ class Recording:
     >>> import numpy as np
     >>> recording = Recording(ArraySource(np.zeros((2, 5000))), sample_rate=1e3,
     ...                       pulse_times=np.arange(0.0, 5.0, 0.04), ratio=2.5)
+    >>> recording
+    Recording(2 channels of 5000 samples at 1000 Hz (5 s), 125 pulse_times, ratio 2.5)
     >>> recording.channel_names, recording.duration
     (('channel 0', 'channel 1'), 5.0)
     >>> [block.shape for block in recording.blocks(2000)]
@@ -181,6 +183,18 @@ class Recording:
                     f'{len(labels)} {name} for {channels} channels: give one per channel')
         object.__setattr__(self, 'channel_names', names)
         object.__setattr__(self, 'units', units)
+
+    def __repr__(self) -> str:
+        """Return one line: where it is from, what it holds."""
+        parts = [repr(name) for name in (self.path or self.description,) if name]
+        parts.append(f'{self.channels} channel{"s" * (self.channels > 1)} of {self.samples} '
+                     f'samples at {self.sample_rate:g} Hz ({self.duration:.4g} s)')
+        for name in ('pulse_times', 'reference_pulse_times'):
+            if getattr(self, name) is not None:
+                parts.append(f'{getattr(self, name).size} {name}')
+        if self.tach is not None:
+            parts.append(f'tach at {self.tach_rate:g} Hz')
+        return f'Recording({", ".join([*parts, f"ratio {self.ratio:.6g}"])})'
 
     @property
     def channels(self) -> int:
