@@ -253,7 +253,7 @@ def test_wandering_source_is_no_acceleration(rng):
     found = EFFECTS['speed_fluctuation'].fit(evidence_of(
         rng, declared(rng) + errors, moving=errors,
         ripple=bump + rng.normal(0.0, 1e-6, bump.shape), ripple_error=1e-6))
-    assert 'the source moves' in found.against
+    assert 'the source moves' in found.contradiction
 
 
 def test_noise_is_fitted_within_its_error(rng):
@@ -351,13 +351,13 @@ def test_few_pulses_find_a_memory_or_leave_it_open(rng):
     for _ in range(15):
         evidence = evidence_of(rng, declared(rng)[:3] + stationary(rng, 1e-8 * 0.7**LAGS, 3))
         independent = EFFECTS['excess_jitter'].fit(evidence)
-        assert bool(independent.rivals) == bool(independent.decider)
+        assert bool(independent.indistinguishable_from) == bool(independent.deciding_measurement)
         hits.append(EFFECTS['correlated_jitter'].fit(evidence).effect is not None
-                    or 'correlated_jitter' in independent.rivals)
+                    or 'correlated_jitter' in independent.indistinguishable_from)
     assert sum(hits) >= 13
     independent = [EFFECTS['excess_jitter'].fit(evidence_of(
         rng, declared(rng) + rng.normal(0.0, 60e-6, (ACQUISITIONS, PULSES)))) for _ in range(15)]
-    assert sum(bool(item.rivals) for item in independent) <= 4  # 5 % of them by chance
+    assert sum(bool(item.indistinguishable_from) for item in independent) <= 4  # 5 % by chance
 
 
 def test_rare_shocks_that_fade_are_no_correlated_jitter(rng):
@@ -365,7 +365,7 @@ def test_rare_shocks_that_fade_are_no_correlated_jitter(rng):
     def against(errors):
         found = EFFECTS['correlated_jitter'].fit(evidence_of(rng, 0.1 * declared(rng) + errors))
         assert found.effect is not None
-        return found.against
+        return found.contradiction
 
     def shocks():
         size = ACQUISITIONS * PULSES + 50

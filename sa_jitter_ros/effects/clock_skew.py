@@ -18,7 +18,7 @@ class ClockSkew(Effect):
     """Time t of the vibration is t (1 + skew) on the keyphasor's clock."""
 
     name: ClassVar[str] = 'clock_skew'
-    summary: ClassVar[str] = 'clock of the keyphasor against that of the vibration'
+    summary: ClassVar[str] = 'speed of the keyphasor clock relative to the vibration clock'
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
 

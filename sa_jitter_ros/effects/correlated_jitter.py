@@ -1,4 +1,4 @@
-"""Correlated jitter: normal pulse errors that remember each other (a wandering trigger level)."""
+"""Correlated jitter: normal pulse errors with memory (a wandering trigger level)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ class CorrelatedJitter(Effect):
 
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'
-    of_pulses: ClassVar[bool] = True
+    needs_pulse_errors: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
                                    minimum=-0.999, maximum=0.999)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
-        """Return the first-order autoregressive pulse errors, seen through the angle law."""
+        """Return the angle errors that first-order autoregressive pulse errors cause."""
         if self.std == 0.0:
             return ()
         require_in_turn('the spread of correlated_jitter.std', Normal(self.std).width, model)
@@ -48,18 +48,18 @@ class CorrelatedJitter(Effect):
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
-        """Fit variance and memory of the pulse errors; white ones are another effect's."""
+        """Fit variance and memory of the pulse errors; independent errors are `excess_jitter`."""
         fit = fit_memory(evidence)
         std, error = root(fit.variance, fit.variance_error)
         if std == 0.0:
             return absent(cls.name, 'the pulse errors vary no more than declared')
         p_value = memory_p_value(evidence.of_all)
         text = (f'pulse errors of {std:.3g} s correlated by {fit.shape:.2f} from pulse to pulse, '
-                f'p = {p_value:.2g} against independent ones')
+                f'p = {p_value:.2g} if they were independent')
         if p_value > _SIGNIFICANT:
-            return absent(cls.name, f'the pulse errors do not remember each other: {text}',
+            return absent(cls.name, f'the pulse errors are not correlated: {text}',
                           p_value=p_value)
-        against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
+        contradiction = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
         return Finding(cls.name, cls(std, fit.shape),
                        {'std': error, 'correlation': fit.shape_error},
-                       min(p_value, fit.p_value), text, against)
+                       min(p_value, fit.p_value), text, contradiction)

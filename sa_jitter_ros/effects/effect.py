@@ -2,7 +2,7 @@
 What an effect is: an influence on the average that has parameters and can be fitted to evidence.
 
 An effect is one frozen dataclass whose fields are its parameters. It overrides the hooks of
-`Influence` that it needs; what it leaves alone has no influence.
+`Influence` that it needs; the defaults of the other hooks have no influence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -73,21 +73,21 @@ def require_in_turn(name: str, spread: float, model: DeclaredModel) -> None:
 
 class Effect(Influence):
     """
-    An effect that does nothing: the base of all.
+    Base class of all effects; it has no influence itself.
 
-    `name` is that of the parameters, `summary` says in a few words what the effect is.
+    `name` is the prefix of the effect's parameters, `summary` describes the effect in a few words.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
-    #: Whether amplitudes scatter while the attenuation, raw over corrected, stays as it is.
+    #: Whether it makes amplitudes scatter but does not change the attenuation, raw over corrected.
     scatters: ClassVar[bool] = False
-    #: Whether it is seen in the pulses themselves, so that it is reported whatever it does.
-    seen: ClassVar[bool] = False
-    #: Whether the recovered errors of single pulses are what tells it.
-    of_pulses: ClassVar[bool] = False
-    #: Whether the vibration moves and the pulses are right, however its motion is recovered.
-    moves_vibration: ClassVar[bool] = False
+    #: Whether the pulse times alone show it; it is then reported even if amplitudes do not change.
+    visible_in_pulse_times: ClassVar[bool] = False
+    #: Whether its evidence is the recovered errors of single pulses.
+    needs_pulse_errors: ClassVar[bool] = False
+    #: Whether the vibration moves while the pulse times are correct; recovery shows pulse errors.
+    pulse_times_correct: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         """Check every parameter."""
@@ -96,7 +96,7 @@ class Effect(Influence):
 
     @classmethod
     def fit(cls, evidence: Evidence) -> 'Finding':
-        """Return the effect that fits the evidence best, with what speaks for or against it."""
+        """Return the effect that fits the evidence best, what supports and what contradicts it."""
         raise NotImplementedError
 
     @property
@@ -108,12 +108,13 @@ class Effect(Influence):
 @dataclass(frozen=True)
 class Finding:
     """
-    What an effect makes of the evidence.
+    The result of fitting an effect to the evidence.
 
-    `effect` with the fitted parameters, None where nothing could be fitted; `standard_errors` by
-    parameter; `p_value` of the physical evidence under "this effect is absent"; `against` says why
-    the effect is not the one, '' where nothing speaks against it; `rivals` are effects that this
-    evidence cannot tell from it, `decider` the measurement that could.
+    `effect` has the fitted parameters, None if nothing could be fitted; `standard_errors` are by
+    parameter; `p_value` is the probability of evidence at least this strong if the effect is
+    absent; `evidence` describes it in words. `contradiction` says what in the data contradicts
+    the effect, '' if nothing does. `indistinguishable_from` names effects that this evidence
+    cannot distinguish from it, `deciding_measurement` a measurement that could.
     """
 
     name: str
@@ -121,14 +122,14 @@ class Finding:
     standard_errors: Mapping[str, Any]
     p_value: float
     evidence: str
-    against: str = ''
-    rivals: Sequence[str] = ()
-    decider: str = ''
+    contradiction: str = ''
+    indistinguishable_from: Sequence[str] = ()
+    deciding_measurement: str = ''
 
 
 def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:
-    """Return the finding of an effect that is not there."""
-    return Finding(name, None, {}, p_value, reason, against=reason)
+    """Return the finding of an effect that the evidence does not show; `reason` says why."""
+    return Finding(name, None, {}, p_value, reason, contradiction=reason)
 
 
 def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:

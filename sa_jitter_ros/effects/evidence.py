@@ -1,8 +1,8 @@
 """
-What the effects look at: pulse errors, ripple and amplitudes of the acquisitions of one record.
+What effects are fitted to: pulse errors, ripple and amplitudes of the acquisitions of one record.
 
-`Evidence` is plain data that the loop gathers from the acquisitions it fits on; whatever effects
-were added before are taken out of it (`explained`).
+The loop gathers `Evidence` from the acquisitions that it fits effects to. The contributions of
+effects that were added before (`explained`) are subtracted.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
 
-#: Relative spread of speeds that are one: nothing can be told from how they differ.
+#: Relative spread of speeds below which they count as one speed.
 SAME_SPEED = 5e-3
 
 
 @dataclass(frozen=True)
 class Tone:
-    """`frequency` (Hz) and peak `amplitude` of the clearest tone, their errors, its chance."""
+    """`frequency` (Hz) and peak `amplitude` of the strongest tone, their errors, its p value."""
 
     frequency: float
     amplitude: float
@@ -42,8 +42,7 @@ class LineEvidence:
     noise, in the units of the recording; `radial` (acquisition, cycle, line) each cycle's
     amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
     alone. `tone` is what stands out most between the synchronous lines. `beat_method` is the
-    interpolator whose beat the lines show, '' for none, and `beat_gain` (line,) what it has left
-    of the amplitudes.
+    interpolator whose beat the lines show, '' for none, and `beat_gain` (line,) its gain.
     """
 
     order: Array
@@ -61,15 +60,15 @@ class LineEvidence:
 @dataclass(frozen=True)
 class Evidence:
     """
-    What is known of the acquisitions that a fit may use.
+    Measurements of the acquisitions that a fit may use.
 
     `errors` and `standard_errors` (acquisition, N_t + 1) are pulse errors in s, of mean 0 in each
     acquisition, less the patterns of the effects in `explained`; they were measured
     `against_reference`, a better keyphasor, or else recovered from the vibration. `ripple`
     (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
-    `record_times` are all pulses of the record and `record_missing` (interval,) is how many pulses
-    lack in each interval of the record; `clock` is the one on whose ticks all pulse times lie, if
-    any. `whole` holds the acquisitions that no fit may use, too.
+    `record_times` are all pulses of the record, `record_missing` (interval,) the number of pulses
+    that are missing in each of its intervals; `clock` is the one on whose ticks all pulse times
+    lie, if any. `whole` also contains the acquisitions that no fit may use.
     """
 
     model: DeclaredModel
@@ -88,7 +87,7 @@ class Evidence:
 
     @property
     def of_all(self) -> 'Evidence':
-        """Return the evidence of all acquisitions: it tells effects apart, no fit uses it."""
+        """Return the evidence of all acquisitions: it distinguishes effects, no fit uses it."""
         return self.whole or self
 
     @property
@@ -107,21 +106,21 @@ class Evidence:
         return np.array([pulses.times for pulses in self.pulses])
 
     @property
-    def times_left(self) -> Array:
-        """Return the times (acquisition, N_t + 1) less what `explained` knows of each pulse."""
+    def unexplained_times(self) -> Array:
+        """Return `times` less the pulse errors that the effects in `explained` predict, in s."""
         known = [known_errors(self.model, self.explained, pulses) for pulses in self.pulses]
         return np.array([times if errors is None else times - errors
                          for times, errors in zip(self.times, known)])
 
     @property
     def hidden_by_ticks(self) -> bool:
-        """Tell whether the ticks of the clock leave room for all that the pulses err."""
-        whole = self.errors + self.times - self.times_left
+        """Return whether the ticks of the clock alone can make all pulse errors."""
+        whole = self.errors + self.times - self.unexplained_times
         return ticks_leave_room(whole, self.standard_errors, self.clock.rate)
 
     @property
     def jitter_replaced(self) -> bool:
-        """Tell whether an added effect takes the place of the declared jitter."""
+        """Return whether an added effect replaces the declared jitter."""
         return any(effect.replaces_jitter(self.model) for effect in self.explained)
 
     def expected_autocovariance(self, lags: Array) -> Array:

@@ -15,7 +15,7 @@ from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _HINT = 0.05  # the p value of a memory that is hardly chance, and no proof
-_DECIDER = 'more acquisitions, or longer ones'
+_DECIDING = 'more acquisitions, or longer ones'
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ExcessJitter(Effect):
 
     name: ClassVar[str] = 'excess_jitter'
     summary: ClassVar[str] = 'independent normal pulse errors'
-    of_pulses: ClassVar[bool] = True
+    needs_pulse_errors: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)
 
@@ -50,8 +50,9 @@ class ExcessJitter(Effect):
             return absent(cls.name, 'the pulse errors vary no more than declared')
         text = (f'the pulse errors have {fit.observed_std:.3g} s where '
                 f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
-        against = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
+        contradiction = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
         unsure = memory_p_value(evidence.of_all) < _HINT
         return Finding(
-            cls.name, cls(std), {'std': error}, fit.p_value, text, against,
-            rivals=('correlated_jitter',) if unsure else (), decider=_DECIDER if unsure else '')
+            cls.name, cls(std), {'std': error}, fit.p_value, text, contradiction,
+            indistinguishable_from=('correlated_jitter',) if unsure else (),
+            deciding_measurement=_DECIDING if unsure else '')

@@ -96,7 +96,7 @@ def _period_std(evidence: Evidence) -> tuple[float, float]:
     True pulses are the measured ones less their errors, whose noise is taken out of the periods'
     variance. A slow speed moves neighbouring periods together: acquisitions count, not periods.
     """
-    periods = np.diff(evidence.times_left - evidence.errors, axis=1)
+    periods = np.diff(evidence.unexplained_times - evidence.errors, axis=1)
     noise = np.nan_to_num(evidence.standard_errors) ** 2
     rows = np.mean((periods - periods.mean()) ** 2 - noise[:, 1:] - noise[:, :-1], axis=1)
     return root(float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(rows.size)))

@@ -33,7 +33,7 @@ class MissingPulses(Effect):
 
     name: ClassVar[str] = 'missing_pulses'
     summary: ClassVar[str] = 'pulses that are lost and not repaired'
-    seen: ClassVar[bool] = True
+    visible_in_pulse_times: ClassVar[bool] = True
     probability: float = parameter(0.0, 'probability that a pulse is lost', '1', minimum=0.0,
                                    maximum=0.9)
 

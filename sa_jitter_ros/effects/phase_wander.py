@@ -1,4 +1,4 @@
-"""Phase wander: the source moves against the tach shaft (torsion, a changing transfer path)."""
+"""Phase wander: the source moves relative to the tach shaft (torsion, changing transfer path)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngl
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _NARROW = 0.05
+_DECIDING = 'a second keyphasor, or a steadier speed'
 _SIGNIFICANT = 1e-3
 _MOST_BESIDE = 4.0  # variance of independent errors beside that of the wander
 _FREEDOM = 2.0  # what one more parameter gains by chance, Akaike's criterion
@@ -29,9 +30,9 @@ class PhaseWander(Effect):
     """
 
     name: ClassVar[str] = 'phase_wander'
-    summary: ClassVar[str] = 'slow motion of the source against the tach shaft'
-    moves_vibration: ClassVar[bool] = True
-    of_pulses: ClassVar[bool] = True
+    summary: ClassVar[str] = 'slow motion of the source relative to the tach shaft'
+    pulse_times_correct: ClassVar[bool] = True
+    needs_pulse_errors: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
     bandwidth: float = parameter(SLOW_BAND[1], 'highest frequency of the motion over the trigger '
@@ -42,7 +43,7 @@ class PhaseWander(Effect):
         if self.std == 0.0:
             return ()
         require_below('phase_wander.std', self.std, 2.0 * np.pi, 'rad', 'a source that turns '
-                      'freely against the shaft has no orders of it; lower it')
+                      'freely relative to the shaft has no orders of it; lower it')
         variance = (self.std / (2.0 * np.pi)) ** 2
 
         def covariance(u: Array, v: Array, lag: int) -> Array:
@@ -53,7 +54,7 @@ class PhaseWander(Effect):
         return (GaussianAngleError(covariance, slow_memory(model.trigger_cycles)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
-        """Return what the wander looks like when it is taken for pulse errors."""
+        """Return the autocovariance of the pulse errors that the recovery makes of the wander."""
         seconds = self.std / (2.0 * np.pi * model.fundamental_frequency)
         return np.asarray(seconds**2 * recovered_correlation(lags, _band(self.bandwidth)))
 
@@ -61,7 +62,7 @@ class PhaseWander(Effect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit slow errors that the measured pulse times do not have."""
         if evidence.against_reference:
-            return absent(cls.name, 'against a better keyphasor the source cannot move')
+            return absent(cls.name, 'relative to a better keyphasor the source cannot move')
         slope = slope_test(evidence.of_all)
         if slope.tach_side:
             return absent(cls.name, 'the pulse times move as the recovered errors do: the '
@@ -79,23 +80,24 @@ class PhaseWander(Effect):
             return absent(cls.name, 'the pulse errors vary no more than declared')
         seconds, error = root(fit.variance, fit.variance_error)
         rad = 2.0 * np.pi * evidence.model.fundamental_frequency
-        text = (f'the vibration moves by {seconds:.3g} s against the pulses, whose times do not '
-                f'show {slope.share:.2f} +- {slope.standard_error:.2f} of the motion, '
+        text = (f'the vibration moves by {seconds:.3g} s relative to the pulses, whose times do '
+                f'not show {slope.share:.2f} +- {slope.standard_error:.2f} of the motion, '
                 f'p = {slope.p_value:.2g}')
         rivals = () if slope.decided else ('correlated_jitter',)
-        against = ''
+        contradiction = ''
         if rivals:
             whole = evidence.of_all
             better = max(fit_covariance(whole, white).gain, fit_memory(whole).gain - _FREEDOM)
-            own = fit_covariance(whole, _correlation, bounds=(_NARROW, 0.5)).gain - _FREEDOM
-            if better > own:
-                against = ('independent or autoregressive pulse errors explain them better: twice '
-                           f'the log-likelihood gains {better:.1f} with them, {own:.1f} with '
-                           'a wander')
+            wander = fit_covariance(whole, _correlation, bounds=(_NARROW, 0.5)).gain - _FREEDOM
+            if better > wander:
+                contradiction = (
+                    'independent or autoregressive pulse errors explain them better: twice the '
+                    f'log-likelihood gains {better:.1f} with them, {wander:.1f} with a wander')
         return Finding(cls.name, cls(rad * seconds, bandwidth),
                        {'std': rad * error, 'bandwidth': bandwidth_error},
-                       max(fit.p_value, 1e-300), text, against, rivals=rivals,
-                       decider='a second keyphasor, or a steadier speed' if rivals else '')
+                       max(fit.p_value, 1e-300), text, contradiction,
+                       indistinguishable_from=rivals,
+                       deciding_measurement=_DECIDING if rivals else '')
 
 
 def _band(bandwidth: float) -> tuple[float, float]:

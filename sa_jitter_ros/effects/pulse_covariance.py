@@ -174,7 +174,7 @@ def _fourth_cumulant(evidence: Evidence) -> float:
 
 
 def goodness_of_fit(evidence: Evidence, fit: CovarianceFit) -> str:
-    """Say what speaks against a fit, by what it leaves; '' if nothing does."""
+    """Return what in the remaining errors contradicts a fit, '' if nothing does."""
     white_left = fit.innovations[:, 1:]
     rows, count = white_left.shape
     total, used = 0.0, 0

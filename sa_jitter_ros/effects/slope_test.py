@@ -49,7 +49,7 @@ def slope_test(evidence: Evidence) -> SlopeTest:
     turns = np.outer(np.arange(1, count // 2), np.arange(count - 2)) / (count - 2)
     spectrum = np.exp(-2j * np.pi * turns) * np.hanning(count)[1:-1]
     errors = np.diff(evidence.errors, 2, axis=1) @ spectrum.T
-    bends = np.diff(evidence.times_left, 2, axis=1)
+    bends = np.diff(evidence.unexplained_times, 2, axis=1)
     if any(pulses.missing is not None and pulses.missing.any() for pulses in evidence.pulses):
         period = evidence.period
         bends = (bends + 0.5 * period) % period - 0.5 * period
@@ -62,7 +62,7 @@ def slope_test(evidence: Evidence) -> SlopeTest:
     lags = np.arange(count)
     moving = toeplitz(sum(
         (effect.pulse_autocovariance(evidence.model, lags) for effect in evidence.explained
-         if isinstance(effect, Effect) and effect.moves_vibration), np.zeros(count)))
+         if isinstance(effect, Effect) and effect.pulse_times_correct), np.zeros(count)))
     declared = toeplitz(evidence.expected_autocovariance(lags)) - moving
     noise = np.diag(np.nan_to_num(np.mean(evidence.standard_errors**2, axis=0)))
     of_tach = np.clip(1.0 - power(moving + noise) / observed, 0.0, 1.0)

@@ -63,7 +63,7 @@ class SpeedFluctuation(Effect):
         resolved = np.all(np.isfinite(evidence.ripple), axis=1)  # not where a pulse lacks
         if np.count_nonzero(resolved) < _FEWEST or evidence.ripple[:, 1:-1].size < 12:
             return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
-        times = evidence.times_left[resolved]
+        times = evidence.unexplained_times[resolved]
         expected = _inside(times - evidence.errors[resolved])  # s, at all cycles but the outer two
         ripple = evidence.ripple[resolved, 1:-1]
         noise = evidence.ripple_standard_error**2
@@ -84,21 +84,21 @@ class SpeedFluctuation(Effect):
             return absent(cls.name, 'the error inside the cycles does not follow the acceleration '
                           f'between the pulses: slope {slope:.2f}, p = {p_value:.2g}',
                           p_value=p_value)
-        against = ''
+        contradiction = ''
         r = slope * float(expected.std() / ripple.std())
         if r**2 * (1.0 + noise / variance) < 0.4:
-            against = (f'the acceleration between the pulses explains {r**2:.0%} of the error '
-                       'inside the cycles: something faster moves')
+            contradiction = (f'the acceleration between the pulses explains {r**2:.0%} of the '
+                             'error inside the cycles: something faster moves')
         # Jitter of the pulses has no part in the ripple, a moving source none in the pulses.
         product = ripple * _inside(times)
         whole = float(np.mean(ripple * expected)) + shared
         share = float(product.mean()) / whole
         unsure = float(product.std() / np.sqrt(product.size)) / abs(whole)
         if share < 0.5 and share + 3.0 * unsure < 1.0:
-            against = (f'the pulse times show {share:.0%} +- {unsure:.0%} of the acceleration: '
-                       'the source moves')
+            contradiction = (f'the pulse times show {share:.0%} +- {unsure:.0%} of the '
+                             'acceleration: the source moves')
         return Finding(cls.name, cls(unit * size), {'acceleration_std': unit * error},
-                       p_value, text, against)
+                       p_value, text, contradiction)
 
 
 def _left_by(weights: PulseWeights, variance: float) -> Covariance:

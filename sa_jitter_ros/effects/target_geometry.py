@@ -30,7 +30,7 @@ class TargetGeometry(Effect):
 
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'
-    of_pulses: ClassVar[bool] = True
+    needs_pulse_errors: ClassVar[bool] = True
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')
 

@@ -69,21 +69,22 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
         if name in taken:
             continue
         untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model) or (
-            _HIDDEN if hidden and kind.of_pulses else '')
+            _HIDDEN if hidden and kind.needs_pulse_errors else '')
         finding = absent(name, untold) if untold else kind.fit(evidence)
         if finding.effect is None:
             found.append(Candidate(name, number, finding, None,
-                                   finding.against if significant else unneeded))
+                                   finding.contradiction if significant else unneeded))
             continue
         left = bench.unsteadiness([*effects, finding.effect]) if kind.scatters else own
         score = bench.score([*effects, finding.effect], [*chosen, finding], unsteadiness=left)
         gain = (_gain_of_amplitude(finding, current, score, own, left) if kind.scatters
                 else _gain_of_attenuation(bench, effects, finding, current, moves, score))
-        rejected = finding.against or _rejection(bench, effects, finding, gain)
-        plain = kind.seen or (not kind.scatters and (gain.told or finding.p_value < _DECISIVE))
+        rejected = finding.contradiction or _rejection(bench, effects, finding, gain)
+        visible = kind.visible_in_pulse_times
+        plain = visible or (not kind.scatters and (gain.told or finding.p_value < _DECISIVE))
         if not rejected and not plain:  # pulses that show an effect plainly may show two
             rejected = _leaves(kind.scatters, current, score)
-        in_times = kind.seen or finding.effect.replaces_jitter(bench.observation.model)
+        in_times = visible or finding.effect.replaces_jitter(bench.observation.model)
         if not rejected and not in_times and not kind.scatters:
             rejected = str(still_moving(moves, dependences(
                 bench, [*effects, finding.effect], [*chosen, finding])) or '')
@@ -125,7 +126,8 @@ def _gain_of_attenuation(bench: Bench, effects: Sequence[Effect], finding: Findi
     """Return what an effect on the attenuation gains."""
     new, old = score.score, current.score
     told = _told(bench, effects, finding, current, score)
-    better = new > old or told or (EFFECTS[finding.name].seen and new > old - _SAME)
+    visible = EFFECTS[finding.name].visible_in_pulse_times
+    better = new > old or told or (visible and new > old - _SAME)
     change = moving(moves)
     p_value = min(current.p_attenuation, change.p_value if change else 1.0)
     return _Gain('attenuation', new, old, p_value, _decisive(finding, current, score), told,
@@ -137,10 +139,11 @@ def _rejection(bench: Bench, effects: Sequence[Effect], finding: Finding, gain: 
     if finding.p_value > _EVIDENCE:
         return f'its evidence may be chance: {finding.evidence}'
     assert finding.effect is not None
-    seen, least = finding.effect.seen, _FAINT if finding.effect.scatters else ACCURACY
-    if not seen and _moved(bench, effects, finding.effect) < least:
+    visible = finding.effect.visible_in_pulse_times
+    least = _FAINT if finding.effect.scatters else ACCURACY
+    if not visible and _moved(bench, effects, finding.effect) < least:
         return f'it is too small to matter: the {gain.of} of no line changes by {least:g}'
-    if not (gain.p_value < SIGNIFICANT or seen or gain.decisive or gain.told):
+    if not (gain.p_value < SIGNIFICANT or visible or gain.decisive or gain.told):
         return f'not needed: the {gain.of} leaves nothing significant (p = {gain.p_value:.2g})'
     if not gain.better:
         return (f'the {gain.of} of held-out acquisitions is predicted no better: log score '

@@ -79,7 +79,8 @@ def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
         _scatter(observation, lines, level), fit, held_out,
         (*declared, _measured_noise(observation, lines)), ONLY_OFF_LINE), progress=progress)
     return replace(found, declared=tuple(declared), findings=tuple(
-        replace(item, rivals=(*item.rivals, 'speed_fluctuation'), decider=_DECISIVE)
+        replace(item, deciding_measurement=_DECISIVE,
+                indistinguishable_from=(*item.indistinguishable_from, 'speed_fluctuation'))
         if item.name == 'phase_wander' else item for item in found.findings))
 
 

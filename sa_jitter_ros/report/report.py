@@ -100,8 +100,9 @@ def _effect(finding: Finding) -> Mapping[str, Json]:
     assert finding.effect is not None
     ranges = parameter_ranges(type(finding.effect))
     evidence = finding.evidence
-    if finding.rivals:
-        evidence += f'; {finding.decider} would distinguish it from {", ".join(finding.rivals)}'
+    if finding.indistinguishable_from:
+        others = ', '.join(finding.indistinguishable_from)
+        evidence += f'; {finding.deciding_measurement} would distinguish it from {others}'
     return {
         'name': finding.name,
         'parameters': {name: {'value': value,
@@ -109,7 +110,7 @@ def _effect(finding: Finding) -> Mapping[str, Json]:
                               'unit': ranges[name].unit}
                        for name, value in finding.effect.values.items()},
         'evidence': evidence, 'p_value': finding.p_value,
-        'indistinguishable_from': list(finding.rivals)}
+        'indistinguishable_from': list(finding.indistinguishable_from)}
 
 
 def _candidate(item: Candidate) -> Mapping[str, Json]:
