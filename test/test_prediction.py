@@ -201,7 +201,7 @@ def test_effects_can_take_the_place_of_the_declared_jitter():
 
 @pytest.mark.parametrize(('changes', 'message'), [
     ({'keyphasor_rate': 0.0}, 'keyphasor_rate is 0.0: it must be finite and above 0'),
-    ({'keyphasor_rate': 'fast'}, 'keyphasor_rate is fast: it must be finite and above 0'),
+    ({'keyphasor_rate': 'fast'}, "keyphasor_rate is 'fast': it must be finite and above 0"),
     ({'keyphasor_rate': None}, 'keyphasor_rate is None'),
     ({'trigger_cycles': float('inf')}, 'trigger_cycles is inf: an average holds a whole number'),
     ({'trigger_cycles': '3'}, 'trigger_cycles is 3: an average holds a whole number'),
