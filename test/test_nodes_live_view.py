@@ -26,7 +26,7 @@ from sa_jitter_ros.nodes import live_view_board as board
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.live_view import LiveView
-from sa_jitter_ros.nodes.live_view_server import is_own_name, PORTS_TRIED
+from sa_jitter_ros.nodes.live_view_server import is_name_of_this_machine, PORTS_TRIED
 from std_msgs.msg import Float64, Float64MultiArray, String
 import yaml
 
@@ -348,7 +348,7 @@ def test_foreign_host_name_is_refused(bench):
 @pytest.mark.parametrize('host', [
     'localhost', 'localhost:9', '127.0.0.1:80', '[::1]:8420', '192.0.2.7', socket.gethostname()])
 def test_addresses_and_names_of_this_host_are_served(host):
-    assert is_own_name(host)
+    assert is_name_of_this_machine(host)
 
 
 def test_page_is_complete_and_requests_nothing_elsewhere(bench):

@@ -78,7 +78,7 @@ class AmplitudeModulation(Effect):
         known = sum(effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
         weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
         if radial.shape[2] < 2:
-            return absent(cls.name, 'one line alone does not tell modulation from noise')
+            return absent(cls.name, 'one line alone cannot distinguish modulation from noise')
         common = radial @ weight
         own = radial**2 @ weight**2
         pairs = weight.sum() ** 2 - np.sum(weight**2)
@@ -118,9 +118,9 @@ def _chance(mean: float, weight: Array, count: int) -> float:
     if slope(ends[0]) >= 0.0 or slope(ends[1]) <= 0.0:
         return float(mean < 0.0)
     s = optimize.brentq(slope, *ends, xtol=1e-12)
-    left = 1.0 - 2.0 * s * values
-    exponent = np.sign(s) * np.sqrt(max(count * (2.0 * s * mean + np.sum(np.log(left))), 0.0))
-    spread = s * np.sqrt(2.0 * count * np.sum((values / left) ** 2))
+    factors = 1.0 - 2.0 * s * values
+    exponent = np.sign(s) * np.sqrt(max(count * (2.0 * s * mean + np.sum(np.log(factors))), 0.0))
+    spread = s * np.sqrt(2.0 * count * np.sum((values / factors) ** 2))
     if abs(exponent) < 1e-3:  # the formula is 0/0 there
         return float(stats.norm.sf(exponent))
     return float(np.clip(stats.norm.sf(exponent) + stats.norm.pdf(exponent) * (

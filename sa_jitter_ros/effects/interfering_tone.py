@@ -26,7 +26,7 @@ class InterferingTone(Effect):
     def line_variance(self, model: DeclaredModel) -> Array:
         """Return the power that the comb filter of the average passes (Eq. 8)."""
         require_below('interfering_tone.amplitude', self.amplitude, _MOST, 'components',
-                      'nothing of a component is seen beside it; lower it')
+                      'no component is visible beside it; lower it')
         line = np.asarray(model.orders) * model.fundamental_frequency
         passed = (np.sinc((self.frequency - line) * model.duration) ** 2
                   + np.sinc((self.frequency + line) * model.duration) ** 2)

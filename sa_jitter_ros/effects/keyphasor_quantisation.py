@@ -1,8 +1,8 @@
 """
 Keyphasor quantisation: pulse times on the grid of a clock, to which their errors are locked.
 
-A clock of the declared keyphasor rate IS the declared jitter, seen rightly: its errors take the
-place of the independent ones. A clock of another rate comes on top. Errors of a steady machine
+A clock of the declared keyphasor rate is the cause of the declared jitter: its errors replace the
+independent ones. The errors of a clock of another rate are added. Errors of a steady machine
 repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases need not be what one
 average shows: where pulses were measured, the prediction is made for their own phases.
 """
@@ -59,16 +59,16 @@ class KeyphasorQuantisation(Effect):
         return np.asarray((np.ceil(ticks) - ticks - 0.5) / self.clock_rate)
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
-        """Return the errors that the measured times themselves tell."""
+        """Return the errors that follow from the measured times."""
         return pulses.errors
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
-        """Tell whether this clock is the declared one."""
+        """Return whether this clock is the declared one."""
         return abs(self.clock_rate / model.keyphasor_rate - 1.0) < _SAME_RATE
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
-        """Look whether the errors are those that the grid of the pulse times imposes."""
+        """Test whether the errors are those that the grid of the pulse times imposes."""
         clock = evidence.clock.rate
         if not clock > 0.0:
             return absent(cls.name, 'the pulse times lie on no grid of a clock')

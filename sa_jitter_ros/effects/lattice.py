@@ -1,4 +1,4 @@
-"""The grid of a clock in pulse times: finding it, and what it says about each pulse."""
+"""The grid of a clock in pulse times: how it is found, and the error it implies for each pulse."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -119,7 +119,7 @@ def placed_on_grid(errors: Array, clock_rate: float) -> tuple[Array, float]:
 
 
 def ticks_leave_room(errors: Array, standard_errors: Array, clock_rate: float) -> bool:
-    """Tell whether pulse errors (acquisition, pulse) in s are such as a clock alone can make."""
+    """Return whether a clock alone can make the pulse errors (acquisition, pulse) in s."""
     beyond = np.mean([placed_on_grid(row, clock_rate)[1] ** 2 for row in errors])
     return bool(beyond < max(np.nanmean(standard_errors**2), (_ROOM / clock_rate) ** 2))
 

@@ -1,5 +1,5 @@
 """
-Missing pulses that nobody repairs: from each one on the angle is short of a trigger cycle.
+Missing pulses that nobody repairs: from each one on the angle lacks one trigger cycle.
 
 In every cycle the counted angle falls behind by a geometric number of trigger cycles, so that the
 phasors make a random walk, whose characteristic function is closed: moments are geometric sums.
@@ -112,14 +112,15 @@ def loss_moments(
     count = trigger_cycles
     steps = np.arange(count)
     mean = np.sum(inside * first, axis=1) * np.mean(walk[:, None] ** steps, axis=1)
-    power = count * _own(chance, weight, weight.conj(), _pair(processes, g, u, -1.0, 0)).real
+    power = count * _mean_product(chance, weight, weight.conj(),
+                                  _pair(processes, g, u, -1.0, 0)).real
     starts = np.cumsum(double[:, None] ** steps, axis=1)  # of n cycles at n - 1
-    square = starts[:, -1] * _own(chance, weight, weight, _pair(processes, g, u, 1.0, 0))
+    square = starts[:, -1] * _mean_product(chance, weight, weight, _pair(processes, g, u, 1.0, 0))
     lags = steps[1:]
-    left = np.sum(back * first, axis=1) * np.sum(inside * first, axis=1).conj()
-    right = np.sum(forward * first, axis=1) * np.sum(inside * first, axis=1)
-    apart = np.repeat(left[:, None], lags.size, axis=1)
-    apart_square = np.repeat(right[:, None], lags.size, axis=1)
+    conjugate = np.sum(back * first, axis=1) * np.sum(inside * first, axis=1).conj()
+    direct = np.sum(forward * first, axis=1) * np.sum(inside * first, axis=1)
+    apart = np.repeat(conjugate[:, None], lags.size, axis=1)
+    apart_square = np.repeat(direct[:, None], lags.size, axis=1)
     for lag in range(1, min(correlation_length(processes) + 1, count)):
         apart[:, lag - 1] = np.einsum('ou,ouv,ov->o', back, _pair(processes, g, u, -1.0, lag),
                                       inside.conj())
@@ -150,6 +151,6 @@ def _pair(processes: Sequence[AngleErrorProcess], g: Array, u: Array, sign: floa
     return np.asarray(value * np.ones((g.size, u.size, u.size)))
 
 
-def _own(chance: Array, early: Array, late: Array, pair: Array) -> Array:
-    """Return the mean over losses of a cycle's own product."""
+def _mean_product(chance: Array, early: Array, late: Array, pair: Array) -> Array:
+    """Return the mean over losses of the product of two phasors of one cycle."""
     return np.asarray(np.einsum('l,olu,ouv,olv->o', chance, early, pair, late, optimize=True))

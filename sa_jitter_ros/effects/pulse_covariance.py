@@ -1,5 +1,5 @@
 """
-Fits of the autocovariance of pulse errors, and tests of what such a fit leaves.
+Fits of the autocovariance of pulse errors, and tests of the errors that remain after a fit.
 
 Errors have mean 0 in every acquisition, so they are compared through contrasts that a common delay
 does not change. The likelihood is normal; for the uniform declared jitter that errs on the safe
@@ -33,7 +33,7 @@ def white(lags: Array, _: float) -> Array:
 
 
 def autoregressive(lags: Array, correlation: float) -> Array:
-    """Return the autocorrelation of errors that remember each other."""
+    """Return the autocorrelation of first-order autoregressive errors."""
     return np.asarray(correlation ** np.abs(lags))
 
 

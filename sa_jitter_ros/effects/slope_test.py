@@ -1,10 +1,10 @@
 """
-Whose error is it: that of the pulses, or does the vibration move against them.
+Test whether recovered errors are pulse errors or a motion of the vibration relative to the pulses.
 
-What is recovered from the vibration does not know. But the measured pulse times are those of a
-shaft that turns smoothly, plus the errors of the pulses: they follow recovered errors that are the
-tach's and know nothing of a motion of the source. Compared at every frequency by how steady the
-shaft is there. What earlier rounds know of each pulse is taken out of both.
+The recovery from the vibration cannot distinguish the two. But the measured pulse times are those
+of a shaft that turns smoothly, plus the pulse errors: they contain recovered errors that are pulse
+errors, and do not contain a motion of the source. Each frequency counts by how steady the shaft is
+there. The pulse errors that earlier rounds explained are subtracted from both.
 """
 
 from dataclasses import dataclass
@@ -29,11 +29,11 @@ _DECISIVE = 4.0  # standard errors between the two answers
 @dataclass(frozen=True)
 class SlopeTest:
     """
-    Whose error is it: regression of the pulse times on the recovered errors.
+    Regression of the pulse times on the recovered errors.
 
-    `share` of what was not declared is motion of the vibration: 0 where the pulse times follow all
-    of it, 1 where they know nothing of it. `p_value` is that of 0; `decided` says whether the
-    shaft is steady enough to tell the two apart.
+    `share` of the errors beyond the declared ones is motion of the vibration: 0 if the pulse times
+    contain all of them, 1 if they contain none. `p_value` is that of 0; `decided` says whether the
+    shaft is steady enough to distinguish 0 from 1, `tach_side` that it is nearer to 0.
     """
 
     share: float
@@ -71,18 +71,18 @@ def slope_test(evidence: Evidence) -> SlopeTest:
                   observed * of_vibration**2)
 
 
-def _share(left: Array, motion: Array, unsure: Array) -> SlopeTest:
+def _share(remainder: Array, motion: Array, unsure: Array) -> SlopeTest:
     """
-    Return which share of `motion` is in `left` (acquisition, frequency).
+    Return the share of `motion` in `remainder` (acquisition, frequency).
 
-    `unsure` (frequency,) is how unsure the motion is, in power: what chance takes for declared.
+    `unsure` (frequency,) is the uncertainty of the motion, as power.
     """
     share, information = 0.5, 0.0
     for _ in range(_ROUNDS):
-        steadiness = np.maximum(_smooth(np.mean(np.abs(left - share * motion) ** 2, axis=0)
+        steadiness = np.maximum(_smooth(np.mean(np.abs(remainder - share * motion) ** 2, axis=0)
                                         ) + share**2 * unsure, 1e-300)
         information = float(np.sum(np.abs(motion) ** 2 / steadiness))
-        share = float(np.sum((motion.conj() * left).real / steadiness)) / max(
+        share = float(np.sum((motion.conj() * remainder).real / steadiness)) / max(
             information, _NOTHING)
     error = float(np.sqrt(0.5 * _REPEATS / max(information, _NOTHING)))
     decided = 1.0 > _DECISIVE * error
@@ -97,7 +97,7 @@ def _smooth(power: Array) -> Array:
 
 
 def require_tach_side(evidence: Evidence) -> str:
-    """Say that the vibration side moves, where it does; '' where the pulses are wrong."""
+    """Return the evidence that the vibration moves, '' if the errors are those of the pulses."""
     if evidence.against_reference:
         return ''
     test = slope_test(evidence.of_all)

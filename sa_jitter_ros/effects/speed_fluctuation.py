@@ -49,7 +49,7 @@ class SpeedFluctuation(Effect):
                       'trigger speeds', 'the shaft would stop; lower it, or use more '
                       'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
-        covariance = _left_by(model.weights, variance)
+        covariance = _error_covariance(model.weights, variance)
 
         def faded(u: Array, v: Array, lag: int) -> Array:
             return covariance(u, v, lag) * fading(lag + v - u, model.trigger_cycles)
@@ -101,12 +101,13 @@ class SpeedFluctuation(Effect):
                        p_value, text, contradiction)
 
 
-def _left_by(weights: PulseWeights, variance: float) -> Covariance:
+def _error_covariance(weights: PulseWeights, variance: float) -> Covariance:
     """
-    Return that of the angle which a law leaves of accelerations of `variance`, by its spectrum.
+    Return the covariance of the error that the angle law makes of accelerations of `variance`.
 
-    Of a motion of f cycles a trigger cycle a law follows what its weights make of it at the
-    pulses; the acceleration is (2 pi f)^2 times the motion.
+    It is an integral over the spectrum. Of a motion of f cycles a trigger cycle the law follows
+    what its weights make of the values at the pulses; the acceleration is (2 pi f)^2 times the
+    motion.
     """
     low, high = ACCELERATION_BAND
     turn = 2j * np.pi * (low + (high - low) * _FREQUENCIES)

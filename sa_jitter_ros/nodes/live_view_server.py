@@ -41,7 +41,7 @@ def is_loopback(host: str) -> bool:
         return host == 'localhost'
 
 
-def is_own_name(header: str) -> bool:
+def is_name_of_this_machine(header: str) -> bool:
     """
     Return whether a Host header names this machine, with any port (a tunnel changes it).
 
@@ -156,7 +156,7 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         """Answer with a file of the page or with the snapshot."""
         path, _, query = self.path.partition('?')
-        if not is_own_name(self.headers.get('Host', '')):
+        if not is_name_of_this_machine(self.headers.get('Host', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'open this page by its address or as localhost')
         elif path == '/snapshot.json':
             since = parse_qs(query).get('since', ['0'])[0]

@@ -145,22 +145,22 @@ class AmplitudeDistribution:
         return np.asarray(ndtr(_straight(t, self.skew[:, None, None])))
 
 
-def curved_distribution(moments: AverageMoments, plain: Array, mixed: Array
+def curved_distribution(moments: AverageMoments, unmixed: Array, mixed: Array
                         ) -> AmplitudeDistribution:
     """
     Return the distribution of |X| for an average with third cumulants, in the frame of its phase.
 
-    `plain` is k(X, X, X), `mixed` is k(X, X, conj X).
+    `unmixed` is k(X, X, X), `mixed` is k(X, X, conj X).
     """
     size = np.abs(moments.mean)
     turn = np.where(size > 0.0, moments.mean / np.where(size > 0.0, size, 1.0), 1.0).conj()
     pseudo = moments.pseudo_variance * turn**2
     along = np.maximum(0.5 * (moments.variance + pseudo.real), 0.0)
     across = np.maximum(0.5 * (moments.variance - pseudo.real), 0.0)
-    plain = plain * turn**3
+    unmixed = unmixed * turn**3
     mixed = mixed * turn
-    along_cubed = 0.25 * (3.0 * mixed.real + plain.real)
-    along_across_squared = 0.25 * (mixed.real - plain.real)
+    along_cubed = 0.25 * (3.0 * mixed.real + unmixed.real)
+    along_across_squared = 0.25 * (mixed.real - unmixed.real)
     slope = _ratio(0.5 * pseudo.imag, across)
     bend = _ratio(along_across_squared, 2.0 * across**2)
     free = np.maximum(along - slope**2 * across, 0.0)

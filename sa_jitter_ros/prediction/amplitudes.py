@@ -51,14 +51,14 @@ class Amplitudes:
     Complex amplitudes of unit components with the gain of the influences, without noise.
 
     `moments` (order,) are those over all scenarios, `each` (scenario, order) those in each, with
-    the third cumulants `plain` k(X, X, X) and `mixed` k(X, X, conj X). Where they are too few
+    the third cumulants `unmixed` k(X, X, X) and `mixed` k(X, X, conj X). Where they are too few
     numbers for the distribution, `draws` are equally likely values of X, (order, draw) of all
     scenarios or (order, scenario, draw) of each, and `noise` (draw,) is circular of variance 1.
     """
 
     moments: AverageMoments
     each: AverageMoments
-    plain: Array
+    unmixed: Array
     mixed: Array
     draws: Array | None = field(default=None, repr=False)
     noise: Array | None = field(default=None, repr=False)
@@ -75,16 +75,16 @@ class Amplitudes:
         """
         rows = np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)
-        own = self.moments.of((rows,)).shifted(shift).with_noise(noise)
+        moments = self.moments.of((rows,)).shifted(shift).with_noise(noise)
         if self.draws is not None:
-            return self._sampled(self.draws[rows, :most], own, shift, noise)
+            return self._sampled(self.draws[rows, :most], moments, shift, noise)
         count = len(self.each.mean)
         curved = self._curved((slice(None), rows), shift, noise)
         if count == 1:
             return curved
         values = curved.spread(max(_FEWEST, _DRAWS // count)).reshape(count, rows.size, -1)
         return SampledDistribution(np.moveaxis(values, 1, 0).reshape(rows.size, -1),
-                                   own.mean_square)
+                                   moments.mean_square)
 
     def distribution_in(
         self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
@@ -107,7 +107,7 @@ class Amplitudes:
         moments = self.each.of(rows).shifted(shift).with_noise(noise)
         return curved_distribution(AverageMoments(
             moments.mean.ravel(), moments.variance.ravel(), moments.pseudo_variance.ravel()),
-            self.plain[rows].ravel(), self.mixed[rows].ravel())
+            self.unmixed[rows].ravel(), self.mixed[rows].ravel())
 
     def _sampled(self, draws: Array, moments: AverageMoments, shift: Array, noise: Array
                  ) -> SampledDistribution:
@@ -162,8 +162,8 @@ def unit_amplitudes(model: DeclaredModel, influences: Sequence[Influence] = ()) 
     spread = float(orders.max()) * frequency * math.sqrt(sum(item.variance for item in jitters))
     nodes = int(np.clip(16.0 + 16.0 * spread, 16 if alike else 32, 160))
     cycles = cycle_moments(orders, processes, nodes=nodes, lags=count)
-    plain, mixed = average_cumulants(orders, processes, count, cycles)
-    found = _of_scenarios(cycles.averaged(count).of(np.newaxis), plain, mixed, gain)
+    unmixed, mixed = average_cumulants(orders, processes, count, cycles)
+    found = _of_scenarios(cycles.averaged(count).of(np.newaxis), unmixed, mixed, gain)
     if few_cycles(cycles, count, alike, found.skew) and can_be_sampled(
             processes, count, orders.size):
         return _with_draws(found, model, processes, gain)
@@ -188,21 +188,21 @@ def known_amplitudes(model: DeclaredModel, processes: Sequence[AngleErrorProcess
     return found
 
 
-def few_cycles(cycles: CycleMoments, trigger_cycles: int, plain: bool, skew: Array) -> bool:
+def few_cycles(cycles: CycleMoments, trigger_cycles: int, independent: bool, skew: Array) -> bool:
     """
-    Tell whether an average holds too few cycles for a limit theorem, so that it is sampled.
+    Return whether an average holds too few cycles for a limit theorem, so that it is sampled.
 
     Cycles that remember each other count as fewer: as the variance of one over that of the average
-    says. `plain` are independent errors alone, `skew` the skewness of the curved distribution.
+    says. `independent`: all errors are; `skew` is the skewness of the curved distribution.
     """
     average = cycles.averaged(trigger_cycles)
     power = np.abs(cycles.mean) ** 2
     if np.all(average.variance <= _NOTHING * power):
         return False
     lopsided = np.max(np.abs(skew)) > _LOPSIDED
-    if trigger_cycles <= (_FEW_LOPSIDED_CYCLES if plain and lopsided else _FEW_CYCLES):
+    if trigger_cycles <= (_FEW_LOPSIDED_CYCLES if independent and lopsided else _FEW_CYCLES):
         return True
-    if plain:
+    if independent:
         return False
     turn = np.exp(-2j * np.angle(cycles.mean))
     pairs = [(m.variance, np.real(m.pseudo_variance * turn))
@@ -225,7 +225,7 @@ def _of_orders(name: str, value: ArrayLike, model: DeclaredModel, least: float) 
     return given
 
 
-def _of_scenarios(each: AverageMoments, plain: Array, mixed: Array, gain: Array) -> Amplitudes:
+def _of_scenarios(each: AverageMoments, unmixed: Array, mixed: Array, gain: Array) -> Amplitudes:
     """Return amplitudes of scenarios of the same probability, without draws."""
     mean = each.mean.mean(axis=0)
     spread = each.mean - mean
@@ -233,7 +233,7 @@ def _of_scenarios(each: AverageMoments, plain: Array, mixed: Array, gain: Array)
                              np.mean(each.pseudo_variance + spread**2, axis=0))
     # A scenario turns the cycles' phasors apart and shortens their sum, skewness included.
     return Amplitudes(moments.scaled(gain), each.scaled(gain),
-                      np.broadcast_to(plain * gain**3, each.mean.shape),
+                      np.broadcast_to(unmixed * gain**3, each.mean.shape),
                       np.broadcast_to(mixed * gain * np.abs(gain) ** 2, each.mean.shape))
 
 
@@ -243,9 +243,10 @@ def _with_errors(model: DeclaredModel, processes: Sequence[AngleErrorProcess], e
     count, orders = model.trigger_cycles, np.asarray(model.orders)
     each = scenario_moments(model, processes, errors)
     cycles = cycle_moments(orders, processes, nodes=_SCENARIO_NODES, lags=count)
-    plain, mixed = average_cumulants(orders, processes, count, cycles)
-    left = each.mean / np.where(np.abs(cycles.mean) > 0.0, cycles.mean, 1.0)
-    return _of_scenarios(each, plain * left**3, mixed * left * np.abs(left) ** 2, gain), cycles
+    unmixed, mixed = average_cumulants(orders, processes, count, cycles)
+    share = each.mean / np.where(np.abs(cycles.mean) > 0.0, cycles.mean, 1.0)
+    found = _of_scenarios(each, unmixed * share**3, mixed * share * np.abs(share) ** 2, gain)
+    return found, cycles
 
 
 def _pooled(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
@@ -272,7 +273,7 @@ def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[Ang
 
 def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: Array,
            influences: Sequence[tuple[Influence, Array]]) -> Amplitudes:
-    """Return amplitudes of averages that are drawn, each with a scenario of its own."""
+    """Return amplitudes of averages that are drawn, each with its scenario."""
     if not can_be_sampled(processes, model.trigger_cycles, len(model.orders)):
         names = ', '.join(item.name for item, _ in influences)
         raise ModelError(

@@ -51,7 +51,7 @@ def third_cumulants(
     axes = (u[:, None, None], u[:, None], u)
     box = g[:, None, None, None]
     m = cycles.mean
-    plain = np.zeros(g.size, complex)
+    unmixed = np.zeros(g.size, complex)
     mixed = np.zeros(g.size, complex)
 
     def pair(i: int, j: int) -> Array:
@@ -72,14 +72,14 @@ def third_cumulants(
             arrangements = set(permutations(triple))
             raw = joint_characteristic(processes, [box] * 3, axes, triple) @ w @ w @ w
             lower = pair(0, p) + pair(0, p + q) + pair(p, p + q)
-            plain += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
+            unmixed += places * len(arrangements) * (raw - m * lower + 2.0 * m**3)
             for (a, b, c), count in Counter(
                     (*sorted(order[:2]), order[2]) for order in arrangements).items():
                 raw = joint_characteristic(processes, [box, box, -box], axes, (a, b, c))
                 lower = m * (pair_conj(a, c) + pair_conj(b, c)) + m.conj() * pair(a, b)
                 mixed += places * count * (
                     raw @ w @ w @ w - lower + 2.0 * m * np.abs(m) ** 2)
-    return plain, mixed
+    return unmixed, mixed
 
 
 def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Array, Array]:
@@ -111,11 +111,11 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Arr
     p, j = p[:, np.abs(distance)], j[:, np.abs(distance)]
     j = np.where(distance > 0, j.conj(), j)
     p_row, j_row, j_column = p.sum(axis=2), j.sum(axis=2), j.sum(axis=1)
-    plain = 3.0 * np.sum(p_row**2, axis=1) + np.sum(p * (p @ p), axis=(1, 2))
+    unmixed = 3.0 * np.sum(p_row**2, axis=1) + np.sum(p * (p @ p), axis=(1, 2))
     mixed = (2.0 * np.sum(p_row * j_row, axis=1) + np.sum(j_column**2, axis=1)
              + np.sum(p * (j @ j.transpose(0, 2, 1)), axis=(1, 2)))
     factor = np.where(clear, m, 0.0) / count**3
-    return plain * factor * m**2, mixed * factor * size**2
+    return unmixed * factor * m**2, mixed * factor * size**2
 
 
 def average_cumulants(
@@ -137,20 +137,22 @@ def average_cumulants(
     gains = [process for process in processes if hasattr(process, 'draw_gain')]
     spurious = (0.0, 0.0)
     if gains:
-        own = superposed_cumulants(cycle_moments(orders, gains, nodes=_PAIR_NODES), trigger_cycles)
-        spurious = own[0] * cycles.mean**3, own[1] * cycles.mean * np.abs(cycles.mean) ** 2
+        of_gains = superposed_cumulants(
+            cycle_moments(orders, gains, nodes=_PAIR_NODES), trigger_cycles)
+        spurious = (of_gains[0] * cycles.mean**3,
+                    of_gains[1] * cycles.mean * np.abs(cycles.mean) ** 2)
     short = [process for process in near if process.correlation_length <= _REACH]
     if not short:
         every = superposed_cumulants(cycles, trigger_cycles)
         return every[0] - spurious[0], every[1] - spurious[1]
     alone = cycle_moments(orders, short, nodes=_PAIR_NODES)
-    plain, mixed = _integrated(orders, short, trigger_cycles, alone)
+    unmixed, mixed = _integrated(orders, short, trigger_cycles, alone)
     gain = cycles.mean / np.where(np.abs(alone.mean) > 0.0, alone.mean, 1.0)
     if len(short) == len(near):
-        return plain * gain**3, mixed * gain * np.abs(gain) ** 2
+        return unmixed * gain**3, mixed * gain * np.abs(gain) ** 2
     every = superposed_cumulants(cycles, trigger_cycles)
     close = superposed_cumulants(alone, trigger_cycles)
-    return (every[0] - spurious[0] + (plain - close[0]) * gain**3,
+    return (every[0] - spurious[0] + (unmixed - close[0]) * gain**3,
             every[1] - spurious[1] + (mixed - close[1]) * gain * np.abs(gain) ** 2)
 
 

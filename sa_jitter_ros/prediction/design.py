@@ -144,21 +144,21 @@ def design(
         model = replace(model, keyphasor_rate=rate)
     if trigger_cycles is None:
         model = replace(model, trigger_cycles=required_trigger_cycles(model, maximum_variation))
-    left = None
+    interference = None
     if interfering.size:
         count = model.trigger_cycles
         more = min(max(count, _FEWEST_MORE), _MOST_MORE)
-        left = leakage(
+        interference = leakage(
             interfering, model.orders, cycle_length=model.cycle_length,
             minimum=count if trigger_cycles is None else max(count - more, 1),
             maximum=count + more, trigger_cycles=trigger_cycles)
-        model = replace(model, trigger_cycles=left.trigger_cycles)
+        model = replace(model, trigger_cycles=interference.trigger_cycles)
     detection = None
     if change is not None and false_alarm_rate is not None:
         detection = detection_probability(model, change, false_alarm_rate)[:, 0]
     loss, variation = loss_and_variation(model)
     return Design(model.keyphasor_rate, model.trigger_cycles, np.asarray(model.orders), loss,
-                  variation, left, detection, model)
+                  variation, interference, detection, model)
 
 
 def loss_and_variation(model: DeclaredModel) -> tuple[Array, Array]:

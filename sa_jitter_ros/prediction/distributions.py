@@ -208,7 +208,7 @@ class Empirical:
 
 
 def is_number(value: object) -> bool:
-    """Tell whether a value is a real number, and neither text nor truth."""
+    """Return whether a value is a real number, neither a text nor true or false."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 

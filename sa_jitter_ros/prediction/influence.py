@@ -65,7 +65,7 @@ class Influence(Protocol):
 
     @classmethod
     def unmodelled(cls, model: DeclaredModel) -> str:
-        """Say why there is no forward model with this declared model; '' where there is one."""
+        """Return why there is no forward model with this declared model, '' if there is one."""
         return ''
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
@@ -107,7 +107,7 @@ class Influence(Protocol):
         return 0.0
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
-        """Tell whether this takes the place of the declared jitter."""
+        """Return whether this replaces the declared jitter."""
         return False
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:

@@ -129,11 +129,11 @@ def cycle_moments(
     far = (*rule, joint_characteristic(processes, [g[:, None]], [rule[0]], [0]) @ rule[1])
     length = correlation_length(processes)
     for lag in range((length if lags is None else min(lags, length)) + 1):
-        u, w, own = fine if lag <= _NEAR else far
+        u, w, level = fine if lag <= _NEAR else far
         points = ([u[:, None], u], [0, lag])
         variance.append(joint_characteristic(processes, [plane, -plane], *points) @ w @ w
-                        - np.abs(own) ** 2)
-        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - own**2)
+                        - np.abs(level) ** 2)
+        pseudo.append(joint_characteristic(processes, [plane, plane], *points) @ w @ w - level**2)
     return CycleMoments(mean, np.array(variance), np.array(pseudo))
 
 

@@ -81,7 +81,7 @@ class SampledDistribution:
 def can_be_sampled(
     processes: Sequence[AngleErrorProcess], trigger_cycles: int, orders: int,
 ) -> bool:
-    """Tell whether averages of all processes can be drawn, and in about a second."""
+    """Return whether averages of all processes can be drawn, and in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
     points = trigger_cycles * (1 if pulsed else _LINEAR_RULE[0].size)
     drawn = _MOST_POINTS if any(hasattr(item, 'draw_angle') or hasattr(item, 'draw_gain')

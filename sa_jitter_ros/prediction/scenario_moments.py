@@ -46,15 +46,15 @@ def scenario_moments(
     for row in range(0, len(cycles), rows):
         part = slice(row, row + rows)
         for begin in range(0, count, length):
-            own = min(length, count - begin)
-            held = min(own + max(reach - 1, 0), count - begin)
+            size = min(length, count - begin)
+            held = min(size + max(reach - 1, 0), count - begin)
             pulses = cycles[part, begin:begin + held + model.weights.pulses - 1]
             path = model.weights.path(pulses, u, held)
             for i, order in enumerate(g):
                 phasor = _phasors(model, order, pulses, path) * w
-                mean[part, i] += (phasor[:, :own] @ first[i]).sum(axis=1) / count
+                mean[part, i] += (phasor[:, :size] @ first[i]).sum(axis=1) / count
                 for lag, pairs in enumerate(joint):
-                    here = min(own, held - lag)
+                    here = min(size, held - lag)
                     scale = (1.0 if lag == 0 else 2.0) / count**2
                     early = phasor[:, :here].transpose(0, 2, 1)
                     late = phasor[:, lag:lag + here]
