@@ -21,6 +21,7 @@ from sa_jitter_ros.errors import ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import Trace, trace
 from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.report.report import report, summary
 
@@ -185,12 +186,22 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                     recording, model,
                     sources=observations[0].sources.tolist() if observations else ()))
             except SaJitterError as error:
-                raise type(error)(f'{name}: {error}') from error
+                raise type(error)(f'{name}: {_mistake(recording) or error}') from error
             show(f'{len(observations[-1].acquisitions)} acquisitions of {model.trigger_cycles} '
                  'trigger cycles')
         traces[shaft] = trace(observations, opened, declared=declaration.effects,
                               progress=progress)
     return Loop(traces, names)
+
+
+def _mistake(recording: Recording) -> str:
+    """Return what is probably wrong with the pulse times of a recording, '' for nothing."""
+    times = recording.pulse_times
+    if times is None:
+        times = recording.reference_pulse_times
+    start = recording.start_time
+    return '' if times is None else likely_mistake(
+        times, start, start + recording.duration, recording.sample_rate)
 
 
 def _for_several(recording: Recording, models: Mapping[str, DeclaredModel]) -> Recording:

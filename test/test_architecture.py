@@ -33,7 +33,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib', 'prediction',
         'pulses', 'recordings'},
     'loop': {
-        'declaration', 'effects', 'errors', 'inference', 'prediction', 'recordings', 'report'},
+        'declaration', 'effects', 'errors', 'inference', 'prediction', 'pulses', 'recordings',
+        'report'},
 }
 ROOMS = {
     **CORE,

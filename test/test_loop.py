@@ -126,6 +126,8 @@ def test_unusable_input_is_named(recording, tmp_path):
         close_loop(recording, None)
     with pytest.raises(ModelError, match='recordings is 3: give a path or a Recording'):
         close_loop(3, KEYWORDS)
+    with pytest.raises(ModelError, match='the pulse times look like milliseconds'):
+        close_loop(replace(recording, pulse_times=1e3 * recording.pulse_times), KEYWORDS)
     with pytest.raises(RecordingError, match='no such file'):
         close_loop(tmp_path / 'none.npz', KEYWORDS)
 

@@ -18,6 +18,7 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import listed, number
+from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.pulses.validation import MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -27,7 +28,6 @@ AngleLawName = Literal['linear', 'quadratic', 'spline']
 Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
 
 _PIECE = 1 << 18  # samples of a channel that are handed on at once, so that memory stays small
-_MUCH = 10.0  # pulses that span so many times the vibration are in another unit
 _ALL_CYCLES = 1 << 60  # more trigger cycles than a stream has
 _SHAFT = 'shaft'
 
@@ -230,7 +230,7 @@ def average(
     found = averager.update(samples, pulses) + averager.flush()
     discarded = _discarded(averager)
     start, end = float(start_time), float(start_time + samples.shape[-1] / sample_rate)
-    likely = _likely_mistake(pulses, start, end, float(sample_rate))
+    likely = likely_mistake(pulses, start, end, float(sample_rate))
     if not found:
         counts = averager.counts
         wanted = '' if trigger_cycles is None else f' of the {trigger_cycles} of an average'
@@ -244,33 +244,6 @@ def average(
     if beyond:
         warnings.warn(beyond, DataWarning, stacklevel=2)
     return found
-
-
-def _likely_mistake(pulses: NDArray[np.generic], start: float, end: float, rate: float) -> str:
-    """Return what is probably wrong with pulse times that do not fit the vibration, else ''."""
-    times = pulses[np.isfinite(pulses)].astype(np.float64)
-    if times.size < 2 or end <= start:
-        return ''
-    backwards = int(np.count_nonzero(np.diff(times) < 0.0))
-    if 2 * backwards >= times.size:
-        return (f'{backwards} of {times.size} pulse times are earlier than the one before: give '
-                'them in order of time, numpy.sort(pulse_times)')
-    duration, span = end - start, float(np.ptp(times))
-    spans = f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s'
-    if span > _MUCH * duration:
-        units = {'sample indices': rate, 'milliseconds': 1e3, 'microseconds': 1e6}
-        unit = min(units, key=lambda name: abs(math.log(span / (units[name] * duration))))
-        if 0.5 < span / (units[unit] * duration) < 2.0:
-            return (f'{spans}: the pulse times look like {unit}; divide them by '
-                    f'{units[unit]:g} to have seconds')
-        return f'{spans}: give pulse times in s, and sample_rate in Hz'
-    if span * _MUCH**2 < duration:
-        return f'{spans}: give pulse times in s, and sample_rate in Hz'
-    if times.max() < start or times.min() > end:
-        return (f'the pulses come from {times.min():.6g} s to {times.max():.6g} s, when there is '
-                'no vibration: set start_time to the time of the first sample on the clock of the '
-                'pulses')
-    return ''
 
 
 def _beyond_nyquist(found: Sequence[Average], ratio: float, rate: float) -> str:
