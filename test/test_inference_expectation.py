@@ -133,3 +133,39 @@ def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, o
             distance = stats.kstest(noisy, lambda x, a=a, line=line: found.mean_cdf(
                 [a], line, x)).statistic
             assert distance < bias + 1.95 / np.sqrt(256 if wander else draws)
+
+
+@pytest.mark.parametrize('correlated', [False, True])
+def test_orders_beside_scatter_by_jitter_too(correlated, rng):
+    """A short trigger cycle does not keep them apart; their phases are their own."""
+    sources, draws, cycles = (19.0, 18.3, 20.0), 4000, 16
+    model = replace(MODEL, ratio=0.4, keyphasor_rate=2000.0, orders=(19.0,), noise_std=0.0,
+                    trigger_cycles=cycles)
+    item = observed(model).acquisitions[0]
+    amplitudes = np.tile(np.array([[[1.0, 0.6, 0.5j]]]), (2, 1, 1))
+    observation = replace(observed(model), orders=np.array([19.0]), sources=np.array(sources),
+                          acquisitions=(replace(item, raw_cycles=amplitudes, cycles=amplitudes),))
+    effects = []
+    errors = model.distribution.draw(rng, (draws, cycles + 1))
+    if correlated:
+        effects.append(make_effect('correlated_jitter', std=1.5e-4, correlation=0.5))
+        steps = rng.standard_normal((draws, cycles + 1)) * np.sqrt(0.75)
+        steps[:, 0] /= np.sqrt(0.75)
+        for k in range(1, cycles + 1):
+            steps[:, k] += 0.5 * steps[:, k - 1]
+        errors = errors + 1.5e-4 * steps
+    found = expect(observation, Lines(np.zeros(1, int), np.zeros(1, int)), np.ones(1), effects,
+                   [[Pulses(np.full(cycles + 1, np.nan))]], np.zeros(1, int), [0])
+    errors = errors * model.fundamental_frequency
+    powers = []
+    for phase in rng.uniform(0.0, 2.0 * np.pi, (12, 2)):
+        beside = 1j * np.array([0.0, *phase])
+        signal = AveragedSignal(cycles, model.cycle_length, 19.0, sources,
+                                tuple(np.array([1.0, 0.6, 0.5]) * np.exp(beside)))
+        powers.append(np.var(np.abs(signal.whole_trigger_cycles(errors))))
+    alone = AveragedSignal(cycles, model.cycle_length, 19.0)
+    least = np.var(np.abs(alone.whole_trigger_cycles(errors)))
+    variance = found.attenuation_variance[0, 0] - RESOLUTION**2
+    assert variance > 1.5 * least
+    assert variance == pytest.approx(np.mean(powers), rel=4.0 * np.std(powers) / np.mean(powers)
+                                     / np.sqrt(12.0))

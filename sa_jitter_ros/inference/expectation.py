@@ -26,7 +26,7 @@ from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import (
     Influence, known_errors, mean_period, Pulses, random_processes)
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.prediction.moments import cycle_moments
+from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
 
 Array = NDArray[Any]
@@ -42,6 +42,7 @@ _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
 # Speeds closer than this are the same.
 _SPEED_STEP = 1e-3
 _SHARPEST = 2.0
+_NEAR = 3.0  # lines of a trigger cycle: sources further away hardly leak by random errors
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,9 @@ class _Shown:
     What averages show of unit components, one entry per row: a line of an acquisition.
 
     `index` (row,) are places among all lines of all acquisitions, `order` indices of orders;
-    `shift` is added to the component and `noise`, E|n|^2, to the sum. `scenario` (row,) is the
-    acquisition's own where its pulses are known, None where they are not.
+    `shift` is the mean of what leaks in and `scatter` its variance; `noise`, E|n|^2 in the unit of
+    the vibration, is added to the sum. `scenario` (row,) is the acquisition's own where its pulses
+    are known, None where they are not.
     """
 
     amplitudes: Amplitudes
@@ -76,11 +78,13 @@ class _Shown:
     index: NDArray[np.intp]
     order: NDArray[np.intp]
     shift: Array
+    scatter: Array
     noise: Array
 
     def distribution(self, rows: Array, noise: Array, most: int) -> Distribution:
-        """Return the distribution of some rows with as much noise."""
+        """Return the distribution of some rows with as much noise beside what leaks in."""
         order, shift = self.order[rows], self.shift[rows]
+        noise = noise + self.scatter[rows]
         if self.scenario is None:
             return self.amplitudes.distribution(order, shift=shift, noise=noise, most=most)
         return self.amplitudes.distribution_in(self.scenario[rows], order, shift=shift,
@@ -224,11 +228,11 @@ def _together(rows: Sequence[Sequence[_Shown]]) -> tuple[_Shown, ...]:
     found = []
     for items in alike.values():
         own = [item.scenario for item in items if item.scenario is not None]
-        index, order, shift, noise = (
+        index, order, shift, scatter, noise = (
             np.concatenate([getattr(item, name) for item in items])
-            for name in ('index', 'order', 'shift', 'noise'))
+            for name in ('index', 'order', 'shift', 'scatter', 'noise'))
         found.append(_Shown(items[0].amplitudes, np.concatenate(own) if own else None, index,
-                            order, shift, noise))
+                            order, shift, scatter, noise))
     return tuple(found)
 
 
@@ -289,6 +293,11 @@ class _Setting:
             leakage = leakage * np.resize(_sharpening(self.observation.sources, doubt),
                                           leakage.shape[2])
         return [_Source(amplitudes, i, *row) for i, row in enumerate(zip(leakage, shift))]
+
+    @cached_property
+    def scatter(self) -> Array:
+        """The variance (order, source) of what leaks from each unit source into each order."""
+        return _scatter(self.observation, self.processes)
 
     @cached_property
     def _of_unknown_pulses(self) -> _Source:
@@ -365,6 +374,37 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     return table
 
 
+def _scatter(observation: Observation, processes: Sequence[AngleErrorProcess]) -> Array:
+    """
+    Return the variance (order, source) of what random errors leak from a unit source.
+
+    Sources leak with phases of their own, so that their variances add. The order itself, and what
+    is so many lines of the trigger cycle away that hardly anything leaks, has none.
+    """
+    model, sources = observation.model, observation.sources
+    r, count = model.cycle_length, model.trigger_cycles
+    if not kept_apart(r, sources):
+        sources = np.concatenate((sources, -sources))
+    turns = r * (sources - observation.orders[:, None])
+    found = np.zeros(turns.shape)
+    u, w = _nodes(_NODES)
+    lags = min(correlation_length(processes) + 1, count)
+    for s, source in enumerate(sources):
+        near = np.flatnonzero((np.abs(turns[:, s]) < _NEAR) & (observation.orders != source))
+        if not near.size:
+            continue
+        first = joint_characteristic(processes, [np.array([source])], [u], [0])
+        wave = np.exp(2j * np.pi * np.outer(turns[near, s], u)) * w  # (order, u)
+        for lag in range(lags):
+            joint = joint_characteristic(processes, [np.array([[source]]), np.array([[-source]])],
+                                         [u[:, None], u], [0, lag])
+            joint = joint - np.multiply.outer(first, first.conj())
+            both = np.einsum('ou,uv,ov->o', wave, joint, wave.conj())
+            both = both * np.exp(-2j * np.pi * turns[near, s] * lag)
+            found[near, s] += (1.0 if lag == 0 else 2.0) * (count - lag) / count**2 * both.real
+    return np.maximum(found, 0.0)
+
+
 def _of_lines(item: Acquisition, lines: Lines, source: _Source, channels: Array,
               setting: _Setting) -> _Shown:
     """Return what an acquisition shows on the lines of some `channels` (channel,), a mask."""
@@ -377,6 +417,11 @@ def _of_lines(item: Acquisition, lines: Lines, source: _Source, channels: Array,
     extra = np.where(np.isfinite(extra), extra, 0.0)
     here = np.flatnonzero(channels[lines.channel])
     order = lines.order[here]
-    shift = source.shift[order] + setting.gain[order] * extra[lines.channel[here], order]
+    channel = lines.channel[here]
+    shift = source.shift[order] + setting.gain[order] * extra[channel, order]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        share = np.abs(amplitude[channel]) / np.abs(amplitude[channel, order])[:, None]
+    share[~np.isfinite(share)] = 0.0
+    scatter = np.sum(share**2 * setting.scatter[order], axis=1)
     scenario = None if source.scenario is None else np.full(here.size, source.scenario)
-    return _Shown(source.amplitudes, scenario, here, order, shift, setting.noise[order])
+    return _Shown(source.amplitudes, scenario, here, order, shift, scatter, setting.noise[order])
