@@ -1,0 +1,570 @@
+"""
+The record fit: pulse errors and all lines of a whole recording in one least-squares problem.
+
+The vibration is read at even steps of the angle that the pulses tell. Every trigger cycle then
+differs from a sum of lines by the derivative of that sum times what the angle is wrong by:
+
+* the errors of its two pulses, times hat functions;
+* bends of the speed inside the cycle, times u (1 - u) and u (1 - u) (2 u - 1);
+
+and by a gain that all lines share. These states of the cycles have a banded normal matrix; the
+amplitudes of the lines border it (Schur complement). Gauss-Newton steps read the vibration again
+at the corrected angle, so that nothing is linearised at the end. The sizes of the states are
+estimated with them (expectation-maximisation).
+
+Undeclared orders of other shafts and sidebands leak into trigger cycles that are too short to keep
+them apart, and would be taken for pulse errors. So the fit looks for them in the spectrum of what
+it leaves, over angle (orders) and over time (tones): the sharper peak decides which it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.pulses.resampling import interpolate
+from scipy.fft import next_fast_len
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.stats import gamma
+
+Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+
+# The band that is read ends so far above the highest declared order: by orders, and by lines of a
+# trigger cycle. What lies further away does not leak into a cycle.
+_BEYOND, _BEYOND_LINES = 6.0, 3.0
+_EDGE = 1.15  # of the band, where the low pass ends
+_POINTS, _SAMPLES = 2 * _EDGE, 3.7  # in a period of the band's end: of the angle, and of time
+_FEWEST_POINTS = 8
+# A first guess of the states: of bends in parts of the declared jitter, of gains.
+_BEND, _GAIN = 0.1, 0.03
+_FIXED = 1e-4  # of the first guess, while the lines are still looked for
+_LEAST_BEND, _LEAST_GAIN = 0.003, 1e-3
+_LEAST_JITTER, _MOST_JITTER = 0.1, 30.0  # of the declared one
+# Pulses that were not measured are known this much worse than the others.
+_NOT_MEASURED = 100.0
+# Largest change of the pulse errors in a step, in periods of the highest declared order.
+_STEP = 0.25
+_ROUNDS, _MOST_LINES, _A_ROUND = 14, 60, 8
+_EARLY_ROUNDS, _EARLY_LINES = 7, 30
+_LAST_STEPS, _CONVERGED = 6, 1e-3
+# A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
+# it must not be far below the strongest, which may leave images of itself.
+_FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
+_SHARPER = 1.3  # in power, over angle than over time or the reverse
+_APART = 1.5  # bins between lines
+_ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
+_TRIED = 10  # frequencies a bin
+_PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
+# Neighbourhoods of which the median is the floor: half an order, at least some bins; the skirt.
+_WIDE, _SKIRT = 20, 24
+_SLOPES, _SLOPE_STEP, _SLOPE_GAIN = 400, 0.3, 0.7
+_WEAK = 3.0  # the last fit expects pulse errors this much larger: they are hardly shrunk
+_SAMPLED = 60  # variances of which the median stands for all
+_RIDGE = 1e-9
+
+
+@dataclass(frozen=True)
+class RecordFit:
+    """
+    Pulse errors and lines of a stretch of a recording.
+
+    `errors` and `standard_errors` (pulse,) in s, measured minus true, their mean 0; `ripple`
+    (cycle,) is the factor of u (1 - u) in the error inside a cycle (s), `ripple_standard_error`
+    its standard error. `orders` (order,), the declared ones first, and `tones` (tone,) in Hz are
+    the lines; `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells
+    which orders certainly turn with the shaft: the speed varies enough to show it. `jitter_std`
+    (s) is the estimated size of the pulse errors.
+    """
+
+    errors: Array
+    standard_errors: Array
+    ripple: Array
+    ripple_standard_error: float
+    orders: Array
+    tones: Array
+    amplitudes: ComplexArray
+    turning: BoolArray
+    jitter_std: float
+
+
+def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
+               measured: BoolArray, cycle_length: float, orders: Sequence[float],
+               jitter_std: float, known: RecordFit | None = None) -> RecordFit:
+    """
+    Fit consecutive trigger cycles of a recording.
+
+    `samples` (sample, channel) begin at `start_time` (s); `times` (pulse,) are the trigger pulses,
+    of which some are `measured` (pulse,) and the others were put in evenly. `cycle_length` is r;
+    `jitter_std` (s) the declared size of the pulse errors. With `known` the lines are those of an
+    earlier fit, and none is looked for.
+    """
+    top = max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)
+    period = float(np.diff(times).mean())
+    band, rate = _low_passed(samples, sample_rate, top * cycle_length / period)
+    states = _States(band, rate, start_time, times, measured, cycle_length, np.array(orders), top,
+                     jitter_std)
+    states.follow_trend()
+    if known is not None:
+        states.add(known.orders[len(orders):], known.tones)
+    states.fit_amplitudes()
+    _search(states, known is None)
+    for _ in range(_LAST_STEPS):
+        if states.step() < _CONVERGED * jitter_std:
+            break
+    return states.result()
+
+
+def _search(states: '_States', look: bool) -> None:
+    """Fit states and lines by turns until no line is found any more."""
+    for number in range(_ROUNDS):
+        for _ in range(3 if number == 0 else 2):
+            states.step()
+        orders, tones = states.new_lines() if look else ([], [])
+        done = not orders and not tones
+        if not states.all_free and (done or number >= _EARLY_ROUNDS
+                                    or states.lines_found > _EARLY_LINES):
+            states.free_all()
+            for _ in range(4):
+                states.step()
+            if look:
+                states.prune(_PRUNED_EARLY)
+                states.fit_amplitudes()
+            continue
+        if done or states.lines_found >= _MOST_LINES:
+            break
+        states.add(orders, tones)
+        states.fit_amplitudes()
+        states.refine()
+        states.fit_amplitudes()
+    if look:
+        states.refine()
+        states.fit_amplitudes()
+        states.step()
+        states.prune(_PRUNED)
+        states.fit_amplitudes()
+
+
+def _low_passed(samples: Array, rate: float, top: float) -> tuple[Array, float]:
+    """Return the samples up to 1.15 `top` (Hz) at a rate that the interpolator reads exactly."""
+    count = len(samples)
+    padded = next_fast_len(count + 200, real=True)
+    spectrum = np.fft.rfft(samples - samples.mean(axis=0), padded, axis=0)
+    spectrum[int(_EDGE * top / rate * padded):] = 0.0
+    size = min(round(padded * _SAMPLES * top / rate), padded)
+    size += size % 2
+    found = np.fft.irfft(spectrum[:size // 2 + 1], size, axis=0)
+    return found[:int(count * size / padded)] * (size / padded), rate * size / padded
+
+
+class _States:
+    """
+    The states of all cycles and the lines, and one step of their fit.
+
+    A cycle has `width` states: the error of its first pulse (s), its bends (s), its gain. Angles
+    are in fundamental cycles; lines are those in angle, then those in time.
+    """
+
+    def __init__(self, samples: Array, rate: float, start_time: float, times: Array,
+                 measured: BoolArray, cycle_length: float, orders: Array, top: float,
+                 jitter_std: float) -> None:
+        self.samples, self.sample_rate, self.start_time = samples, rate, start_time
+        self.times, self.measured, self.cycle_length = times, measured, cycle_length
+        self.whole = measured[:-1] & measured[1:]
+        self.frequency = cycle_length / float(np.diff(times).mean())
+        self.orders, self.declared = orders, orders.size
+        self.tones = np.zeros(0)
+        self.highest = top
+        self.jitter_std = jitter_std
+        points = max(_FEWEST_POINTS, int(np.ceil(_POINTS * top * cycle_length)))
+        self.u = u = (np.arange(points) + 0.5) / points
+        # of the states of a cycle, and of the error of its last pulse
+        self.shapes = np.stack([1.0 - u, u * (1.0 - u), u * (1.0 - u) * (2.0 * u - 1.0),
+                                np.ones(points), u])
+        self.width = len(self.shapes) - 1
+        self.states = np.zeros((times.size, self.width))
+        self.size = np.array([jitter_std, *[_FIXED * jitter_std] * (self.width - 2), _FIXED])
+        self.all_free = False
+        self.slow: Array = np.zeros(times.size)  # straight line of the errors, which is not jitter
+        self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
+        self._read()
+
+    @property
+    def lines_found(self) -> int:
+        """Return the number of undeclared lines."""
+        return self.amplitudes.shape[1] - self.declared
+
+    @property
+    def span(self) -> float:
+        """Return the fundamental cycles in the stretch."""
+        return self.cycle_length * (self.times.size - 1)
+
+    # --- the vibration at the present angle, and the lines in it ---
+
+    def _read(self) -> None:
+        corrected = self.times - self.states[:, 0]
+        period = np.diff(corrected)
+        self.slope = self.cycle_length / period
+        self.place = (corrected[:-1, None] + period[:, None] * self.u
+                      - self.states[:-1, 1:-1] @ self.shapes[1:-2])
+        position = np.clip((self.place - self.start_time) * self.sample_rate, 0.0,
+                           len(self.samples) - 1.0)
+        self.vibration = interpolate(self.samples, position.ravel()).reshape(*self.place.shape, -1)
+        self.vibration *= self.whole[:, None, None]
+
+    def _make_tables(self) -> None:
+        """Make the lines: of orders, a phase for each cycle times a wave that all cycles share."""
+        cycle = np.arange(self.times.size - 1)[:, None]
+        self.turn = np.exp(2j * np.pi * (self.cycle_length * cycle * self.orders % 1.0))
+        self.turn *= self.whole[:, None]
+        self.wave = np.exp(2j * np.pi * self.cycle_length * self.orders[:, None] * self.u)
+        self.in_time = np.exp(2j * np.pi * self.tones[:, None, None]
+                              * (self.place - self.start_time)) * self.whole[:, None]
+        straight = (self.turn.conj().T @ self.turn) * (self.wave.conj() @ self.wave.T)
+        mirrored = (self.turn.T @ self.turn) * (self.wave @ self.wave.T)
+        if self.tones.size:
+            both = [self._sums(tone.real) + 1j * self._sums(tone.imag) for tone in self.in_time]
+            plus = np.array([item.sum(axis=0) for item in both])  # (tone, line)
+            minus = np.array([(self._sums(tone.real).conj() + 1j * self._sums(tone.imag).conj()
+                               ).sum(axis=0) for tone in self.in_time])
+            n = self.orders.size
+            straight = np.block([[straight, minus[:, :n].T], [minus.conj()]])
+            mirrored = np.block([[mirrored, plus[:, :n].T], [plus]])
+        cross = 0.5 * (mirrored.imag + straight.imag)
+        self.normal = np.block([[0.5 * (straight + mirrored).real, -cross],
+                                [-cross.T, 0.5 * (straight - mirrored).real]])
+
+    def _signal(self, amplitudes: ComplexArray) -> Array:
+        """Return the sum (cycle, point) of the lines with amplitudes (line,)."""
+        n = self.orders.size
+        part = amplitudes[:n] * self.turn
+        total = part.real @ self.wave.real - part.imag @ self.wave.imag
+        for amplitude, tone in zip(amplitudes[n:], self.in_time):
+            total += amplitude.real * tone.real - amplitude.imag * tone.imag
+        return np.asarray(total)
+
+    def _sums(self, values: Array) -> ComplexArray:
+        """Return the sums (cycle, line) over the points of `values` (cycle, point) by lines."""
+        found = self.turn * (values @ self.wave.real.T + 1j * (values @ self.wave.imag.T))
+        if self.tones.size:
+            found = np.hstack([found, np.einsum('kp,tkp->kt', values, self.in_time)])
+        return np.asarray(found)
+
+    def _residual(self) -> Array:
+        gain = 1.0 + self.states[:-1, -1:]
+        return np.stack([self.vibration[:, :, c] - gain * self._signal(row)
+                         for c, row in enumerate(self.amplitudes)], axis=2)
+
+    def fit_amplitudes(self) -> None:
+        """Fit the amplitudes of all lines with the states as they are."""
+        self._make_tables()
+        gain = 1.0 + self.states[:-1, -1:]
+        right = np.stack([self._sums(row / gain).conj().sum(axis=0)
+                          for row in np.moveaxis(self.vibration, 2, 0)], axis=1)
+        ridge = _RIDGE * self.normal[0, 0] * np.eye(len(self.normal))
+        found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
+        n = len(right)
+        self.amplitudes = (found[:n] + 1j * found[n:]).T
+
+    # --- one step ---
+
+    def step(self, *, weak: float = 1.0, move: bool = True) -> float:
+        """Do a Gauss-Newton step; return the RMS change of the pulse errors (s)."""
+        self._make_tables()
+        residual = self._residual()
+        points = self.whole.sum() * self.u.size
+        self.weight = points / np.sum(residual**2, axis=(0, 1))
+        of_orders = np.arange(self.amplitudes.shape[1]) < self.orders.size
+        turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
+        rate = np.stack([self.slope[:, None] * self._signal(turns * row)
+                         for row in self.amplitudes], axis=2)
+        moving = np.stack([self._signal(of_orders * row) for row in self.amplitudes], axis=2)
+        solution = self._solve(residual, (rate, moving), weak)
+        change, amplitudes = solution
+        size = float(np.sqrt(np.mean(change[:, 0] ** 2)))
+        if move:
+            most = _STEP / (self.orders[:self.declared].max() * self.frequency)
+            part = min(1.0, most / max(size, 1e-300))
+            self.states = self.states + part * change
+            self.amplitudes = self.amplitudes + part * amplitudes
+            if weak == 1.0:
+                self._estimate_sizes()
+            self._read()
+        return size
+
+    def _solve(self, residual: Array, derivative: tuple[Array, Array], weak: float
+               ) -> tuple[Array, ComplexArray]:
+        """Return the changes of states (pulse, state) and amplitudes (channel, line)."""
+        pulses, width = self.states.shape
+        count, channels = width * pulses, residual.shape[2]
+        by = [*[0] * (width - 1), 1, 0]  # which derivative a state goes with
+        square = {(i, j): (derivative[i] * derivative[j]) @ self.weight
+                  for i, j in ((0, 0), (0, 1), (1, 1))}
+        right = [(item * residual) @ self.weight for item in derivative]
+        band, down = np.zeros((width + 1, count)), np.zeros(count)
+        first = width * np.arange(pulses - 1)
+        for i, shape in enumerate(self.shapes):
+            down[first + i] += right[by[i]] @ shape
+            for j in range(i + 1):
+                both = square[min(by[i], by[j]), max(by[i], by[j])]
+                band[width - (i - j), first + i] += both @ (shape * self.shapes[j])
+        size = self.size * np.append(weak, np.ones(width - 1))
+        precision = np.tile(size**-2.0, (pulses, 1))
+        precision[~self.measured, 0] /= _NOT_MEASURED**2
+        expected = self.states.copy()
+        expected[:, 0] -= self.slow
+        band[width] += precision.ravel()
+        down -= (precision * expected).ravel()
+        border, corner, below = self._border(residual, derivative, by)
+        scale = 1.0 / np.sqrt(band[width])  # seconds and gains together
+        for j in range(width + 1):
+            band[j, width - j:] *= scale[width - j:] * scale[:count - width + j]
+        border *= scale[:, None]
+        down *= scale
+        factor = (cholesky_banded(band), False)
+        inner = cho_solve_banded(factor, border)
+        schur = cho_factor(corner - border.T @ inner)
+        amplitudes = cho_solve(schur, below - inner.T @ down)
+        change = cho_solve_banded(factor, down - border @ amplitudes) * scale
+        self.solved = factor, inner, schur, scale
+        cos, sin = np.split(amplitudes.reshape(channels, -1), 2, axis=1)
+        return change.reshape(pulses, width), cos + 1j * sin
+
+    def _border(self, residual: Array, derivative: tuple[Array, Array], by: Sequence[int]
+                ) -> tuple[Array, Array, Array]:
+        """Return border, corner and right-hand side of the amplitudes (cos, sin by channel)."""
+        pulses, width = self.states.shape
+        channels, lines = self.amplitudes.shape
+        border = np.zeros((width * pulses, channels, 2 * lines))
+        corner = np.zeros((channels, 2 * lines, channels, 2 * lines))
+        below = np.zeros((channels, 2 * lines))
+        first = width * np.arange(pulses - 1)
+        for c, weight in enumerate(self.weight):
+            for i, shape in enumerate(self.shapes):
+                found = weight * self._sums(derivative[by[i]][:, :, c] * shape)
+                border[first + i, c, :lines] += found.real
+                border[first + i, c, lines:] -= found.imag
+            total = weight * self._sums(residual[:, :, c]).sum(axis=0)
+            below[c] = np.append(total.real, -total.imag)
+            corner[c, :, c] = weight * self.normal
+        flat = corner.reshape(below.size, -1)
+        flat[np.diag_indices(len(flat))] *= 1.0 + _RIDGE
+        return border.reshape(len(border), -1), flat, below.ravel()
+
+    def _variances(self, state: int, most: int = 0) -> Array:
+        """
+        Return posterior variances of a state, of `most` cycles or all.
+
+        Those of pulse errors are about their mean, which nothing tells.
+        """
+        factor, inner, schur, scale = self.solved
+        pulses, width = self.states.shape
+        chosen = np.arange(pulses)
+        if most:
+            chosen = np.unique(np.linspace(2, pulses - 3, most).astype(int))
+        row, column = width * chosen + state, np.arange(chosen.size)
+        unit = np.zeros((width * pulses, chosen.size + 1))
+        unit[row, column] = 1.0
+        unit[state::width, -1] = scale[state::width] * self.measured / self.measured.sum()
+        solved = cho_solve_banded(factor, unit)
+        through = cho_solve(schur, inner[row].T)
+        variance = (solved[row, column] + np.sum(inner[row] * through.T, axis=1)) * scale[row]**2
+        if state:
+            return np.asarray(variance)
+        mean = unit[:, -1]
+        shared = solved[:, -1] + inner @ cho_solve(schur, inner.T @ mean)
+        return np.asarray(variance - 2.0 * shared[row] * scale[row] + mean @ shared)
+
+    def _estimate_sizes(self) -> None:
+        """Estimate how large the states are from their values and variances."""
+        inner = np.arange(self.times.size)[2:-2]
+        inner = inner[self.measured[2:-2]]
+        errors = self.states[:, 0]
+        self.slow = np.asarray(np.polyval(
+            np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
+        power = np.mean((errors - self.slow)[inner] ** 2) + np.median(self._variances(0, _SAMPLED))
+        self.size[0] = np.clip(np.sqrt(power), _LEAST_JITTER * self.jitter_std,
+                               _MOST_JITTER * self.jitter_std)
+        if self.all_free:
+            least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
+            for i, limit in enumerate(least, 1):
+                power = np.mean(self.states[2:-2, i] ** 2) + np.median(
+                    self._variances(i, _SAMPLED))
+                self.size[i] = max(np.sqrt(power), limit)
+
+    def free_all(self) -> None:
+        """Let bends and gains free."""
+        self.all_free = True
+        self.size[1:-1] = _BEND * self.jitter_std
+        self.size[-1] = _GAIN
+
+    # --- lines ---
+
+    def follow_trend(self) -> None:
+        """
+        Start from the slope of the errors that keeps the declared lines together.
+
+        A clock that is fast or slow, or a wrong ratio, makes it.
+        """
+        flat = self.vibration.reshape(-1, self.vibration.shape[2])
+        spectrum = np.abs(np.fft.rfft(flat * np.hanning(len(flat))[:, None], axis=0)) ** 2
+        power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
+        step = _SLOPE_STEP / self.orders.max() / self.span
+        number = np.arange(-_SLOPES, _SLOPES + 1)
+        slope = step * number
+        score = np.sum([np.log(1e-3 * power.max() + np.interp(
+            g * (1.0 + slope) * self.span, np.arange(power.size), power)) for g in self.orders],
+            axis=0)
+        best = slope[np.argmax(score - 1e-3 * np.abs(number))]
+        if score.max() - score[_SLOPES] > _SLOPE_GAIN * self.declared and abs(best) > 1.5 * step:
+            pulse = np.arange(self.times.size) - 0.5 * self.times.size
+            self.slow = np.asarray(best * pulse * np.diff(self.times).mean())
+            self.states[:, 0] = self.slow
+            self._read()
+
+    def new_lines(self) -> tuple[list[float], list[float]]:
+        """Return orders, and tones in Hz, that stand out of the residual."""
+        self._make_tables()
+        residual = self._residual()
+        flat = np.ascontiguousarray(residual.reshape(-1, residual.shape[2]))
+        time = self.place.ravel()
+        duration = float(time[-1] - time[0])
+        at = np.interp(np.linspace(time[0], time[-1], time.size), time, np.arange(time.size))
+        even = interpolate(flat, np.clip(at, 0.0, time.size - 1.0))
+        least = _ACCURACY * np.sqrt(np.mean(self.vibration**2, axis=(0, 1)))
+        over_angle, over_time = (_spectrum(item, self.span, least) for item in (flat, even))
+        limit = gamma.isf(_FALSE / len(over_angle[0]), flat.shape[1]) * _MARGIN
+        found: list[tuple[float, float, bool]] = []
+        for tone, (ratio, power), (_, other) in ((False, over_angle, over_time),
+                                                 (True, over_time, over_angle)):
+            middle = ratio[1:-1]
+            peaks = 1 + np.flatnonzero((middle > ratio[:-2]) & (middle >= ratio[2:])
+                                       & (middle > limit))
+            order = peaks / self.span
+            for peak in peaks[(order > 3.0 / self.span) & (order < self.highest)]:
+                near = other[max(peak - 8, 0):peak + 9].max()
+                if power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER):
+                    place = _between(np.log(ratio[peak - 1:peak + 2])) + peak
+                    found.append((power[peak], place / (duration if tone else self.span), tone))
+        found.sort(reverse=True)
+        orders: list[float] = []
+        tones: list[float] = []
+        for size, place, tone in found[:4 * _A_ROUND]:
+            if size < _SHARE * found[0][0] or len(orders) + len(tones) == _A_ROUND:
+                break
+            others = np.array([*self.orders, *orders])
+            beside = np.array([*self.tones, *tones])
+            if tone:
+                near_one = np.any(np.abs(beside - place) * duration < _APART) or np.any(
+                    np.abs(others - place / self.frequency) * self.span < _APART)
+            else:
+                near_one = np.any(np.abs(others - place) * self.span < _APART)
+            if not near_one:
+                (tones if tone else orders).append(float(place))
+        return orders, tones
+
+    def add(self, orders: Sequence[float] | Array, tones: Sequence[float] | Array) -> None:
+        """Add undeclared lines, their amplitudes 0."""
+        old = np.split(self.amplitudes, [self.orders.size], axis=1)
+        none = [np.zeros((len(self.amplitudes), len(new))) for new in (orders, tones)]
+        self.amplitudes = np.hstack([old[0], none[0], old[1], none[1]])
+        self.orders = np.append(self.orders, orders)
+        self.tones = np.append(self.tones, tones)
+
+    def refine(self) -> None:
+        """Move each undeclared line to where the residual has nothing left of it."""
+        self._make_tables()
+        residual = self._residual()
+        angle = self.cycle_length * (np.arange(self.times.size - 1)[:, None] + self.u)
+        for i in range(self.declared, self.amplitudes.shape[1]):
+            tone = i - self.orders.size
+            coordinate = angle if tone < 0 else self.place
+            coordinate = coordinate - coordinate.mean()
+            top = bottom = 0.0
+            for c, row in enumerate(self.amplitudes):
+                one = np.zeros(row.size, np.complex128)
+                one[i] = 2j * np.pi * row[i]
+                moved = coordinate * self._signal(one)
+                top += self.weight[c] * float(np.sum(moved * residual[:, :, c]))
+                bottom += self.weight[c] * float(np.sum(moved**2))
+            most = 0.5 / float(np.ptp(coordinate))
+            step = float(np.clip(top / bottom, -most, most)) if bottom else 0.0
+            if tone < 0:
+                self.orders[i] += step
+            else:
+                self.tones[tone] += step
+
+    def prune(self, least: float) -> None:
+        """Take out undeclared lines whose amplitudes are noise."""
+        channels, lines = self.amplitudes.shape
+        schur = self.solved[2]
+        variance = np.diag(cho_solve(schur, np.eye(len(schur[0])))).reshape(channels, 2, lines)
+        power = np.abs(self.amplitudes) ** 2 / variance.mean(axis=1)
+        kept = (np.arange(lines) < self.declared) | (power.mean(axis=0) > 2.0 * least)
+        orders, tones = np.split(kept, [self.orders.size])
+        self.orders, self.tones = self.orders[orders], self.tones[tones]
+        self.amplitudes = self.amplitudes[:, kept]
+
+    # --- what comes out ---
+
+    def result(self) -> RecordFit:
+        """Return the fit, pulse errors and bends as good as unshrunk."""
+        self.step(weak=_WEAK)
+        self.step(weak=_WEAK, move=False)
+        errors = self.states[:, 0] - self.states[self.measured, 0].mean()
+        variance = float(np.median(self._variances(1, _SAMPLED)))
+        kept = max(1.0 - variance / self.size[1] ** 2, 0.0)  # of a bend
+        with np.errstate(divide='ignore', invalid='ignore'):
+            ripple = self.states[:-1, 1] / kept
+            ripple_error = float(np.sqrt(variance / np.float64(kept)))
+        return RecordFit(
+            errors, np.sqrt(self._variances(0)), ripple, ripple_error, self.orders, self.tones,
+            self.amplitudes[:, :self.orders.size], self._turning(), float(self.size[0]))
+
+    def _turning(self) -> BoolArray:
+        """Tell which orders have more power over angle than any tone near them has over time."""
+        self._make_tables()
+        residual = self._residual()
+        middle = self.place.mean(axis=1)
+        angle = self.cycle_length * (np.arange(self.times.size - 1) + 0.5)
+        near = np.arange(-_TRIED, _TRIED + 1) / _TRIED / float(np.ptp(middle))
+        found = np.zeros(self.orders.size, np.bool_)
+        found[:self.declared] = True
+        for i in range(self.declared, self.orders.size):
+            alone = np.zeros(self.amplitudes.shape[1], np.complex128)
+            turned, timed = 0.0, np.zeros(near.size)
+            tone = self.orders[i] * self.frequency + near
+            beside = np.exp(2j * np.pi * (self.orders[i] * angle - tone[:, None] * middle))
+            for c, row in enumerate(self.amplitudes):
+                alone[i] = row[i]
+                each = self._sums(residual[:, :, c] + self._signal(alone))[:, i].conj()
+                turned += self.weight[c] * float(np.abs(each.sum()) ** 2)
+                timed += self.weight[c] * np.abs(beside @ each) ** 2
+            found[i] = turned > _SHARPER * timed.max()
+        return found
+
+
+def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
+    """
+    Return power over its floor, summed over channels (last axis), and power (bin,).
+
+    The floor of a channel is at least the power of a line of the amplitude `least` (channel,).
+    """
+    window = np.hanning(len(values) + 1)[:-1, None]
+    power = np.abs(np.fft.rfft(values * window, axis=0)) ** 2
+    ratio = np.zeros(len(power))
+    for channel, limit in zip(power.T, (0.5 * least * window.sum()) ** 2):
+        floor = np.full(len(power), limit)
+        for wide in (max(_WIDE, int(span / 2)), _SKIRT):
+            middles = np.arange(0, len(power), max(1, wide // 2))
+            medians = [np.median(channel[max(0, i - wide):i + wide]) for i in middles]
+            floor = np.maximum(floor, np.interp(np.arange(len(power)), middles, medians))
+        ratio += channel * np.log(2.0) / floor
+    return ratio, power.sum(axis=1)
+
+
+def _between(values: Array) -> float:
+    """Return where a parabola through three values has its top, from the middle one."""
+    left, middle, right = values
+    return float(0.5 * (left - right) / (left - 2.0 * middle + right))

@@ -1,0 +1,142 @@
+"""
+How exactly pulse errors are recovered from whole recordings of another simulator's machines.
+
+`python benchmarks/record_recovery.py` draws machines (`independent_machines`), lets happen to them
+what their declared model lacks (`independent_effects`), fits each recording
+(`record_fit`) and compares its pulse errors and lines with the true ones. `--gear0 FILE` does
+the same with the measured gearbox whose keyphasor is timed by a clock of 6 kHz, and compares with
+what the averager recovers.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import sys
+import time
+
+from independent_effects import draw_case
+from independent_machines import Array, Machine, pulses, record
+import numpy as np
+from page import table
+from record_fit import fit_record, RecordFit
+import sa_jitter_ros as sa
+from worse_pulses import with_slower_clock
+
+EFFECTS = ((), ('excess_jitter',), ('correlated_jitter',), ('target_geometry',), ('clock_skew',),
+           ('missing_pulses',), ('speed_fluctuation',), ('interfering_tone',))
+_EDGE = 15  # samples at either end that interpolation cannot read
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """
+    The fit of a machine's recording and its truth.
+
+    `true` (pulse,) are the errors of the trigger pulses (s, NaN where one is missing), `wrong` the
+    recovered errors less these, the mean taken out.
+    """
+
+    machine: Machine
+    fit: RecordFit
+    true: Array
+    wrong: Array
+    seconds: float
+
+    @property
+    def undeclared(self) -> Array:
+        """Return the undeclared orders of the machine, each once."""
+        return np.unique(np.round(self.machine.components[self.machine.orders.size:], 9))
+
+    @property
+    def near(self) -> Array:
+        """Return how far found orders are from true ones, in what the record resolves."""
+        span = self.machine.cycle_length * (self.true.size - 1)
+        orders = self.fit.orders[self.machine.orders.size:]
+        return np.asarray(np.abs(orders[:, None] - self.undeclared) * span)
+
+
+def fitted(names: tuple[str, ...], seed: int) -> Fitted:
+    """Draw a machine to which `names` happen, and fit its recording."""
+    case = draw_case(names, seed)
+    machine, what = case.machine, case.what
+    times, true = pulses(machine, what, np.random.default_rng([seed, 1]))
+    samples = record(machine, what, np.random.default_rng([seed, 1]))['vibration'].T
+    measured = np.full(true.size, np.nan)
+    number = np.rint(np.interp(times, true, np.arange(true.size))).astype(int)
+    measured[number if times.size < true.size else slice(None)] = times
+    measured, true = (item[::machine.pulses_per_trigger] for item in (measured, true))
+    first = machine.start_time + _EDGE / machine.sample_rate
+    last = machine.start_time + (len(samples) - _EDGE) / machine.sample_rate
+    inside = np.flatnonzero((measured > first) & (measured < last))  # false where NaN
+    part = slice(inside[0], inside[-1] + 1)
+    measured, true = measured[part], true[part]
+    there = np.isfinite(measured)
+    begin = time.process_time()
+    found = fit_record(
+        samples, machine.sample_rate, machine.start_time,
+        np.interp(np.arange(measured.size), np.flatnonzero(there), measured[there]),
+        measured=there, cycle_length=machine.cycle_length, orders=machine.orders.tolist(),
+        jitter_std=1.0 / np.sqrt(12.0) / machine.keyphasor_rate)
+    seconds = time.process_time() - begin
+    wrong = found.errors - (measured - true)
+    return Fitted(machine, found, measured - true, wrong - np.nanmean(wrong), seconds)
+
+
+def measured(path: Path) -> str:
+    """Return errors against the better keyphasor: of the averager, and of the record fit (us)."""
+    clock, orders = 6000.0, [23.0, 46.0, 69.0, 92.0, 115.0]
+    recording = with_slower_clock(sa.read(path), clock)
+    times, better = recording.pulse_times, recording.reference_pulse_times
+    assert times is not None
+    assert better is not None
+    samples = recording.read()
+    averages = sa.average(
+        samples, recording.sample_rate, times, start_time=recording.start_time, orders=orders,
+        trigger_cycles=40, correct_jitter=True, keyphasor_rate=clock)
+    variance = []
+    for average in averages:
+        part = np.searchsorted(times, average.pulses - 0.5 / clock)
+        assert average.correction is not None
+        variance.append(np.var(average.correction.pulse_errors - (times - better)[part]))
+    inner = slice(1, len(times) - 1)
+    found = fit_record(
+        samples.T, recording.sample_rate, recording.start_time, times[inner],
+        measured=np.ones(len(times) - 2, np.bool_), cycle_length=1.0, orders=orders,
+        jitter_std=1.0 / np.sqrt(12.0) / clock)
+    wrong = found.errors - (times - better)[inner]
+    return (f'averager {1e6 * np.sqrt(np.mean(variance)):.1f} us, record fit '
+            f'{1e6 * np.std(wrong):.1f} us, true errors {1e6 * np.std(times - better):.1f} us')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the comparison."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seeds', type=int, default=6, help='machines an effect')
+    parser.add_argument('--first', type=int, default=300, help='first seed')
+    parser.add_argument('--gear0', type=Path, help='gear0_gearbox.npz, the measured gearbox')
+    options = parser.parse_args(arguments)
+    if options.gear0:
+        print(measured(options.gear0))
+        return 0
+    rows = []
+    for names in EFFECTS:
+        runs = [fitted(names, seed) for seed in range(options.first,
+                                                      options.first + options.seeds)]
+        share = [np.nanstd(run.wrong) / np.nanstd(run.true) for run in runs]
+        z = [np.sqrt(np.nanmean((run.wrong / run.fit.standard_errors) ** 2)) for run in runs]
+        made_up = sum(int(np.sum(run.near.min(axis=1) > 0.5)) for run in runs if run.near.size)
+        found = sum(int(np.sum(run.near.min(axis=0) < 0.5)) for run in runs if run.near.size)
+        rows.append([
+            ' + '.join(names) or 'declared model', str(len(runs)), f'{np.median(share):.4f}',
+            f'{max(share):.4f}', f'{np.median(z):.2f}',
+            f'{found} of {sum(run.undeclared.size for run in runs)}', str(made_up),
+            f'{np.median([run.seconds for run in runs]):.1f} s'])
+    print(table(['undeclared', 'runs', 'error over true errors (median)', 'worst',
+                 'error over standard error (median)', 'undeclared orders found', 'made up',
+                 'time'], rows))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,80 @@
+"""Pulse errors and lines of whole recordings, against the truth of another simulator."""
+
+from independent_effects import draw_case
+import numpy as np
+import pytest
+from record_fit import fit_record
+from record_recovery import fitted
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize(('names', 'seed'), [
+    ((), 203), (('target_geometry',), 200), (('interfering_tone',), 200),
+    (('missing_pulses',), 201)])
+def test_errors_are_as_wrong_as_their_standard_errors_say(names, seed):
+    run = fitted(names, seed)
+    inner = slice(2, -2)  # half as much vibration tells the outermost pulses
+    z = (run.wrong / run.fit.standard_errors)[inner]
+    z = z[np.isfinite(z)]
+    # the mean of z^2 of about as many independent values as pulses
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size) + 0.15)
+    size = np.nanstd(run.true)
+    assert np.nanstd(run.wrong) < 0.2 * size
+    assert run.fit.jitter_std == pytest.approx(size, rel=4.0 / np.sqrt(2.0 * z.size) + 0.05)
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('seed', [210, 213])
+def test_undeclared_orders_are_found_and_none_is_made_up(seed):
+    run = fitted((), seed)
+    assert np.all(run.near.min(axis=1) < 0.5)
+    # what is not found is below what would matter
+    missed = run.undeclared[run.near.min(axis=0) > 0.5]
+    lost = np.abs(run.machine.peaks[:, np.isin(np.round(run.machine.components, 9), missed)])
+    assert not lost.size or lost.max() < 0.05 * np.abs(run.machine.peaks).max()
+    assert run.fit.tones.size == 0
+
+
+@pytest.mark.machines
+def test_a_tone_is_no_order():
+    run = fitted(('interfering_tone',), 201)
+    true = draw_case(('interfering_tone',), 201).what.tone[0]
+    resolved = 1.0 / (run.machine.average * run.machine.acquisitions)
+    assert run.fit.tones == pytest.approx([true], abs=0.1 * resolved)
+
+
+@pytest.mark.machines
+def test_a_speed_that_moves_inside_the_cycle_is_found_as_such():
+    run = fitted(('speed_fluctuation',), 200)
+    assert np.std(run.fit.ripple) > 5.0 * run.fit.ripple_standard_error
+    assert np.std(run.wrong) < 0.2 * np.std(run.true)
+
+
+def steady(rng, count=60, rate=5000.0, speed=25.0, noise=0.02):
+    """Return a steady machine's vibration, and its pulses with errors."""
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    vibration = sum(size * np.cos(2.0 * np.pi * g * speed * time)
+                    for g, size in ((8.0, 1.0), (16.0, 0.7), (24.0, 0.5)))
+    errors = rng.normal(0.0, 5e-5, count)
+    times = (np.arange(count) + 0.5) / speed + errors
+    return (vibration + noise * rng.standard_normal(time.size))[:, None], times, errors
+
+
+def test_without_noise_nothing_is_made_up(rng):
+    samples, times, errors = steady(rng, noise=0.0)
+    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    assert found.orders.tolist() == [8.0, 16.0, 24.0]
+    wrong = found.errors - errors
+    assert wrong[1:-1] == pytest.approx(wrong.mean(), abs=1e-8)  # half as much tells the ends
+
+
+@pytest.mark.parametrize('size', [0.2, 1.0, 5.0])
+def test_the_declared_size_hardly_matters(rng, size):
+    samples, times, errors = steady(rng)
+    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size)
+    wrong = found.errors - (errors - errors.mean())
+    assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
+        1.0, abs=4.0 / np.sqrt(2.0 * times.size))
+    assert found.jitter_std == pytest.approx(5e-5, rel=4.0 / np.sqrt(2.0 * times.size))
