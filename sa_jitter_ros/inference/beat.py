@@ -1,11 +1,11 @@
 """
-The beat that an interpolator leaves: how much amplitude it cost, from the samples alone.
+The beat that an interpolator causes, and from it the amplitude that the interpolator took.
 
-Samples that were read between the samples of another clock lose amplitude most half-way between
-two of them and nothing on one of them. As the two clocks drift through each other, every line
-beats at one common frequency and in step, the more the higher its own frequency is. The depth of
-the beat is known and tells the mean loss, which raw and corrected amplitudes share and their ratio
-does not show. Found are beats slower than half the trigger rate.
+Samples that were interpolated between the samples of another clock lose most amplitude half-way
+between two of them and none on one of them. As the two clocks drift relative to each other, the
+amplitudes of all lines beat at one common frequency and phase, the deeper the higher the frequency
+of the line. The mean loss follows from the depth of the beat; raw and corrected amplitudes share
+it, so that their ratio does not show it. Beats slower than half the trigger rate are found.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ _POOR = 3.0  # mean square misfit of the depths, in their errors, that is no int
 @dataclass(frozen=True)
 class Beat:
     """
-    A common beat of the lines: its interpolator, chance, and the gain (line,) that it tells.
+    A common beat of the lines: interpolator, p value, and the `gain` (line,) that follows from it.
 
     `depth` (line,) is the relative amplitude of the beat; `method` is '' without a beat.
     """
@@ -85,8 +85,8 @@ def _fits(swings: Array, shape: Array, error: Array) -> tuple[Array, Array, Arra
     """
     Fit a shape (line,) of any size and phase to `swings` of some `error` (frequency, line).
 
-    Returns, by frequency, the logarithm of the chance of as large a swing, the sum of squares that
-    is left (lines that swing out of step, or for themselves, fit no shape) and the size.
+    Returns, by frequency, the logarithm of the p value, the remaining sum of squares (large if the
+    lines swing out of phase, or each by itself) and the size.
     """
     alone = np.sum(swings * shape / error**2, axis=1)
     weight = 1.0 / (error**2 + (_KNOWN * np.abs(swings)) ** 2)

@@ -1,9 +1,9 @@
 """
-Candidates: every effect that is not there yet, fitted, scored and, mostly, rejected.
+Candidates: every effect that is not in the model yet is fitted, scored and accepted or rejected.
 
-An effect is added when its own physical evidence speaks for it, nothing in its goodness of fit
-speaks against it, and the held-out acquisitions are predicted better with it; the one with the
-most specific evidence first.
+An effect is accepted if its physical evidence is significant, its goodness of fit does not
+contradict it, and the held-out acquisitions are predicted better with it. Of several, the one with
+the most specific evidence is added first.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,16 @@ _EVIDENCE = 1e-3
 # Held-out pulse errors that are e^7 times likelier by chance are rarer than e^-7.
 _TOLD, _MOVED = 7.0, 0.01
 _DECISIVE = 1e-6
-# Scatter of an amplitude, in parts of it, that nobody asks the cause of.
+# Relative scatter of an amplitude below which no cause is looked for.
 _FAINT = 1e-3
 _NEARLY_ALL = 0.8
-# Chi2 per degree of freedom of amplitudes whose scatter a cause explains.
+# Largest chi2 per degree of freedom of amplitudes whose scatter an effect explains.
 _NO_MORE = 1.5
 _HIDDEN = 'the ticks of the clock leave room for the errors of all pulses'
-# Scores this close are the same: what is seen in the pulses may lie in none of the held-out ones.
+# Scores this close are the same: what the pulses show may be in none of the held-out acquisitions.
 _SAME = 0.01
-# Most specific evidence first: what one sees in the pulse times themselves, then in the order of
-# the pulse errors, then in their size, then in amplitudes.
+# Most specific evidence first: that in the pulse times themselves, then in the sequence of the
+# pulse errors, then in their size, then in amplitudes.
 _TIERS = (
     ('missing_pulses',), ('keyphasor_quantisation',), ('target_geometry', 'clock_skew'),
     ('speed_fluctuation', 'phase_wander'), ('correlated_jitter',), ('excess_jitter',),
@@ -42,7 +42,7 @@ _TIERS = (
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect in one round: its finding, its score on held-out acquisitions, its rejection."""
+    """One effect in one round: finding, score on held-out acquisitions, reason of rejection."""
 
     name: str
     stage: int
@@ -54,9 +54,10 @@ class Candidate:
 def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
             moves: Sequence[Dependence], own: float, significant: bool) -> list[Candidate]:
     """
-    Fit every effect that is not there yet and score it on the held-out acquisitions.
+    Fit every effect that is not in the model yet and score it on the held-out acquisitions.
 
-    `current` and `moves` are the residual so far and how it moves, `own` the unsteadiness.
+    `current` is the residual so far, `moves` its dependences, `own` the unsteadiness and
+    `significant` whether a significant residual remains.
     """
     effects = [finding.effect for finding in chosen if finding.effect is not None]
     taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
@@ -95,10 +96,11 @@ def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current
 @dataclass(frozen=True)
 class _Gain:
     """
-    What held-out acquisitions gain by an effect: log `score` and the one `before`.
+    What an effect improves on held-out acquisitions: its log `score` and the one `before` it.
 
-    `p_value` is that of the residual `of` attenuation or amplitude so far. `decisive` and `told`
-    say that the effect is there whatever that p value, `better` that it predicts no worse.
+    `p_value` is that of the residual `of` attenuation or amplitude so far. `decisive` (by the
+    residual) and `told` (by the likelihood) say that the effect is accepted whatever that p value
+    is, `better` that the prediction with it is not worse.
     """
 
     of: str
@@ -112,7 +114,7 @@ class _Gain:
 
 def _gain_of_amplitude(finding: Finding, current: Residual, score: Residual, own: float,
                        left: float) -> _Gain:
-    """Return what an effect on the scatter gains; it leaves the unsteadiness `left` of `own`."""
+    """Return the gain of an effect on the scatter, which lowers unsteadiness `own` to `left`."""
     new, old = score.amplitude_score, current.amplitude_score
     decisive = own > ACCURACY and left**2 < 0.5 * own**2
     told = own > ACCURACY and finding.p_value < _DECISIVE and (new - old) * score.z.size > _TOLD
@@ -123,7 +125,7 @@ def _gain_of_amplitude(finding: Finding, current: Residual, score: Residual, own
 
 def _gain_of_attenuation(bench: Bench, effects: Sequence[Effect], finding: Finding,
                          current: Residual, moves: Sequence[Dependence], score: Residual) -> _Gain:
-    """Return what an effect on the attenuation gains."""
+    """Return the gain of an effect on the attenuation."""
     new, old = score.score, current.score
     told = _told(bench, effects, finding, current, score)
     visible = EFFECTS[finding.name].visible_in_pulse_times
@@ -135,7 +137,7 @@ def _gain_of_attenuation(bench: Bench, effects: Sequence[Effect], finding: Findi
 
 
 def _rejection(bench: Bench, effects: Sequence[Effect], finding: Finding, gain: _Gain) -> str:
-    """Say why an effect is not needed or no help; '' if it is."""
+    """Return why an effect is not needed or does not help, '' if it does."""
     if finding.p_value > _EVIDENCE:
         return f'its evidence may be chance: {finding.evidence}'
     assert finding.effect is not None
@@ -144,7 +146,8 @@ def _rejection(bench: Bench, effects: Sequence[Effect], finding: Finding, gain: 
     if not visible and _moved(bench, effects, finding.effect) < least:
         return f'it is too small to matter: the {gain.of} of no line changes by {least:g}'
     if not (gain.p_value < SIGNIFICANT or visible or gain.decisive or gain.told):
-        return f'not needed: the {gain.of} leaves nothing significant (p = {gain.p_value:.2g})'
+        return (f'not needed: the residual of the {gain.of} is not significant '
+                f'(p = {gain.p_value:.2g})')
     if not gain.better:
         return (f'the {gain.of} of held-out acquisitions is predicted no better: log score '
                 f'{gain.score:.3f} after {gain.before:.3f}')
@@ -152,7 +155,7 @@ def _rejection(bench: Bench, effects: Sequence[Effect], finding: Finding, gain: 
 
 
 def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the candidate of the first tier that has one, the best score within it."""
+    """Return the best candidate of the first tier with an accepted one, None without any."""
     for tier in _TIERS:
         left = [item for item in candidates if item.name in tier and not item.rejected_because]
         if left:
@@ -162,7 +165,7 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
 
 
 def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
-    """Return the largest RMS, over the acquisitions, by which an effect moves a line."""
+    """Return the largest RMS change, over the acquisitions, that an effect makes to a line."""
     without, with_it = (bench.expect(known, bench.held_out) for known in (
         effects, [*effects, more]))
     square = (np.maximum(with_it.amplitude_variance - without.amplitude_variance, 0.0)
@@ -171,7 +174,7 @@ def _moved(bench: Bench, effects: Sequence[Effect], more: Effect) -> float:
 
 
 def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
-    """Say that an effect leaves nearly all of a significant residual; '' where it does not."""
+    """Return that nearly all of a significant residual remains with an effect, '' otherwise."""
     if scatters:
         old, new = before.chi2_per_dof - 1.0, after.chi2_per_dof - 1.0
         if after.p_amplitude < SIGNIFICANT and new > _NEARLY_ALL * old:
@@ -184,7 +187,7 @@ def _leaves(scatters: bool, before: Residual, after: Residual) -> str:
 
 
 def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
-    """Tell whether an effect predicts what the declared model takes for chance."""
+    """Return whether an effect halves the residual and its evidence is beyond doubt."""
     return (finding.p_value < _DECISIVE and before.rms > ACCURACY
             and after.rms < 0.5 * before.rms)
 
@@ -192,9 +195,10 @@ def _decisive(finding: Finding, before: Residual, after: Residual) -> bool:
 def _told(bench: Bench, effects: Sequence[Effect], finding: Finding, before: Residual,
           after: Residual) -> bool:
     """
-    Tell whether held-out pulse errors tell an effect that the attenuation is too rough to tell.
+    Return whether held-out pulse errors show an effect that the attenuation is too noisy to show.
 
-    Beside a large effect, the chance of few averages hides another; but it must explain them.
+    Beside a large effect, the scatter of few averages can hide a second one in the attenuation.
+    With the effect no significant residual of the attenuation may remain.
     """
     moved = float(np.sqrt(np.mean((after.mean - before.mean) ** 2)))
     if finding.effect is None or moved < _MOVED or after.p_attenuation < SIGNIFICANT:

@@ -1,8 +1,8 @@
 """
-Dependence: how the residual moves with order, speed, frequency and number of averaged cycles.
+Dependence: how the residual changes with order, speed, frequency and number of averaged cycles.
 
-A prediction that is right on the average may be wrong in how it goes with these: another effect
-has then been fitted to the size of the true one. All is of held-out acquisitions.
+A prediction that is right on average may depend on these in a wrong way: then a wrong effect was
+fitted to the size of the true one. Only held-out acquisitions are used.
 """
 
 from collections.abc import Sequence
@@ -21,21 +21,21 @@ from scipy import stats
 
 Array = NDArray[Any]
 
-#: A change of the residual with a smaller p value is no chance; there are up to four.
+#: A change of the residual with a smaller p value is significant; up to four are tested.
 CERTAIN = 1e-3
 _NEARLY_ALL = 0.8
 _FREEDOM = 3
-# What predictions of the same lines at the same speed may be wrong by against each other.
+# Error of the difference of predictions for the same lines at the same speed.
 _ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
 class Dependence:
     """
-    How much the residual of the attenuation changes `on` something from its `low` to `high` end.
+    Change of the residual of the attenuation with the quantity `on`, from its `low` to `high` end.
 
-    `change` in parts of an amplitude with its `standard_error`, which holds what the parameters of
-    effects are uncertain by, and the chance `p_value` of as much.
+    `change` is relative to an amplitude; its `standard_error` includes the uncertainty of the
+    parameters of effects; `p_value` is that of no change.
     """
 
     on: str
@@ -47,7 +47,7 @@ class Dependence:
     p_value: float
 
     def __str__(self) -> str:
-        """Return how much changes with what."""
+        """Return the change and its p value in words."""
         name = self.on.replace('_', ' ')
         unit = f' {self.unit}' if self.unit else ''
         return (f'what is left changes by {self.change:+.4f} from {name} {self.low:.4g} to '
@@ -55,20 +55,20 @@ class Dependence:
 
 
 def moving(found: Sequence[Dependence]) -> Dependence | None:
-    """Return the clearest change that is no chance, None where there is none."""
+    """Return the most significant change, None if none is significant."""
     certain = [item for item in found if item.p_value < CERTAIN]
     return min(certain, key=lambda item: item.p_value) if certain else None
 
 
 def still_moving(before: Sequence[Dependence], after: Sequence[Dependence]) -> Dependence | None:
-    """Return the clearest change that an effect leaves nearly all of, None where there is none."""
+    """Return the most significant change of which nearly all remains, None if there is none."""
     old = {item.on: abs(item.change) for item in before}
     return moving([item for item in after if abs(item.change) > _NEARLY_ALL * old[item.on]])
 
 
 def dependences(bench: Bench, effects: Sequence[Effect], findings: Sequence[Finding]
                 ) -> tuple[Dependence, ...]:
-    """Return on what the residual with `effects` may depend: all that differs in the data."""
+    """Return the dependences of the residual with `effects` on all that differs in the data."""
     whole = bench.compare(effects, findings)
     weights = 1.0 / (np.mean(whole.scale**2, axis=0) + ACCURACY**2)
     orders = bench.observation.orders[bench.lines.order]
@@ -96,7 +96,7 @@ def _over_lines(whole: Comparison, weights: Array, orders: Array) -> Dependence:
 
 def _over_acquisitions(on: str, whole: Comparison, weights: Array, shape: Array, speeds: Array
                        ) -> Dependence:
-    """Return the slope over speeds; `shape` (line,) is how much of it each line has."""
+    """Return the slope over speeds; `shape` (line,) is its relative size for each line."""
     across = weights * shape / np.sum(weights * shape**2) * shape.max()
     away = speeds - speeds.mean()
     return _judged(on, 'Hz', speeds * shape.max(), whole, across,

@@ -1,9 +1,9 @@
 """
 Expectation: what declared model and effects predict for every acquisition and line.
 
-A line is one order on one channel. What effects know of an acquisition's own pulses (the grid of a
-clock, the marks of a target, a gap) enters the prediction of that acquisition; orders leak into
-each other with the amplitudes that the channel has.
+A line is one order on one channel. The prediction for an acquisition uses the errors of its pulses
+that effects know (by the grid of a clock, the marks of a target, a gap). Orders leak into each
+other with the amplitudes that the channel has.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ Array = NDArray[Any]
 
 Distribution = AmplitudeDistribution | SampledDistribution
 
-#: What resampling leaves of uncertainty in an amplitude, in parts of it.
+#: Relative uncertainty of an amplitude that comes from resampling.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
@@ -65,7 +65,7 @@ class Lines:
 @dataclass(frozen=True)
 class _Shown:
     """
-    What averages show of unit components, one entry per row: a line of an acquisition.
+    Predicted averages of unit components, one row for each line of an acquisition.
 
     `index` (row,) are places among all lines of all acquisitions, `order` indices of orders;
     `shift` is the mean of what leaks in and `scatter` its variance; `noise`, E|n|^2 in the unit of
@@ -92,7 +92,7 @@ class _Shown:
 
 
 class Memory:
-    """What was predicted for effects and an acquisition, as long as it takes little room."""
+    """Predictions by effects and acquisition, kept while they take little memory."""
 
     def __init__(self) -> None:
         """Begin with nothing."""
@@ -100,7 +100,7 @@ class Memory:
         self._drawn = 0
 
     def make_room(self) -> None:
-        """Forget everything where it is too much."""
+        """Drop all predictions if there are too many."""
         if len(self.shown) > _MOST_KEPT or self._drawn > _MOST_DRAWN:
             self.shown.clear()
             self._drawn = 0
@@ -131,7 +131,7 @@ class Expectation:
 
     @cached_property
     def attenuation_variance(self) -> Array:
-        """Return Var|X|, and what resampling leaves of uncertainty."""
+        """Return Var|X| plus the variance that comes from resampling."""
         return self._gathered(self._bare, 'variance') + RESOLUTION**2
 
     @cached_property
@@ -189,10 +189,10 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
     """
     Predict the `chosen` acquisitions, each at its own speed.
 
-    `level` (line,) are mean amplitudes, which noise is compared with; `pulses[a][i]` is what is
-    known of the pulses of acquisition a for the channels whose `group` (channel,) is i;
-    `unsteadiness` is what the amplitudes scatter by themselves, in parts of the level. `memory`
-    keeps what was computed, for calls that differ in `effects`, `chosen` and `unsteadiness` only.
+    `level` (line,) are mean amplitudes, to which noise is relative; `pulses[a][i]` are the pulses
+    of acquisition a with their known errors, for the channels whose `group` (channel,) is i;
+    `unsteadiness` is the unexplained scatter of the amplitudes relative to the level. `memory`
+    keeps results for calls that differ in `effects`, `chosen` and `unsteadiness` only.
     """
     memory = Memory() if memory is None else memory
     memory.make_room()
@@ -238,7 +238,7 @@ def _together(rows: Sequence[Sequence[_Shown]]) -> tuple[_Shown, ...]:
 
 @dataclass(frozen=True)
 class _Source:
-    """Amplitudes of unit components, in which scenario, and what comes on top of each order."""
+    """Amplitudes of unit components, their scenario, and what is added to each order."""
 
     amplitudes: Amplitudes
     scenario: int | None
@@ -258,7 +258,7 @@ class _Setting:
     made: list[Amplitudes] = field(default_factory=list)
 
     def shown(self, pulses: Sequence[Pulses]) -> list[_Source]:
-        """Return what unit components show of themselves and of each other, for all `pulses`."""
+        """Return the predicted amplitudes and leakage of unit components, for all `pulses`."""
         known = [known_errors(self.observation.model, self.effects, item) for item in pulses]
         found: dict[int, _Source] = {}
         alike: dict[tuple[float, ...], list[int]] = {}
@@ -320,8 +320,8 @@ def _speed(item: Acquisition, model: DeclaredModel) -> float:
     """
     Return the speed of an acquisition in Hz, that of the record unless it differs.
 
-    It is exact where pulses lack: a gap turns the average by whole trigger cycles, and what the
-    speed were off by would count as often as the order has periods in them.
+    It is exact if pulses are missing: a gap turns the average by whole trigger cycles, which
+    multiplies an error of the speed.
     """
     ratio = model.trigger_period / mean_period(item.times, item.missing)
     if item.missing.any():
@@ -331,10 +331,10 @@ def _speed(item: Acquisition, model: DeclaredModel) -> float:
 
 def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
     """
-    Return the factor on moments that allow for being unsure by the jitter `doubt`.
+    Return the factor that corrects moments for the uncertainty `doubt` of the known errors.
 
-    Errors that are off scatter more than the true ones, so that they attenuate too much already;
-    allowing for being unsure attenuates once more. Two-fold at most: beyond, nothing is known.
+    Uncertain errors scatter more than the true ones, so that they attenuate too much; the
+    uncertainty itself attenuates once more. The factor is at most two.
     """
     mean = np.abs(cycle_moments(orders, [doubt], nodes=_NODES, lags=0).mean)
     return np.asarray(np.minimum(mean**-2.0, _SHARPEST))

@@ -1,4 +1,4 @@
-"""Gathering: the evidence that effects look at, from the acquisitions that a fit may use."""
+"""Gathering: the evidence that effects are fitted to, from the acquisitions that a fit may use."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +26,7 @@ _STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
 _CERTAIN = 1e-4
 _GROUPS = 3
-# A clock this much faster than the declared one is no cause of anything.
+# A clock this much faster than the declared one has no visible effect.
 _FINE = 50.0
 
 
@@ -58,9 +58,9 @@ def choose_lines(observation: Observation) -> Lines:
 
 def channel_groups(observation: Observation) -> Array:
     """
-    Return groups of channels (channel,), each of which can be predicted by the others.
+    Return the group of each channel (channel,); each group can be predicted by the others.
 
-    The channels that tell most of the pulse errors are dealt out to the groups one by one.
+    The channels that show the pulse errors best are distributed evenly to the groups.
     """
     corrected = np.abs(observation.stacked('corrected'))
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -73,11 +73,11 @@ def channel_groups(observation: Observation) -> Array:
 def gather_pulses(recording: Recording, observation: Observation, group: Array
                   ) -> tuple[Clock, Sequence[Sequence[Pulses]]]:
     """
-    Return the clock and what is known of the pulses.
+    Return the clock and the known errors of the pulses.
 
-    On a grid, the errors are those of the smoothest motion that it allows; where other channels
-    recover the motion better than a quarter of a tick, those of that motion. Pulses that the angle
-    law reads beside those of an acquisition are there, too.
+    On the grid of a clock, the errors are those of the smoothest motion that it allows; if other
+    channels recover the motion better than to a quarter of a tick, those of the recovered motion.
+    Pulses beside an acquisition that its angle law uses are included.
     """
     model, pulses = observation.model, observation.pulses
     found = find_clock(pulses.times)
@@ -118,7 +118,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
 def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
            pulses: Sequence[Sequence[Pulses]], clock: Clock, effects: Sequence[Effect],
            scatter: LineEvidence) -> Evidence:
-    """Return the evidence of the `chosen` acquisitions, less what `effects` explain."""
+    """Return the evidence of the `chosen` acquisitions, less the contributions of `effects`."""
     model = observation.model
     picked = [observation.acquisitions[a] for a in chosen]
     usable = [a for a, item in zip(chosen, picked) if np.all(np.isfinite(item.errors))]
@@ -154,7 +154,7 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
-    """Return how the amplitudes of the lines scatter, of all acquisitions."""
+    """Return the scatter of the amplitudes of the lines in all acquisitions."""
     model = observation.model
     cycles = lines.of(_cycles(observation))
     shortest = cycles.shape[1]
@@ -179,7 +179,7 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
 
 
 def _cycles(observation: Observation) -> Array:
-    """Return corrected amplitudes (acquisition, cycle, channel, order) of cycles that all have."""
+    """Return corrected amplitudes (acquisition, cycle, channel, order), as many cycles of each."""
     shortest = min(len(item.cycles) for item in observation.acquisitions)
     return np.array([item.cycles[:shortest, :, :observation.orders.size]
                      for item in observation.acquisitions])
@@ -189,7 +189,7 @@ def _middles(observation: Observation, cycles: int) -> tuple[Array, Array]:
     """
     Return time (s) and fundamental cycles (acquisition, cycle) of the middles of the cycles.
 
-    Of several recordings, whose times do not go together, those of the first.
+    Of several recordings, whose clocks differ, only the first is used.
     """
     times, places = [], []
     number = observation.pulses.number
@@ -205,10 +205,11 @@ def _middles(observation: Observation, cycles: int) -> tuple[Array, Array]:
 
 def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:
     """
-    Return how uncertain recovered errors (acquisition, pulse) are, in s.
+    Return the standard error of recovered errors (acquisition, pulse) in s.
 
-    Against a better keyphasor, what they differ from it by, its own errors included. Else the
-    delete-a-group jackknife: recoveries that leave out one group of channels each share the rest.
+    With a reference keyphasor it is their difference from it, whose errors are included. Otherwise
+    it is that of the delete-a-group jackknife over recoveries that leave out one group of channels
+    each.
     """
     if observation.against_reference:
         apart = motion - observation.stacked('errors')
@@ -221,9 +222,9 @@ def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array
 
 def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[float, float]:
     """
-    Return what the smoothest motion on a grid misses: size in s and correlation of neighbours.
+    Return the error of the smoothest motion on a grid: size in s and correlation of neighbours.
 
-    It is 0 where more than the ticks errs.
+    It is 0 where there are other errors beside those of the ticks.
     """
     usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
     if not usable:
@@ -248,7 +249,7 @@ def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
 
 
 def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
-    """Return recovered errors (acquisition, pulse) less a slope over time that no grid makes."""
+    """Return recovered errors (acquisition, pulse) less a slope over time that no grid causes."""
     items = observation.acquisitions
     grid = _of_acquisitions(smooth, items)
     times = np.array([item.times - item.times.mean() for item in items])

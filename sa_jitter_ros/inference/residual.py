@@ -2,7 +2,7 @@
 Residual: observed minus predicted, with the predicted standard deviation as its scale.
 
 The mean residual is that of the attenuation; the distribution that of the raw amplitude over its
-level, which noise and modulation move as well. Lines of an acquisition share its pulses, so
+level, which noise and modulation change as well. Lines of an acquisition share its pulses, so
 significance counts acquisitions, two neighbours as one block, and keeps the lines together.
 """
 
@@ -16,7 +16,7 @@ from scipy import stats
 
 Array = NDArray[Any]
 
-#: What a predicted attenuation may be wrong by: smaller residuals are no cause for a verdict.
+#: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3
 _DRAWS, _SEED = 4000, 17
 
@@ -24,10 +24,10 @@ _DRAWS, _SEED = 4000, 17
 @dataclass(frozen=True)
 class Sensitivity:
     """
-    What one standard error of a fitted parameter changes in the prediction.
+    Change of the prediction by one standard error of a fitted parameter.
 
-    `mean` (line,) of the attenuation, and in parts of itself the variance of attenuation and
-    amplitude.
+    `mean` (line,) is that of the attenuation; `variance` (of the attenuation) and
+    `amplitude_variance` are relative changes.
     """
 
     mean: Array
@@ -40,13 +40,14 @@ class Residual:
     """
     Summary of a residual; `mean` and `standard_error` are per line.
 
-    `rms` is the root mean square over lines of the mean residual, `rms_standard_error` what its
-    standard error adds to it (in quadrature), of which `rms_parameter_error` is by what the fitted
-    parameters are uncertain, the rest by the chance of these acquisitions; `chi2_per_dof`, `ks`,
+    `rms` is the root mean square over lines of the mean residual, `rms_standard_error` the part of
+    it that standard errors contribute (in quadrature). Of this, `rms_parameter_error` comes from
+    the uncertainty of fitted parameters, the rest from the scatter of the acquisitions.
+    `chi2_per_dof`, `ks`,
     `cramer_von_mises` and `coverage` (of the 95 % band) describe the standardised amplitudes `z`.
     `score` and `amplitude_score` are mean normal log likelihoods of attenuation and amplitude,
-    `p_mean`, `p_scatter` and `p_amplitude_scatter` the chances of this much mean residual, scatter
-    of the attenuation and scatter of the amplitude.
+    `p_mean`, `p_scatter` and `p_amplitude_scatter` the p values of the mean residual, of the
+    scatter of the attenuation and of the scatter of the amplitude.
     """
 
     mean: Array
@@ -77,7 +78,7 @@ class Residual:
 
     @property
     def p_value(self) -> float:
-        """Return the p value of the largest of the three tests."""
+        """Return the p value of all three tests together."""
         return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude_scatter)
 
 
@@ -90,9 +91,9 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
              amplitude_expected: Array, amplitude_variance: Array, probability: Array, *,
              sensitivities: Sequence[Sensitivity] = ()) -> Residual:
     """
-    Compare observed with predicted, all arrays (acquisition, line).
+    Compare observed with predicted values, all arrays (acquisition, line).
 
-    The variances hold those of the observation itself; `probability` is the predicted distribution
+    The variances include those of the observations; `probability` is the predicted distribution
     function at the amplitudes; `sensitivities` are those to each fitted parameter.
     """
     difference = attenuation - expected
@@ -126,10 +127,10 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
 
 def _log_score(difference: Array, scale: Array) -> float:
     """
-    Return the mean normal log likelihood, with as much more scatter as makes it largest.
+    Return the mean normal log likelihood, with the additional scatter that maximises it.
 
-    So a prediction for each acquisition's own pulses, which leaves nothing to chance, is not
-    punished for what another effect does.
+    A prediction for the measured pulses of each acquisition has a small variance; without the
+    additional scatter its score would be low because of another effect.
     """
     more = np.concatenate(([0.0], np.geomspace(1e-4, 1.0, 41)))[:, None, None]
     variance = scale**2 + more**2
@@ -171,7 +172,7 @@ def _scatter_p_value(difference: Array, scale: Array, unsure: Sequence[float]) -
     """
     Test whether the lines scatter more than predicted, block by block.
 
-    `unsure` are parts of the predicted variance that it may be wrong by.
+    `unsure` are relative errors of the predicted variance.
     """
     count = len(difference)
     if count < 3:

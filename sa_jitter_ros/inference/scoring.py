@@ -1,8 +1,8 @@
 """
 Scoring: how well the declared model and some effects predict the held-out acquisitions.
 
-The scale holds what the machine's own amplitudes scatter by (unsteadiness), beside what noise,
-jitter and effects predict.
+The scale of the residual includes the unexplained scatter of the amplitudes (unsteadiness), beside
+the scatter that noise, jitter and effects predict.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,8 +23,8 @@ from sa_jitter_ros.prediction.influence import Pulses
 
 Array = NDArray[Any]
 
-#: Scatter from average to average that is the machine's own, in parts of an amplitude: what steady
-#: machines were measured to have that no effect describes (docs/measured_cases.md).
+#: Relative scatter of an amplitude from average to average that steady machines were measured to
+#: have and that no effect describes (docs/measured_cases.md).
 STEADY = 0.02
 _CHANCE = 3.0
 
@@ -34,7 +34,7 @@ class Comparison:
     """
     Residual of the attenuation and its `scale`, (acquisition, line).
 
-    `moved` is what one standard error of each fitted parameter changes in the prediction.
+    `moved` is the change of the prediction by one standard error of each fitted parameter.
     """
 
     difference: Array
@@ -45,9 +45,9 @@ class Comparison:
 @dataclass(frozen=True)
 class Bench:
     """
-    Everything that scoring needs; `untold` says of effects why these data cannot tell them.
+    Everything that scoring needs; `untold` maps effects that these data cannot show to the reason.
 
-    `fewer` is the same averaged over fewer cycles, where the acquisitions hold enough of them.
+    `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them.
     """
 
     observation: Observation
@@ -90,10 +90,10 @@ class Bench:
 
     def unsteadiness(self, effects: Sequence[Effect]) -> float:
         """
-        Return what the corrected amplitudes scatter by beyond what noise and effects predict.
+        Return the scatter of the corrected amplitudes beyond what noise and effects predict.
 
-        It is the root mean square over acquisitions and lines, in parts of the level: 0 where it
-        may be chance, and of no line more than a steady machine has.
+        It is the root mean square over acquisitions and lines, relative to the level; 0 if it is
+        not significant. No line counts with more than a steady machine has.
         """
         orders = self.observation.orders.size
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])

@@ -1,9 +1,9 @@
 """
-The tone that no shaft makes: a line of one frequency while the speed of the shafts drifts.
+The tone that no shaft makes: its frequency is constant while the speed of the shafts drifts.
 
-It is looked for in the amplitudes of single trigger cycles, in which a tone near an order turns
-against it, at the times of the cycles. An order of another shaft does so, too, but evenly from
-cycle to cycle, whatever the speed; where the speed drifts, this tells the two apart.
+It is looked for in the amplitudes of single trigger cycles. The phase of a tone near an order
+turns relative to that order, evenly in time. The phase of an order of another shaft turns evenly
+from cycle to cycle, whatever the speed; where the speed drifts, this distinguishes the two.
 """
 
 import math
@@ -25,7 +25,7 @@ _EXACT = 1e-3  # last power of the distance from a whole place that counts
 
 def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
     """
-    Find the tone that turns most clearly against an order.
+    Find the strongest tone whose phase turns relative to an order.
 
     `cycles` (acquisition, cycle, line) are complex peak amplitudes, corrected, of the `orders`
     (line,); `times` (acquisition, cycle) the middles of the cycles in s and `angle` the
@@ -76,10 +76,11 @@ def find_tone(cycles: Array, times: Array, angle: Array, orders: Array) -> Tone:
 def _heights(series: Array, ahead: Array, places: Array, even_places: Array
              ) -> tuple[Array, Array]:
     """
-    Return how high tones stand over the noise beside one order, and their turns a cycle.
+    Return the power of tones beside one order over that of the noise, and their turns per cycle.
 
-    `series` (cycle,) is what turns against the order, `ahead` (cycle,) the phase by which that is
-    ahead; `places` and `even_places` count the cycles by time and by angle.
+    `series` (cycle,) is the amplitude relative to the order, `ahead` (cycle,) the phase by which
+    the order is ahead of its mean frequency; `places` and `even_places` count the cycles by time
+    and by angle.
     """
     size = _PADDED * int(max(np.ptp(places), np.ptp(even_places)) + 2.0)
     spectrum, twin = (np.abs(_spectrum(item * np.exp(1j * ahead), places, size)) ** 2
@@ -98,9 +99,8 @@ def _spectrum(values: Array, places: Array, size: int) -> Array:
     """
     Return the Fourier transform (size,) of `values` (place,) at uneven `places`.
 
-    Frequencies are those of `fftfreq` for unit steps, the phase that of the first place. Values
-    are put on the next whole place, and what that turns them by is developed in powers of the
-    distance.
+    Frequencies are those of `fftfreq` for unit steps, phases refer to the first place. Values are
+    moved to the nearest whole place; a power series in the distance corrects their phase.
     """
     nearest = np.rint(places - places[0]).astype(int)
     turn = -2j * np.pi * np.fft.fftfreq(size)

@@ -1,8 +1,8 @@
 """
-The trace: which effect makes the residual, added one at a time while a significant one remains.
+The trace: effects are added one at a time while a significant residual remains.
 
-Effects are fitted on one half of the acquisitions (every other one) and judged on the other.
-"None of these" is an answer.
+Effects are fitted to one half of the acquisitions (every other one) and scored on the other half.
+The result may be that no effect explains the residual.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,13 +38,14 @@ _SAME_CLOCK = 0.01
 @dataclass(frozen=True)
 class Trace:
     """
-    What the trace found; `before` and `after` are residuals of held-out acquisitions.
+    Result of the trace; `before` and `after` are residuals of held-out acquisitions.
 
-    `dependences_before` and `dependences_after` tell how they change with order, speed and cycles.
-    `prediction_before` and `prediction_after` are those of all acquisitions (acquisition, line) of
-    the `lines`; `attenuation` and `amplitude` what was observed. `evidence` is that of the first
-    round, with nothing explained. `unsteadiness` is how much the amplitudes scatter by themselves,
-    in parts of their level: part of the scale of both residuals.
+    `dependences_before` and `dependences_after` are their changes with order, speed and cycles.
+    `prediction_before` and `prediction_after` are predictions for all acquisitions
+    (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
+    `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
+    unexplained scatter of the amplitudes relative to their level, part of the scale of both
+    residuals.
     """
 
     observation: Observation
@@ -73,7 +74,7 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     """
     Trace the residual of the observations of some recordings of one machine.
 
-    `declared` are effects that the declared model has already.
+    `declared` are the effects of the declared model.
 
     Raises ModelError for fewer than 4 acquisitions and SignalError where nothing can be compared.
     """
@@ -93,7 +94,7 @@ def require_acquisitions(observation: Observation) -> None:
 
 
 def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
-    """Trace the residual of what is on the bench."""
+    """Trace the residual of the observations of a bench."""
     observation, declared = bench.observation, bench.declared
     count = len(observation.acquisitions)
     say = progress or (lambda text: None)
@@ -149,13 +150,13 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
 
 
 def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
-    """Tell whether a residual is significant, by itself or by what it moves with."""
+    """Return whether a residual or one of its dependences is significant."""
     return left.p_value < SIGNIFICANT or moving(moves) is not None
 
 
 def make_bench(observation: Observation, observations: Sequence[Observation],
                recordings: Sequence[Recording], declared: Sequence[Effect]) -> Bench:
-    """Return all that scoring needs of `observation`, which holds the `observations` together."""
+    """Return what scoring needs of `observation`, the joined `observations` of `recordings`."""
     lines = choose_lines(observation)
     count = len(observation.acquisitions)
     fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
