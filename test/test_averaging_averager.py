@@ -165,6 +165,7 @@ def test_a_stream_may_end_without_an_average():
     ({'sample_rate': None}, 'sample_rate is None: give a number'),
     ({'ratio': '2.5'}, "ratio is '2.5': give a number"),
     ({'time_tolerance': []}, r'time_tolerance is \[\]: give a number'),
+    ({'maximum_discarded': 0.5}, 'maximum_discarded is 0.5: .* consecutive trigger cycles only'),
     ({'keyphasor_rate': -1.0}, 'keyphasor_rate is -1')])
 def test_parameters_that_cannot_be_used_are_refused(options, text):
     with pytest.raises(sa.ParameterError, match=text):
@@ -215,7 +216,8 @@ def test_whole_floats_numpy_scalars_and_0d_arrays_are_numbers():
     numbers = {'ratio': 2.0, 'pulses_per_revolution': 1, 'pulses_per_trigger': 1,
                'trigger_cycles': 10.0, 'keyphasor_rate': 1e3, 'samples_per_revolution': 64,
                'missing_teeth': 0, 'maximum_missing': 3, 'interval_tolerance': 0.25,
-               'minimum_interval': 0.0, 'time_tolerance': 0.01, 'start_time': 0.0}
+               'minimum_interval': 0.0, 'time_tolerance': 0.01, 'start_time': 0.0,
+               'maximum_discarded': 0.0}
     expected = sa.average(VIBRATION, RATE, PULSES, **numbers)
     for kind in (np.array, np.float64):
         same(expected, sa.average(VIBRATION, kind(RATE), PULSES,

@@ -43,8 +43,9 @@ class Averager:
     `synchronous_averager`.
 
     The averages depend on the data only: not on the sizes of the blocks, and not on whether pulses
-    come before or after their samples. An average contains consecutive trigger cycles only. NaN
-    and infinite samples are a gap; double pulses are dropped; cycles with early, late or missing
+    come before or after their samples. An average contains consecutive trigger cycles only, so
+    that `maximum_discarded`, the share of discarded cycles among them, can only be 0. NaN and
+    infinite samples are a gap; double pulses are dropped; cycles with early, late or missing
     pulses are discarded. `messages` describes what was discarded, `counts` counts it. Samples wait
     for their pulses, and pulses for their samples, up to `buffer_seconds`: set a limit if one of
     the two may fail. Raises `ParameterError` for parameters that cannot be used.
@@ -71,7 +72,8 @@ class Averager:
         pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
         trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
         correct_jitter: bool = False, keyphasor_rate: float | None = None,
-        averaging: Averaging = 'block', angle_law: AngleLawName = 'linear',
+        maximum_discarded: float = 0.0, averaging: Averaging = 'block',
+        angle_law: AngleLawName = 'linear',
         interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
         interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
@@ -85,6 +87,10 @@ class Averager:
         if not np.isfinite(start_time):
             raise ParameterError(f'start_time is {start_time} s: give the time of the first '
                                  'sample on the clock of the pulses')
+        if number('maximum_discarded', maximum_discarded) != 0.0:
+            raise ParameterError(
+                f'maximum_discarded is {maximum_discarded}: an average holds consecutive trigger '
+                "cycles only, give 0; missing_pulses 'bridge' puts in single missing pulses")
         if not buffer_seconds > 0.0:
             raise ParameterError(f'buffer_seconds is {buffer_seconds} s: give a positive time')
         if trigger_cycles is None and averaging != 'block':
@@ -176,7 +182,8 @@ def average(
     ratio: float = 1.0, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
     trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
     correct_jitter: bool = False, keyphasor_rate: float | None = None,
-    averaging: Averaging = 'block', angle_law: AngleLawName = 'linear',
+    maximum_discarded: float = 0.0, averaging: Averaging = 'block',
+    angle_law: AngleLawName = 'linear',
     interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
     missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
     interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
@@ -215,11 +222,12 @@ def average(
         sample_rate, start_time=start_time, ratio=ratio,
         pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
         trigger_cycles=trigger_cycles, orders=orders, correct_jitter=correct_jitter,
-        keyphasor_rate=keyphasor_rate, averaging=averaging, angle_law=angle_law,
-        interpolation=interpolation, samples_per_revolution=samples_per_revolution,
-        missing_teeth=missing_teeth, missing_pulses=missing_pulses,
-        maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
-        minimum_interval=minimum_interval, time_tolerance=time_tolerance)
+        keyphasor_rate=keyphasor_rate, maximum_discarded=maximum_discarded, averaging=averaging,
+        angle_law=angle_law, interpolation=interpolation,
+        samples_per_revolution=samples_per_revolution, missing_teeth=missing_teeth,
+        missing_pulses=missing_pulses, maximum_missing=maximum_missing,
+        interval_tolerance=interval_tolerance, minimum_interval=minimum_interval,
+        time_tolerance=time_tolerance)
     samples, pulses = _array(vibration), np.asarray(pulse_times)
     if pulse_times is None:
         raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '
