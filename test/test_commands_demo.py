@@ -172,7 +172,7 @@ def test_measured_recordings_give_averages_whose_loss_is_known(
             if row and re.fullmatch(r'\d+', row[0])]
     attenuation = np.array([float(row[-5]) for row in rows])
     assert len(rows) >= 5
-    np.testing.assert_allclose(attenuation, 1.0, atol=0.01)
+    np.testing.assert_allclose(attenuation, 1.0, atol=0.01, err_msg=done.stdout)
 
 
 def test_node_that_does_not_end_is_killed(monkeypatch):
