@@ -172,12 +172,6 @@ def test_measured_recordings_give_averages_whose_loss_is_known(
             if row and re.fullmatch(r'\d+', row[0])]
     attenuation = np.array([float(row[-5]) for row in rows])
     assert len(rows) >= 5
-    if np.isnan(attenuation).all() and name == 'motor_30V_100kHz':
-        # Its marks are uneven. On a busy computer DDS may lose the first block; then cycles begin
-        # at another mark, and at some of them the standard errors are just above the limit.
-        assert 'of a recovered pulse' in done.stdout, done.stdout
-        assert 'was refused' in done.stdout, done.stdout
-        return
     np.testing.assert_allclose(attenuation, 1.0, atol=0.01, err_msg=done.stdout)
 
 

@@ -213,6 +213,13 @@ def test_unusable_parameters_are_refused_at_the_start(ros_graph):
         ros_graph.add(TachDetector, {'edge': 'up'})
 
 
+def test_status_says_who_receives_the_pulses(bench, ros_graph):
+    assert bench().diagnostics()[2]['subscribers'] == '1'
+    alone = ros_graph.add(TachDetector, {'tach_type': 'std_msgs/Float64MultiArray'},
+                          namespace='/alone')
+    assert alone.summary()[1]['subscribers'] == '0'
+
+
 def test_silence_is_not_a_keyphasor(bench, rng):
     b = bench(minimum_difference=0.5)
     play(b, 0.01 * rng.standard_normal(10000))

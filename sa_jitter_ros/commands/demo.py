@@ -151,7 +151,10 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
     address = ''
 
     def ready() -> bool:
-        return (watcher.prediction is not None and source.services_are_ready() and all(
+        # The source waits for its subscribers itself; the detector of its pulses cannot.
+        heard = not plan.waveform or watcher.status.get('tach_detector', {}).get(
+            'subscribers', '0') != '0'
+        return (heard and watcher.prediction is not None and source.services_are_ready() and all(
             watcher.count_subscribers(topic) and watcher.count_publishers(topic)
             for topic in inputs))
 

@@ -142,10 +142,11 @@ class TachDetector(MonitoringNode):
             samples_lost=samples.samples_lost)
 
     def summary(self) -> tuple[str, dict[str, str]]:
-        """Return the number of pulses found, the state levels and the threshold."""
+        """Return the numbers of pulses found and of subscribers, the levels, the threshold."""
         state = self._detector.state
         values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
         values['pulses'] = str(self._pulses)
+        values['subscribers'] = str(self._output.subscribers)
         if self._timeline.layout is None:
             return 'no waveform received yet', values
         if np.isnan(state.threshold):
