@@ -67,8 +67,8 @@ class Uniform:
 
 
 @dataclass(frozen=True)
-class Normal:
-    """Normal error of standard deviation `std` s: electrical noise on the trigger level."""
+class _OfStd:
+    """An error given by its standard deviation in s."""
 
     std: float
 
@@ -80,6 +80,11 @@ class Normal:
     def variance(self) -> float:
         """Variance in s^2."""
         return self.std**2
+
+
+@dataclass(frozen=True)
+class Normal(_OfStd):
+    """Normal error of standard deviation `std` s: electrical noise on the trigger level."""
 
     @property
     def width(self) -> float:
@@ -96,19 +101,8 @@ class Normal:
 
 
 @dataclass(frozen=True)
-class Triangular:
+class Triangular(_OfStd):
     """Symmetric triangular error of standard deviation `std` s: difference of two clocks."""
-
-    std: float
-
-    def __post_init__(self) -> None:
-        """Refuse a standard deviation that is none."""
-        _require_scale('std', self.std)
-
-    @property
-    def variance(self) -> float:
-        """Variance in s^2."""
-        return self.std**2
 
     @property
     def width(self) -> float:
