@@ -51,6 +51,7 @@ setup(
         'scipy>=1.10',
     ],
     extras_require={
+        'mat73': ['h5py>=3.7'],
         'docs': ['myst-parser>=2,<6', 'sphinx>=7.2,<10'],
         'test': [
             'catkin_pkg',
@@ -65,6 +66,7 @@ setup(
             'flake8-docstrings',
             'flake8-import-order',
             'flake8-quotes',
+            'h5py>=3.7',
             'hypothesis>=6.60,<7',
             'mypy==2.4.1',
             'pytest>=7.2,<10',

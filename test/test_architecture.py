@@ -35,7 +35,7 @@ CORE = {
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {
         'effects', 'errors', 'parameter_file', 'parameters', 'prediction', 'pulses'},
-    'recordings': SCIENCE | {'errors', 'parameters', 'pulses', 'rosbags', 'samples'},
+    'recordings': SCIENCE | {'errors', 'h5py', 'parameters', 'pulses', 'rosbags', 'samples'},
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},

@@ -19,6 +19,8 @@ import sys
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import demo
+from sa_jitter_ros.commands.command_line import (
+    add_recording_options, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import plan_recording
 from sa_jitter_ros.errors import RecordingError, SaJitterError
 from sa_jitter_ros.recordings import read, Recording
@@ -79,6 +81,26 @@ def test_trigger_cycles_are_those_of_the_recording(tmp_path):
     nodes = demo.processes(plan)
     for name in ('synchronous_averager', 'jitter_predictor'):
         assert (nodes[name]['pulses_per_revolution'], nodes[name]['pulses_per_trigger']) == (4, 2)
+
+
+def test_recording_of_other_make_is_planned_by_its_fields(tmp_path):
+    time = np.arange(round(RATE * SECONDS)) / RATE
+    teeth = np.arange(0.1, SECONDS, 1 / 36 / SPEED)
+    np.savez(tmp_path / 'other.npz', acc=np.cos(2.0 * np.pi * 12.0 * SPEED * time),
+             tach=teeth[np.arange(len(teeth)) % 36 < 34])
+    fields = ['vibration=acc', 'pulse_times=tach', f'sample_rate={RATE}', 'ratio=2',
+              'pulses_per_revolution=36', 'missing_teeth=2', 'orders=6,12']
+    parser = Parser()
+    add_recording_options(parser)
+    options = parser.parse_args([part for field in fields for part in ('--field', field)])
+    plan = plan_recording(tmp_path / 'other.npz',
+                          read(tmp_path / 'other.npz', **read_options(options)),
+                          parameters=player_options(options))
+    assert plan.speed == pytest.approx(SPEED, rel=1e-6)
+    assert (plan.ratio, plan.orders, plan.trigger_cycles) == (2.0, (6.0, 12.0), 23)
+    nodes = demo.processes(plan)
+    assert nodes['synchronous_averager']['missing_teeth'] == 2
+    assert nodes['recording_player']['fields'] == fields
 
 
 def test_recording_without_keyphasor_is_refused(machine, tmp_path):

@@ -81,6 +81,19 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
         validated(np.sort(np.append(true, true[10::12] + 0.01 / marks)), marks)
 
 
+def test_trigger_pulses_of_a_wheel_with_gaps_stay_on_its_teeth():
+    """The first pulse is not the index, and a fourth of the teeth is missing."""
+    teeth = np.arange(5, 2000)
+    recording = Recording(ArraySource(np.zeros((1, 10))), RATE,
+                          pulse_times=teeth[teeth % 12 < 9] / 12.0 / SPEED,
+                          pulses_per_revolution=12, missing_teeth=3)
+    model = replace(MODEL, pulses_per_revolution=12, trigger_speed=SPEED)
+    found = record_pulses(recording, model)
+    np.testing.assert_allclose(np.diff(found.times), 1.0 / SPEED)
+    assert found.times.size > 160
+    assert not found.missing.any()
+
+
 def test_double_pulses_are_no_effect():
     """They take acquisitions, not the verdict."""
     recording = simulated(acquisitions=18)

@@ -118,6 +118,15 @@ def test_vibration_and_pulses_arrive_as_recorded(bench, recording):
     assert player.node.counts['pulses_dropped'] == np.count_nonzero(recording.pulse_times >= 7.0)
 
 
+def test_recording_of_other_make_is_played_by_its_fields(ros_graph, recording, tmp_path):
+    np.savez(tmp_path / 'other.npz', acc=recording.read().T, tach=recording.pulse_times)
+    player = Bench(ros_graph, tmp_path / 'other.npz', fields=[
+        'vibration=acc', 'pulse_times=tach', f'sample_rate={RATE}', 'start_time=5'])
+    player.play()
+    np.testing.assert_array_equal(player.samples(), recording.read())
+    assert len(player.pulses) == np.count_nonzero(recording.pulse_times < 7.0)
+
+
 def test_waveform_and_pulses_together(bench, recording):
     player = bench(tach='both')
     player.play()
@@ -340,6 +349,7 @@ def test_pacer_follows_clock_and_rate_and_skips_a_lag():
     ({'vibration_type': 'sensor_msgs/Imu'}, ParameterError, 'vibration_type'),
     ({'acquisition': 3}, RecordingError, 'acquisition 3'),
     ({'tach_channel': 'z'}, RecordingError, "no channel 'z'"),
+    ({'fields': ['raito=2']}, ParameterError, 'a recording has no field raito'),
 ])
 def test_unusable_parameters_are_refused(bench, parameters, error, message):
     with pytest.raises(error, match=message):
@@ -354,3 +364,6 @@ def test_keyphasor_that_the_recording_lacks_is_refused(bench, recording):
 def test_main_ends_with_one_line_on_bad_input(capfd):
     assert recording_player.main(['--ros-args', '-p', 'recording:=/nowhere.npz']) == 2
     assert 'error: /nowhere.npz: no such file or folder' in capfd.readouterr().err
+    assert recording_player.main(['--field', 'raito=2', '--ros-args', '-p',
+                                  'recording:=/nowhere.npz']) == 2
+    assert 'error: a recording has no field raito: give some of' in capfd.readouterr().err

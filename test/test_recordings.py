@@ -13,6 +13,7 @@
 from dataclasses import replace
 import io
 import struct
+import sys
 import tracemalloc
 import wave
 import zipfile
@@ -22,7 +23,8 @@ import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.recordings import ArraySource, read, Recording, write_npz
-from sa_jitter_ros.recordings import limits, mat_format, npz_format
+from sa_jitter_ros.recordings import hdf5_format, limits, mat_format, npz_format
+from sa_jitter_ros.recordings.fields import fields_of
 import scipy.io
 import scipy.io.wavfile
 
@@ -301,10 +303,67 @@ def test_mat_round_trip(recording, tmp_path, compress):
     assert_same(read(path), recording)
 
 
-def test_mat_version_73_gets_a_clear_line(tmp_path):
+def save_mat73(path, **fields):
+    """Write a `.mat` as MATLAB does with '-v7.3'."""
+    h5py = pytest.importorskip('h5py')
+
+    def text(value):
+        codes = np.array([[ord(c)] for c in value], np.uint16)
+        return codes, b'char'
+
+    with h5py.File(path, 'w', userblock_size=512) as file:
+        for name, value in fields.items():
+            if isinstance(value, str):
+                content, kind = text(value)
+            elif isinstance(value, tuple):  # a cell of texts
+                cells = []
+                for number, item in enumerate(value):
+                    content, _ = text(item)
+                    cell = file.create_dataset(f'#refs#/{name}{number}', data=content)
+                    cell.attrs['MATLAB_class'] = np.bytes_('char')
+                    cells.append([cell.ref])
+                content, kind = np.array(cells, h5py.ref_dtype), b'cell'
+            else:
+                content, kind = np.atleast_2d(value).T, b'double'
+            stored = file.create_dataset(name, data=content, compression='gzip' if kind ==
+                                         b'double' else None)
+            stored.attrs['MATLAB_class'] = np.bytes_(kind)
+    with open(path, 'r+b') as file:
+        file.write(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(124) + b'\0\2IM')
+    return path
+
+
+@pytest.mark.parametrize('limit', [0, 1 << 30])
+def test_mat_of_version_73(recording, tmp_path, monkeypatch, limit):
+    monkeypatch.setattr(hdf5_format, 'IN_MEMORY_BYTES', limit)
+    path = save_mat73(
+        tmp_path / 'rig.mat', vibration=recording.read(), tach=recording.read_tach(),
+        sample_rate=RATE, tach_rate=2 * RATE, pulse_times=recording.pulse_times, start_time=12.5,
+        reference_pulse_times=recording.reference_pulse_times, pulses_per_revolution=6,
+        pulses_per_trigger=3.0, ratio=2.40789, orders=[19, 38], channel_names=('a', 'b', 'c'),
+        units=('m/s^2', 'm/s^2', 'Pa'), description='a rig')
+    assert_same(read(path), recording)
+
+
+def test_mat_of_version_73_of_another_make(recording, tmp_path):
+    """Sample x channel in a struct, pulse times under another key."""
+    path = save_mat73(tmp_path / 'rig.mat', tach=recording.pulse_times, **{
+        'rig/acc': recording.read().T})
+    opened = read(path, vibration='rig/acc', sample_rate='2000', pulse_times='tach')
+    np.testing.assert_array_equal(opened.read(), recording.read())
+    np.testing.assert_array_equal(opened.pulse_times, recording.pulse_times)
+    assert opened.remarks == ('rig/acc of shape (5000, 3) is taken as sample x channel',)
+
+
+def test_mat_of_version_73_that_is_broken_or_without_h5py(tmp_path, monkeypatch):
     path = tmp_path / 'new.mat'
     path.write_bytes(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(512, b' '))
-    with pytest.raises(RecordingError, match="save it with '-v7'"):
+    monkeypatch.setitem(sys.modules, 'h5py', None)
+    with pytest.raises(RecordingError, match=r"pip install 'sa_jitter_ros\[mat73\]'.*'-v7'"):
+        read(path)
+    monkeypatch.undo()
+    pytest.importorskip('h5py')
+    with pytest.raises(RecordingError, match=r'new\.mat: cannot be read'):
         read(path)
 
 
@@ -563,7 +622,10 @@ def test_a_missing_rate_can_be_given(recording, tmp_path):
 @pytest.mark.parametrize(('given', 'error', 'message'), [
     ({'sampel_rate': 1.0}, ParameterError, 'no field sampel_rate: give some of sample_rate, '),
     ({'vibration': [1.0]}, ParameterError, 'no field vibration'),
-    ({'ratio': 'two'}, RecordingError, 'rig.npz: ratio of type <U3: give real numbers'),
+    ({'ratio': 'two'}, RecordingError, 'ratio=two: neither a number nor a key of the file'),
+    ({'ratio': '2,3'}, RecordingError, 'ratio of shape .2,.: give a single number'),
+    ({'tach': 'trigger'}, RecordingError, 'tach=trigger: the file has no such key; it has chan'),
+    ({'missing_teeth': 6}, RecordingError, 'missing_teeth 6: must be from 0 to less than'),
     ({'pulses_per_revolution': 1.5}, RecordingError, 'give a whole number'),
     ({'pulse_times': [[1.0, 2.0], [3.0, 4.0]]}, RecordingError, 'give one row of numbers'),
 ])
@@ -571,6 +633,68 @@ def test_fields_that_cannot_be_given(recording, tmp_path, given, error, message)
     write_npz(tmp_path / 'rig.npz', recording)
     with pytest.raises(error, match=message):
         read(tmp_path / 'rig.npz', **given)
+
+
+@pytest.mark.parametrize('suffix', ['npz', 'mat'])
+def test_a_file_of_another_make_is_read_by_its_own_keys(recording, tmp_path, suffix):
+    path = tmp_path / f'rig.{suffix}'
+    samples = recording.read()
+    fields = {'DE': samples[:1].T, 'FE': samples[1:2].T, 'tach': recording.pulse_times,
+              'FS': RATE, 'rpm': 1797.0}
+    np.savez(path, **fields) if suffix == 'npz' else scipy.io.savemat(path, fields)
+    opened = read(path, **fields_of(
+        ['vibration=DE,FE', 'pulse_times=tach', 'sample_rate=FS', 'ratio=2.5', 'missing_teeth=2',
+         'pulses_per_revolution=8', 'orders=20,40, 60', 'units=g']))
+    np.testing.assert_array_equal(opened.read(), samples[:2])
+    np.testing.assert_array_equal(opened.pulse_times, recording.pulse_times)
+    assert opened.channel_names == ('DE', 'FE')
+    assert (opened.sample_rate, opened.ratio, opened.orders, opened.units) == (
+        RATE, 2.5, (20.0, 40.0, 60.0), ('g', 'g'))
+    assert (opened.pulses_per_revolution, opened.missing_teeth) == (8, 2)
+
+
+def test_keys_of_different_lengths_are_refused(tmp_path):
+    path = save(tmp_path / 'rig.npz', a=np.zeros(90), b=np.zeros(80), sample_rate=RATE)
+    with pytest.raises(RecordingError, match='different lengths: a 90, b 80 samples'):
+        read(path, vibration='a,b')
+
+
+def test_tach_of_another_make_as_long_as_the_vibration_has_its_rate(recording, tmp_path):
+    path = save(tmp_path / 'rig.npz', vibration=recording.read(), trig=np.ones(5000),
+                sample_rate=RATE)
+    opened = read(path, tach='trig')
+    assert opened.tach_rate == RATE
+    assert 'as sampled with it' in opened.remarks[0]
+
+
+def test_fields_of_wav_and_csv_name_channels(recording, tmp_path):
+    scipy.io.wavfile.write(tmp_path / 'rig.wav', 100, recording.read().T)
+    path = table(tmp_path / 'rig.csv', recording.read())
+    for name in ('rig.wav', 'rig.csv'):
+        opened = read(tmp_path / name, sample_rate='2000', tach='2', vibration='0',
+                      pulses_per_revolution='36', missing_teeth='1', orders='7')
+        assert (opened.sample_rate, opened.tach_rate, opened.channels) == (2000.0, 2000.0, 1)
+        assert (opened.pulses_per_revolution, opened.missing_teeth, opened.orders) == (
+            36, 1, (7.0,))
+        np.testing.assert_allclose(opened.read_tach(), recording.read()[2], atol=1e-4)
+    with pytest.raises(RecordingError, match=r'rig\.csv: no channel .acc.: choose from'):
+        read(path, sample_rate=RATE, vibration='acc')
+    with pytest.raises(RecordingError, match=r'rig\.csv: ratio=two: neither a number'):
+        read(path, sample_rate=RATE, ratio='two')
+
+
+@pytest.mark.parametrize('text', ['ratio', '=2', 'ratio=', 'raito=2'])
+def test_field_texts_that_say_nothing(text):
+    with pytest.raises(ParameterError, match=r'give NAME=KEY or|no field raito: give some of'):
+        fields_of([text])
+
+
+def test_pulses_without_vibration(tmp_path):
+    path = save(tmp_path / 'edges.npz', edges=np.arange(50.0))
+    with pytest.raises(RecordingError, match='no vibration among the fields edges'):
+        read(path, pulse_times='edges')
+    opened = read(path, pulse_times='edges', pulses_suffice=True)
+    assert (opened.pulse_times.size, opened.samples) == (50, 1)
 
 
 def test_a_rate_that_contradicts_the_messages_is_refused(recording, tmp_path):

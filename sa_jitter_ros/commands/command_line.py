@@ -13,6 +13,8 @@
 import argparse
 from typing import Any, NoReturn
 
+from sa_jitter_ros.recordings.fields import fields_of
+
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
 _READ_OPTIONS = ('sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
 
@@ -26,7 +28,12 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that a `.wav` or `.csv` needs, named as the parameters of the player."""
+    """Add the options for fields and channels, named as the parameters of the player."""
+    parser.add_argument('--field', action='append', default=[], dest='fields',
+                        metavar='NAME=KEY|VALUE',
+                        help='field of the recording: the key that the file has for it '
+                        '(pulse_times=tach), or its value (sample_rate=97656, orders=20,40); '
+                        'may be repeated')
     group = parser.add_argument_group('channels, if the file does not name them (.wav, .csv)')
     group.add_argument('--tach-channel', default='', metavar='CHANNEL',
                        help='name, or number from 0, of the channel with the tach waveform')
@@ -40,5 +47,14 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Return the options that were given, as keywords of `read` and parameters of the player."""
+    """Return the options that were given, as keywords of `read`; raises ParameterError."""
+    return {**_given(options), **fields_of(options.fields)}
+
+
+def player_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that were given, as parameters of the recording player."""
+    return {**_given(options), **({'fields': options.fields} if options.fields else {})}
+
+
+def _given(options: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name in _READ_OPTIONS if (value := getattr(options, name))}

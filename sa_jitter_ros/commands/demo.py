@@ -31,7 +31,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
-from sa_jitter_ros.commands.command_line import add_recording_options, Parser, read_options
+from sa_jitter_ros.commands.command_line import (
+    add_recording_options, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.errors import SaJitterError
@@ -121,7 +122,7 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
     nodes: dict[str, dict[str, object]] = {
         'synchronous_averager': {
             'pulses_per_revolution': plan.pulses_per_revolution,
-            'pulses_per_trigger': plan.pulses_per_trigger,
+            'pulses_per_trigger': plan.pulses_per_trigger, 'missing_teeth': plan.missing_teeth,
             'trigger_cycles': plan.trigger_cycles, 'shaft.ratio': plan.ratio,
             'shaft.orders': plan.orders, 'correct_jitter': True,
             'keyphasor_rate': plan.keyphasor_rate},
@@ -263,7 +264,7 @@ def main(args: Sequence[str] | None = None) -> int:
         if options.recording:
             plan = plan_recording(
                 options.recording, read(options.recording, **read_options(options)),
-                keyphasor_rate=options.keyphasor_rate, parameters=read_options(options))
+                keyphasor_rate=options.keyphasor_rate, parameters=player_options(options))
         options.output.mkdir(parents=True, exist_ok=True)  # fails before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles per average')

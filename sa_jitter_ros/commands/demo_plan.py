@@ -52,6 +52,7 @@ class Plan:
     orders: tuple[float, ...]
     waveform: bool = False
     pulses_per_trigger: int = 0
+    missing_teeth: int = 0
     note: str = ''
 
     @property
@@ -110,12 +111,14 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
         pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
         trigger_cycles=trigger_cycles,
         orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
-        waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0, note=note)
+        waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0,
+        missing_teeth=recording.missing_teeth, note=note)
 
 
 def _keyphasor(recording: Recording) -> KeyphasorParameters:
     return KeyphasorParameters(pulses_per_revolution=recording.pulses_per_revolution,
-                               pulses_per_trigger=recording.pulses_per_trigger)
+                               pulses_per_trigger=recording.pulses_per_trigger,
+                               missing_teeth=recording.missing_teeth)
 
 
 def _first_seconds(recording: Recording) -> tuple[FloatArray, FloatArray]:
@@ -130,7 +133,8 @@ def _strongest_orders(recording: Recording, samples: FloatArray, pulses: FloatAr
     averages = Averager(
         recording.sample_rate, start_time=recording.start_time, ratio=recording.ratio,
         pulses_per_revolution=recording.pulses_per_revolution,
-        pulses_per_trigger=recording.pulses_per_trigger, trigger_cycles=trigger_cycles,
+        pulses_per_trigger=recording.pulses_per_trigger,
+        missing_teeth=recording.missing_teeth, trigger_cycles=trigger_cycles,
     ).update(samples, pulses)
     if not averages:
         return (1.0, 2.0, 3.0)

@@ -95,7 +95,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'check that the tach waveform crosses its threshold')
-    pulses, counts = _validated(measured)
+    pulses, counts = _validated(measured, recording)
     spurious = counts.doubles + counts.early
     if spurious > _MOST_SPURIOUS * measured.size:
         raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
@@ -143,10 +143,14 @@ class _Accepted:
             np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1])
 
 
-def _validated(times: FloatArray) -> tuple[_Accepted, PulseCounts]:
-    """Return the accepted pulses, and the counts of all pulses."""
+def _validated(times: FloatArray, recording: Recording | None = None
+               ) -> tuple[_Accepted, PulseCounts]:
+    """Return the accepted pulses of the target of `recording`, and the counts of all pulses."""
+    target = {} if recording is None or not recording.missing_teeth else {
+        'pulses_per_revolution': recording.pulses_per_revolution, 'pulses_per_trigger': 1,
+        'missing_teeth': recording.missing_teeth}
     # Every pulse is a trigger here, so that pulses are counted also where a run is interrupted.
-    validator = PulseValidator(missing_pulses='bridge', interval_tolerance=_TOLERANCE)
+    validator = PulseValidator(missing_pulses='bridge', interval_tolerance=_TOLERANCE, **target)
     found = validator.update(times)
     number = found.count.copy()
     for begin in np.flatnonzero(np.diff(number) <= 0) + 1:  # after a gap of unknown length

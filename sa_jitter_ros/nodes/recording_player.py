@@ -10,16 +10,21 @@
 
 """Node `recording_player`: publishes a recording as if it were measured now."""
 
+import argparse
 from collections.abc import Iterator, Sequence
+import json
+import sys
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
+from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
@@ -47,6 +52,8 @@ PARAMETERS = (
               read_only=True),
     Parameter('time_column', '', 'name or number of the column of a .csv with the times',
               read_only=True),
+    Parameter('fields', [], 'fields of the recording, each as NAME=KEY, the key that the file has '
+              'for it, or NAME=VALUE', element=str, read_only=True),
 )
 
 
@@ -59,9 +66,11 @@ class RecordingPlayer(PlaybackNode):
         if not values['recording']:
             raise ParameterError('no recording is given: set the parameter recording to a file, '
                                  'as in --ros-args -p recording:=rig.npz')
+        fields: Values = {'sample_rate': values['sample_rate'] or None,
+                          **fields_of(values['fields'])}
         self._recording = recording = read(
-            values['recording'], keyphasor=values['recorded_keyphasor'],
-            sample_rate=values['sample_rate'] or None, **{name: values[name] for name in (
+            values['recording'], keyphasor=values['recorded_keyphasor'], **fields,
+            **{name: values[name] for name in (
                 'acquisition', 'vibration_channels', 'tach_channel', 'time_column')})
         for remark in recording.remarks:
             self.warn(remark)
@@ -167,6 +176,24 @@ class _SampleQueue:
         return taken
 
 
+def with_fields(args: Sequence[str]) -> list[str]:
+    """
+    Return a command line in which the parameter `fields` holds the options `--field`.
+
+    >>> with_fields(['player', '--field', 'ratio=2.5', '--ros-args', '-p', 'rate:=2.0'])
+    ['player', '--ros-args', '-p', 'rate:=2.0', '--ros-args', '-p', 'fields:=["ratio=2.5"]']
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument('--field', action='append')
+    try:
+        found, others = parser.parse_known_args(args)
+    except argparse.ArgumentError:  # an option without its value, which rcl leaves alone
+        return list(args)
+    if found.field:
+        others += ['--ros-args', '-p', f'fields:={json.dumps(found.field)}']
+    return others
+
+
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node."""
-    return run_node(RecordingPlayer, args)
+    """Run the node; `--field NAME=VALUE` sets its parameter `fields`."""
+    return run_node(RecordingPlayer, with_fields(sys.argv if args is None else args))

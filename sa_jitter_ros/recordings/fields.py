@@ -8,14 +8,19 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The fields of `.npz` and `.mat` recordings: from named arrays to a `Recording`."""
+"""
+The fields of recordings: their names and types, and from named arrays to a `Recording`.
 
-from collections.abc import Callable, Collection, Mapping
+A field is given as a value, or as a text. The text is the key under which a `.npz` or `.mat` has
+the field, if it has one of that name, else numbers with commas between them, or a text.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.pulses.detection import counter_pulses
 from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
 
@@ -24,8 +29,12 @@ _MAX_PULSE_BYTES = 8 * MAX_PULSES
 MAX_FIELD_BYTES = 1 << 20
 
 RawArray = NDArray[Any]
+#: Returns the array under a key of a file, of at most so many bytes.
+Load = Callable[[str, int], RawArray]
 SAMPLE_FIELDS = ('vibration', 'tach', 'tach_count')
 _PULSE_FIELDS = ('pulse_times', 'reference_pulse_times')
+_TEXT_FIELDS = ('channel_names', 'units', 'description')
+_MOST_NAMED = 12  # keys of a file in a message
 
 
 def size_limit(name: str) -> int:
@@ -35,8 +44,76 @@ def size_limit(name: str) -> int:
     return _MAX_PULSE_BYTES if name in _PULSE_FIELDS else MAX_FIELD_BYTES
 
 
-def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray], *,
-                          acquisition: int, given: Mapping[str, Any]) -> Recording:
+def fields_of(texts: Iterable[str]) -> dict[str, str]:
+    """
+    Return the fields that texts `NAME=KEY` or `NAME=VALUE` give; raises ParameterError.
+
+    >>> fields_of(['pulse_times=tach', 'orders=20,40'])
+    {'pulse_times': 'tach', 'orders': '20,40'}
+    """
+    found = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.partition('='))
+        if not (name and equals and value):
+            raise ParameterError(f'field {text!r}: give NAME=KEY or NAME=VALUE, as in '
+                                 'pulse_times=tach or sample_rate=97656')
+        found[name] = value
+    require_fields(found)
+    return found
+
+
+def require_fields(fields: Mapping[str, Any]) -> None:
+    """Raise ParameterError for names that no field has, and for samples given as values."""
+    unknown = sorted(name for name, value in fields.items() if name not in FIELDS or (
+        name in SAMPLE_FIELDS and value is not None and not isinstance(value, str)))
+    if unknown:
+        raise ParameterError(f'a recording has no field {", ".join(unknown)}: give some of '
+                             f'{", ".join(CONVERTED)}; {", ".join(SAMPLE_FIELDS)} by the key that '
+                             'the file has for them')
+
+
+def given_fields(fields: Mapping[str, Any], keys: Collection[str] = ()
+                 ) -> tuple[dict[str, Any], dict[str, tuple[str, ...]]]:
+    """
+    Return the values that `fields` give, in the types of `Recording`, and the keys that they name.
+
+    `keys` are those of the file. Samples are given by key only: `vibration` by one, or by several
+    with commas between them. Raises RecordingError for a text that is neither a key nor a value.
+
+    >>> given_fields({'vibration': 'de,fe', 'ratio': '2.5'}, ('de', 'fe', 'rpm'))
+    ({'ratio': 2.5}, {'vibration': ('de', 'fe')})
+    """
+    values: dict[str, Any] = {}
+    sources: dict[str, tuple[str, ...]] = {}
+    for name, value in fields.items():
+        if value is None:
+            continue
+        if isinstance(value, str) and value in keys:
+            sources[name] = (value,)
+        elif name in SAMPLE_FIELDS:
+            named = _listed(value) if isinstance(value, str) else ()
+            if not named or not set(named) <= set(keys):
+                raise RecordingError(f'{name}={value!s:.40}: the file has no such key; it has '
+                                     f'{shown_keys(keys)}')
+            sources[name] = tuple(named)
+        elif isinstance(value, str) and name not in _TEXT_FIELDS:
+            values[name] = _numbers(name, value, keys)
+        elif isinstance(value, str) and name != 'description':
+            values[name] = _listed(value)
+        else:
+            values[name] = value
+    return converted_fields(values), sources
+
+
+def shown_keys(keys: Collection[str]) -> str:
+    """Return the keys of a file as a short text."""
+    some = sorted(keys)[:_MOST_NAMED]
+    return ', '.join(some) + (', ...' if len(keys) > len(some) else '') if some else 'none'
+
+
+def recording_from_fields(names: Collection[str], load: Load, *,
+                          acquisition: int, given: Mapping[str, Any],
+                          pulses_suffice: bool = False) -> Recording:
     """
     Build a recording from named arrays.
 
@@ -49,11 +126,13 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     names
         The fields of the file; unknown ones are ignored.
     load
-        Returns the array of a name.
+        Returns the array under a name, of at most so many bytes.
     acquisition
         Number of the acquisition, from 0.
     given
-        Values of `converted_fields` that replace those of the file.
+        Values that replace those of the file, and texts that name other keys: `given_fields`.
+    pulses_suffice
+        A file without vibration is read as one whose vibration is a single NaN.
 
     Raises
     ------
@@ -63,23 +142,42 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
     Examples
     --------
     >>> arrays = {'vibration': np.zeros((2, 1000)), 'tach_count': np.arange(1000) // 40}
-    >>> recording = recording_from_fields(arrays, arrays.__getitem__, acquisition=0,
-    ...                                   given={'sample_rate': 1e3, 'tach_rate': 1e3})
+    >>> recording = recording_from_fields(arrays, lambda name, limit: arrays[name],
+    ...                                   acquisition=0, given={
+    ...                                       'sample_rate': 1e3, 'tach_rate': 1e3})
     >>> recording.channels, recording.pulse_times[:3]
     (2, array([0.04, 0.08, 0.12]))
 
     """
-    if 'vibration' not in names:
+    values, sources = given_fields(given, names)
+    taken = {key for several in sources.values() for key in several}
+    keys = {**{name: (name,) for name in FIELDS
+               if name in names and name not in values and name not in taken}, **sources}
+    remarks: list[str] = []
+    if 'vibration' in keys:
+        vibration = _stacked(keys['vibration'], load, remarks, mapped='vibration' in sources)
+        if len(keys['vibration']) > 1:
+            values.setdefault('channel_names', keys['vibration'])
+    elif pulses_suffice:
+        vibration = np.full((1, 1), np.nan)
+        values.setdefault('sample_rate', 1.0)
+    else:
         raise RecordingError(
-            f'no vibration among the fields {sorted(names)}: add vibration, channel x sample')
-    if 'sample_rate' not in {*names, *given}:
+            f'no vibration among the fields {shown_keys(names)}: add vibration, channel x sample, '
+            'or name its key: vibration=KEY')
+    tach = (_stacked(keys['tach'], load, remarks, mapped='tach' in sources)
+            if 'tach' in keys else None)
+    values.update(converted_fields({
+        name: load(keys[name][0], size_limit(name)) for name in CONVERTED
+        if name in keys and name not in values}))
+    if 'sample_rate' not in values:
         raise RecordingError('no sample_rate: add the sampling rate of the vibration in Hz to the '
                              'file, or give sample_rate')
-    vibration = _samples('vibration', load('vibration'))
-    tach = _samples('tach', load('tach')) if 'tach' in names else None
-    values = converted_fields({name: load(name) for name in CONVERTED
-                               if name in names and name not in given})
-    values.update(given)
+    if ('tach' in sources and tach is not None and 'tach_rate' not in values
+            and tach.shape[-1] == vibration.shape[-1]):
+        values['tach_rate'] = values['sample_rate']
+        remarks.append('the tach waveform has no tach_rate and as many samples as the vibration: '
+                       'it is taken as sampled with it')
     acquisitions = 1
     if tach is not None and len(tach) > 1:
         if len(tach) != len(vibration):
@@ -96,14 +194,15 @@ def recording_from_fields(names: Collection[str], load: Callable[[str], RawArray
         for name in ('channel_names', 'units'):
             if len(values.get(name, ())) > 1:
                 values[name] = values[name][row]
-    if 'tach_count' in names and tach is None and 'pulse_times' not in values:
+    if 'tach_count' in keys and tach is None and 'pulse_times' not in values:
         tach_rate = values.get('tach_rate')
         if tach_rate is None or not tach_rate > 0:
             raise RecordingError('tach_count without a positive tach_rate: add its rate in Hz')
         values['pulse_times'] = _counted_pulses(
-            load('tach_count'), values.get('start_time', 0.0), tach_rate)
+            load(keys['tach_count'][0], size_limit('tach_count')),
+            values.get('start_time', 0.0), tach_rate)
     return Recording(ArraySource(vibration), tach=None if tach is None else ArraySource(tach),
-                     acquisitions=acquisitions, **values)
+                     acquisitions=acquisitions, remarks=tuple(remarks), **values)
 
 
 def converted_fields(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,6 +216,37 @@ def _real(name: str, array: RawArray) -> RawArray:
     return array
 
 
+def _listed(text: str) -> list[str]:
+    return [part.strip() for part in text.split(',') if part.strip()]
+
+
+def _numbers(name: str, text: str, keys: Collection[str]) -> list[float]:
+    try:
+        return [float(part) for part in _listed(text)]
+    except ValueError:
+        known = f', which are {shown_keys(keys)}' if keys else ''
+        raise RecordingError(f'{name}={text:.40}: neither a number nor a key of the file{known}'
+                             ) from None
+
+
+def _stacked(keys: Sequence[str], load: Load, remarks: list[str], *,
+             mapped: bool) -> RawArray:
+    """Return the samples under some keys; `mapped`: by the user, in either orientation."""
+    parts = []
+    for key in keys:
+        array = load(key, _MAX_SAMPLE_BYTES)
+        if mapped and array.ndim == 2 and array.shape[0] > array.shape[1] > 1:
+            remarks.append(f'{key} of shape {array.shape} is taken as sample x channel')
+            array = array.T
+        parts.append(_samples(key, array))
+    if len({part.shape[1] for part in parts}) > 1:
+        raise RecordingError(
+            'channels of different lengths: '
+            + ', '.join(f'{key} {part.shape[1]}' for key, part in zip(keys, parts))
+            + ' samples; choose those that were sampled together')
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
 def _samples(name: str, array: RawArray) -> RawArray:
     array = _real(name, array)
     if array.ndim == 1 or (array.ndim == 2 and array.shape[1] == 1):
@@ -126,7 +256,7 @@ def _samples(name: str, array: RawArray) -> RawArray:
     if array.shape[0] > array.shape[1]:
         raise RecordingError(
             f'{name} of shape {array.shape}: more channels than samples; store channel x sample '
-            '(transpose it)')
+            f'(transpose it), or give {name}={name}, which takes either')
     return array
 
 
@@ -142,10 +272,10 @@ def _number(name: str, array: RawArray) -> float:
     return float(_real(name, array).reshape(-1)[0])
 
 
-def _count(name: str, array: RawArray) -> int:
+def _count(name: str, array: RawArray, *, least: int = 1) -> int:
     value = _number(name, array)
-    if not (value == np.floor(value) and 1 <= value < 2**31):
-        raise RecordingError(f'{name} {value}: give a whole number, at least 1')
+    if not (value == np.floor(value) and least <= value < 2**31):
+        raise RecordingError(f'{name} {value}: give a whole number, at least {least}')
     return int(value)
 
 
@@ -178,6 +308,7 @@ def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatA
 CONVERTED: Mapping[str, Callable[[str, RawArray], Any]] = {
     'sample_rate': _number, 'tach_rate': _number, 'start_time': _number, 'ratio': _number,
     'pulses_per_revolution': _count, 'pulses_per_trigger': _count,
+    'missing_teeth': lambda name, array: _count(name, array, least=0),
     'pulse_times': _vector, 'reference_pulse_times': _vector,
     'orders': lambda name, array: tuple(_vector(name, array).tolist()),
     'channel_names': _strings, 'units': _strings,

@@ -11,6 +11,8 @@
 """
 Recordings in MATLAB `.mat` files of version 5 to 7, read with bounded memory.
 
+Those of version 7.3 are HDF5: `hdf5_format` reads them.
+
 Only numbers, text and cells of text are parsed, from a map of the file. A compressed variable is
 unpacked once into an unnamed temporary file. Format: MathWorks, MAT-File Format, chapter 1.
 
@@ -21,8 +23,9 @@ have to walk all tags, also those of compressed variables, and this walk is most
 Second, loadmat reads whole variables into memory, with no limit of their unpacked size.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 import mmap
 from pathlib import Path
@@ -34,7 +37,8 @@ import zlib
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import (
-    FIELDS, MAX_FIELD_BYTES, RawArray, recording_from_fields, size_limit)
+    MAX_FIELD_BYTES, RawArray, recording_from_fields)
+from sa_jitter_ros.recordings.hdf5_format import open_hdf5
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
@@ -46,7 +50,7 @@ _COMPLEX = 0x0800
 _NUMBERS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 9: 'f8', 12: 'i8',
             13: 'u8'}
 _TEXTS = {1: 'latin-1', 2: 'latin-1', 4: 'utf-16', 16: 'utf-8', 17: 'utf-16', 18: 'utf-32'}
-_HEAD, _STEP = 4096, 1 << 20
+_HEADER, _HEAD, _STEP = 128, 4096, 1 << 20
 
 
 @dataclass(frozen=True)
@@ -69,27 +73,30 @@ class _Matrix:
     stop: int
 
 
-def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any]) -> Recording:
+def open_mat(path: Path, *, acquisition: int, given: Mapping[str, Any],
+             pulses_suffice: bool = False) -> Recording:
     """
     Open a `.mat` recording; fields as in `recording_from_fields`.
 
-    Raises RecordingError if the file is broken, of version 4 or 7.3, or a variable of a recording
-    has the wrong class.
+    Raises RecordingError if the file is broken, of version 4, of version 7.3 without h5py, or a
+    variable of a recording has the wrong class.
     """
     with recording_errors(path):
         with open(path, 'rb') as file:
-            order = _byte_order(file.read(128))
+            head = file.read(_HEADER)
+            if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
+                return open_hdf5(path, acquisition=acquisition, given=given,
+                                 pulses_suffice=pulses_suffice)
+            order = _byte_order(head)
             whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         variables = dict(_Reader(order).variables(whole))
-        return recording_from_fields(variables, variables.__getitem__, acquisition=acquisition,
-                                     given=given)
+        return recording_from_fields(variables, lambda name, limit: variables[name](limit),
+                                     acquisition=acquisition, given=given,
+                                     pulses_suffice=pulses_suffice)
 
 
 def _byte_order(head: bytes) -> str:
-    if head.startswith((b'MATLAB 7.3', b'\x89HDF')):
-        raise RecordingError("MATLAB version 7.3 (HDF5) is not read; save it with '-v7', or as "
-                             '.npz if a variable is larger than 2 GB')
-    if len(head) < 128 or head[126:128] not in (b'IM', b'MI'):
+    if len(head) < _HEADER or head[126:128] not in (b'IM', b'MI'):
         raise RecordingError("is not a MATLAB file of version 5 to 7: save it with '-v7'")
     return '<' if head[126:128] == b'IM' else '>'
 
@@ -100,25 +107,26 @@ class _Reader:
     def __init__(self, order: str) -> None:
         self._order = order
 
-    def variables(self, whole: _Buffer) -> Iterator[tuple[str, RawArray]]:
-        """Iterate over names and arrays of the variables that are fields of a recording."""
-        start = 128
+    def variables(self, whole: _Buffer) -> Iterator[tuple[str, Callable[[int], RawArray]]]:
+        """Iterate over the names of the variables and what reads the array of each."""
+        start = _HEADER
         while start + 8 <= len(whole):
             element = self._element(whole, start, len(whole))
             start = element.stop
             if element.kind == _MATRIX:
                 matrix = self._matrix(whole, element)
-                if matrix.name in FIELDS:
-                    yield matrix.name, self._array(whole, matrix)
+                yield matrix.name, partial(self._array, whole, matrix)
             elif element.kind == _COMPRESSED:
                 packed = whole[element.start:min(element.start + _HEAD, element.stop)]
                 head = zlib.decompressobj().decompress(packed, _HEAD)
                 tag = self._element(head, 0, None)
-                matrix = self._matrix(head, tag)
-                if matrix.name in FIELDS:
-                    data = _inflate(whole, element, 8 + tag.stop - tag.start)
-                    yield matrix.name, self._array(
-                        data, self._matrix(data, self._element(data, 0, len(data))))
+                yield (self._matrix(head, tag).name,
+                       partial(self._unpacked, whole, element, 8 + tag.stop - tag.start))
+
+    def _unpacked(self, whole: _Buffer, element: _Element, size: int, limit: int) -> RawArray:
+        """Read the array of a compressed variable of `size` bytes."""
+        data = _inflate(whole, element, size)
+        return self._array(data, self._matrix(data, self._element(data, 0, len(data))), limit)
 
     def _element(self, data: _Buffer, start: int, limit: int | None) -> _Element:
         """Read the tag at `start`, of an element that ends at `limit` or before."""
@@ -149,8 +157,7 @@ class _Reader:
         return _Matrix(data[name.start:name.stop].decode('ascii', 'replace'), kind,
                        tuple(shape.tolist()), at, element.stop)
 
-    def _array(self, data: _Buffer, matrix: _Matrix) -> RawArray:
-        limit = size_limit(matrix.name)
+    def _array(self, data: _Buffer, matrix: _Matrix, limit: int) -> RawArray:
         if not matrix.shape or min(matrix.shape) < 0 or 8 * prod(matrix.shape) > limit:
             raise RecordingError(f'{matrix.name} of shape {matrix.shape} exceeds its limit of '
                                  f'{limit} bytes: split the recording')

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike
 from sa_jitter_ros.errors import RecordingError
-from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields, size_limit
+from sa_jitter_ros.recordings.fields import RawArray, recording_from_fields
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
@@ -38,7 +38,8 @@ _COPY_BYTES = 1 << 20
 _HEADER_BYTES = 10_000
 
 
-def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any]) -> Recording:
+def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any],
+             pulses_suffice: bool = False) -> Recording:
     """
     Open an `.npz` recording; fields as in `recording_from_fields`.
 
@@ -48,8 +49,8 @@ def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any]) -> Recor
     with recording_errors(path), zipfile.ZipFile(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
         return recording_from_fields(
-            names, lambda name: _member(archive, path, name), acquisition=acquisition,
-            given=given)
+            names, lambda name, limit: _member(archive, path, name, limit),
+            acquisition=acquisition, given=given, pulses_suffice=pulses_suffice)
 
 
 def write_npz(path: str | os.PathLike[str], recording: Recording, *,
@@ -71,7 +72,8 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
         'sample_rate': recording.sample_rate, 'tach_rate': recording.tach_rate,
         'pulse_times': recording.pulse_times, 'start_time': recording.start_time,
         'pulses_per_revolution': recording.pulses_per_revolution,
-        'pulses_per_trigger': recording.pulses_per_trigger, 'ratio': recording.ratio,
+        'pulses_per_trigger': recording.pulses_per_trigger,
+        'missing_teeth': recording.missing_teeth, 'ratio': recording.ratio,
         'orders': np.array(recording.orders), 'channel_names': np.array(recording.channel_names),
         'units': np.array(recording.units),
         'reference_pulse_times': recording.reference_pulse_times,
@@ -93,7 +95,7 @@ def write_npz(path: str | os.PathLike[str], recording: Recording, *,
                     stream.write(block.astype(dtype).tobytes(order='F'))
 
 
-def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
+def _member(archive: zipfile.ZipFile, path: Path, name: str, limit: int) -> RawArray:
     """Return the array of a member: in memory if small, else mapped from a file."""
     info = archive.getinfo(f'{name}.npy')
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -106,9 +108,9 @@ def _member(archive: zipfile.ZipFile, path: Path, name: str) -> RawArray:
             raise RecordingError(
                 f'{name}: {shape} of {dtype} needs {size} bytes, the file has '
                 f'{info.file_size - start}: it is truncated or broken; copy it again')
-        if size > size_limit(name):
-            raise RecordingError(f'{name}: {size} bytes exceed its limit of {size_limit(name)}: '
-                                 'split the recording')
+        if size > limit:
+            raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: split the '
+                                 'recording')
         order: Any = 'F' if fortran else 'C'
         if size <= IN_MEMORY_BYTES:
             data = stream.read(size)

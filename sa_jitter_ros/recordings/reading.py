@@ -10,17 +10,17 @@
 
 """Opening a recording of any format: `read`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import os
 from pathlib import Path
 from typing import Any
 
-from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.bag_format import open_bag
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.csv_format import open_csv
-from sa_jitter_ros.recordings.fields import CONVERTED, converted_fields
+from sa_jitter_ros.recordings.fields import given_fields, require_fields, SAMPLE_FIELDS
 from sa_jitter_ros.recordings.mat_format import open_mat
 from sa_jitter_ros.recordings.npz_format import open_npz
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
@@ -31,7 +31,7 @@ _SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
          vibration_channels: Sequence[str | int] = (), tach_channel: str | int = '',
-         time_column: str | int = '', **fields: Any) -> Recording:
+         time_column: str | int = '', pulses_suffice: bool = False, **fields: Any) -> Recording:
     """
     Open a recording of any format; its samples are read later, in blocks of bounded memory.
 
@@ -52,12 +52,17 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     time_column
         Name or number of the column of a `.csv` with the sample times in s; '' for one named
         `time` or `t`.
+    pulses_suffice
+        Read a `.npz` or `.mat` without vibration, too, as one whose vibration is a single NaN.
     fields
         Values that are not in the file, or replace those of the file, by their names in
         `Recording`: `sample_rate` (Hz), `start_time` (s), `pulse_times` (s),
         `reference_pulse_times` (s), `tach_rate` (Hz), `pulses_per_revolution`,
-        `pulses_per_trigger`, `ratio`, `orders`, `channel_names`, `units`, `description`. None is
-        the value of the file. The sample times of a `.csv` or a bag are not replaced:
+        `pulses_per_trigger`, `missing_teeth`, `ratio`, `orders`, `channel_names`, `units`,
+        `description`. None is the value of the file. A text is the key under which a `.npz` or
+        `.mat` has the field (`pulse_times='tach'`), else numbers (`orders='20,40'`).
+        `vibration`, `tach` and `tach_count` are given by key; in other formats `vibration` and
+        `tach` name channels. The sample times of a `.csv` or a bag are not replaced:
         `sample_rate` must agree with them.
 
     Raises
@@ -80,15 +85,13 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     (2, 1.0, 2.5, (20.0, 40.0))
 
     """
-    unknown = sorted(fields.keys() - CONVERTED.keys())
-    if unknown:
-        raise ParameterError(f'a recording has no field {", ".join(unknown)}: give some of '
-                             f'{", ".join(CONVERTED)}')
+    require_fields(fields)
     path = Path(path)
     if isinstance(vibration_channels, str):
         vibration_channels = (vibration_channels,)
     channel_map = ChannelMap(tuple(map(str, vibration_channels)), str(tach_channel),
                              str(time_column))
+    fields = {name: value for name, value in fields.items() if value is not None}
     with recording_errors(path):
         if not path.exists():
             raise RecordingError('no such file or folder: check the path')
@@ -96,20 +99,37 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
         if suffix not in ('bag', *_SUFFIXES):
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
                                  f'{", ".join(_SUFFIXES)} or a rosbag2 folder; convert it')
-        given = converted_fields({key: value for key, value in fields.items()
-                                  if value is not None})
         if suffix in ('.npz', '.mat'):
             opened = open_npz if suffix == '.npz' else open_mat
-            recording = channel_map.select(opened(path, acquisition=acquisition, given=given))
-        elif suffix == '.wav':
-            recording = channel_map.select(replace(open_wav(path), **given))
+            recording = channel_map.select(opened(
+                path, acquisition=acquisition, given=fields, pulses_suffice=pulses_suffice))
         else:
-            rate = given.pop('sample_rate', None)
-            recording = replace(
-                open_csv(path, channel_map=channel_map, sample_rate=rate) if suffix == '.csv' else
-                open_bag(path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
-                **given)
+            channel_map, given = _in_channels(channel_map, fields)
+            if suffix == '.wav':
+                recording = channel_map.select(replace(open_wav(path), **given))
+            else:
+                rate = given.pop('sample_rate', None)
+                recording = replace(
+                    open_csv(path, channel_map=channel_map, sample_rate=rate)
+                    if suffix == '.csv' else open_bag(
+                        path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
+                    **given)
         if not 0 <= acquisition < recording.acquisitions:
             raise RecordingError(f'acquisition {acquisition}: the file has '
                                  f'{recording.acquisitions}, numbered from 0')
         return replace(recording, description=recording.description or path.name, path=str(path))
+
+
+def _in_channels(channel_map: ChannelMap, fields: Mapping[str, Any]
+                 ) -> tuple[ChannelMap, dict[str, Any]]:
+    """Return the channel map with the channels that `fields` name, and the other fields."""
+    named = {name: str(fields[name]) for name in SAMPLE_FIELDS if name in fields}
+    if 'tach_count' in named:
+        raise RecordingError('tach_count is a field of .npz and .mat only: convert the file')
+    values, _ = given_fields({name: value for name, value in fields.items() if name not in named})
+    if 'vibration' in named:
+        channels = tuple(part.strip() for part in named['vibration'].split(','))
+        channel_map = replace(channel_map, vibration=channels)
+    if 'tach' in named:
+        channel_map = replace(channel_map, tach=named['tach'])
+    return channel_map, values

@@ -99,6 +99,8 @@ class Recording:
         Of the tach shaft.
     pulses_per_trigger
         Pulses of a trigger cycle; None where the file does not say.
+    missing_teeth
+        Of the target; `pulses_per_revolution` counts them, too.
     ratio
         Speed of the shaft of interest over the speed of the tach shaft.
     orders
@@ -145,6 +147,7 @@ class Recording:
     tach_rate: float | None = None
     pulses_per_revolution: int = 1
     pulses_per_trigger: int | None = None
+    missing_teeth: int = 0
     ratio: float = 1.0
     orders: tuple[float, ...] = ()
     reference_pulse_times: FloatArray | None = None
@@ -156,7 +159,7 @@ class Recording:
     def __post_init__(self) -> None:
         """Check that the parts fit each other, and fill in names and units."""
         for name in ('sample_rate', 'start_time', 'tach_rate', 'pulses_per_revolution',
-                     'pulses_per_trigger', 'ratio'):
+                     'pulses_per_trigger', 'missing_teeth', 'ratio'):
             object.__setattr__(self, name, unwrapped(getattr(self, name)))
         channels = self.vibration.channels
         if not 1 <= channels <= _MAX_CHANNELS or self.vibration.samples < 1:
@@ -180,6 +183,10 @@ class Recording:
         if self.pulses_per_trigger is not None and self.pulses_per_trigger < 1:
             raise RecordingError(
                 f'pulses_per_trigger {self.pulses_per_trigger}: must be at least 1')
+        if not 0 <= self.missing_teeth < self.pulses_per_revolution:
+            raise RecordingError(
+                f'missing_teeth {self.missing_teeth}: must be from 0 to less than '
+                f'pulses_per_revolution ({self.pulses_per_revolution}), which counts them, too')
         for order in self.orders:
             _check_positive('orders', order)
         for name in ('pulse_times', 'reference_pulse_times'):

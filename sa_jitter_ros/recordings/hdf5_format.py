@@ -1,0 +1,92 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Recordings in MATLAB `.mat` files of version 7.3, which are HDF5, read by h5py.
+
+h5py is an optional dependency. A MATLAB array of shape (a, b) is an HDF5 dataset of shape (b, a);
+a text is a dataset of character codes, a cell one of references. Large datasets are read chunk by
+chunk into an unnamed temporary file and mapped there, as members of an `.npz` are.
+"""
+
+from collections.abc import Mapping
+from math import prod
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
+from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
+from sa_jitter_ros.recordings.recording import Recording
+
+_ROWS_BYTES = 1 << 24
+_MOST_CELLS = 10_000
+
+
+def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
+              pulses_suffice: bool = False) -> Recording:
+    """
+    Open a `.mat` recording of version 7.3; fields as in `recording_from_fields`.
+
+    A variable inside a struct has the key `struct/variable`. Raises RecordingError if h5py is not
+    installed, the file is broken, or a variable has the wrong class.
+    """
+    try:
+        import h5py
+    except ImportError:
+        raise RecordingError('MATLAB version 7.3 (HDF5) is read with h5py, which is not '
+                             "installed: pip install 'sa_jitter_ros[mat73]' or h5py, or save the "
+                             "file with '-v7'") from None
+    with h5py.File(path, 'r') as file:
+        keys: list[str] = []
+        file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset)
+                        and not name.startswith('#') else None)
+        return recording_from_fields(
+            keys, lambda name, limit: _array(file, name, limit), acquisition=acquisition,
+            given=given, pulses_suffice=pulses_suffice)
+
+
+def _array(file: Any, name: str, limit: int) -> RawArray:
+    """Return the array of a dataset, of at most `limit` bytes, as MATLAB has it."""
+    dataset = file[name]
+    kind = dataset.attrs.get('MATLAB_class', b'')
+    if kind == b'cell':
+        if dataset.size > _MOST_CELLS:
+            raise RecordingError(f'{name} has {dataset.size} cells: at most {_MOST_CELLS} are '
+                                 'read')
+        return np.array([_text(name, file[cell]) for cell in np.ravel(dataset[()])])
+    if kind == b'char':
+        return np.array([_text(name, dataset)])
+    if dataset.dtype.kind not in 'fiub':
+        raise RecordingError(f'{name} has type {dataset.dtype}: give real numbers or text')
+    shape, size = dataset.shape, prod(dataset.shape) * dataset.dtype.itemsize
+    if size > limit:
+        raise RecordingError(f'{name}: {size} bytes exceed its limit of {limit}: split the '
+                             'recording')
+    if size <= IN_MEMORY_BYTES:
+        return np.asarray(dataset[()]).T
+    check_inflation(name, dataset.id.get_storage_size(), size, 'store it without compression')
+    with tempfile.TemporaryFile() as spool:
+        rows = max(1, _ROWS_BYTES * shape[0] // size)
+        for start in range(0, shape[0], rows):
+            spool.write(np.ascontiguousarray(dataset[start:start + rows]).tobytes())
+        spool.flush()
+        return np.memmap(spool, dataset.dtype, 'r', 0, shape).T
+
+
+def _text(name: str, dataset: Any) -> str:
+    """Return a text, which is stored as character codes (column by column)."""
+    if dataset.dtype.kind != 'u' or 4 * dataset.size > MAX_FIELD_BYTES:
+        raise RecordingError(f'{name} has a cell of type {dataset.dtype}: give text only')
+    if dataset.attrs.get('MATLAB_empty', 0):
+        return ''
+    return ''.join(map(chr, np.ravel(dataset[()], order='F').tolist()))
