@@ -73,6 +73,8 @@ setup(
             'pytest-cov>=4,<8',
             'pytest-timeout>=2.1,<3',
             'pytest-xdist>=3.1,<4',
+            'ros-ament-flake8>=0.17.3',
+            'ros-ament-pep257>=0.17.3',
             'ruff==0.17.6',
         ],
     },

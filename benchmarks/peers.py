@@ -65,12 +65,12 @@ class Record:
 
     @property
     def channels(self) -> int:
-        """Number of channels."""
+        """Return the number of channels."""
         return len(self.samples)
 
     @property
     def cycle_samples(self) -> int:
-        """Samples in a mean cycle of the shaft of interest."""
+        """Return the samples in a mean cycle of the shaft of interest."""
         period = (self.pulses[-1] - self.pulses[0]) / (len(self.pulses) - 1)
         return round(period * self.rate / self.ratio)
 

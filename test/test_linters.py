@@ -10,6 +10,8 @@
 
 """The quality gates: style as ROS packages have it, ruff, and strict types."""
 
+from configparser import ConfigParser
+from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 import subprocess
@@ -19,11 +21,24 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+SOURCES = ('benchmarks', 'docs', 'sa_jitter_ros', 'test', 'validation', 'setup.py')
+# The file header of ament_copyright, which compares it without regard to line ends.
+HEADER = """\
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+"""
 
 
 def check(tool, *arguments):
     """Run a linter on the repository and fail with what it prints."""
-    if find_spec(tool) is None:
+    if find_spec(tool.partition('.')[0]) is None:
         pytest.skip(f'{tool} is not installed')
     command = [sys.executable, '-m', tool, *arguments]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -38,6 +53,33 @@ def test_ruff():
 @pytest.mark.style
 def test_flake8():
     check('flake8', '.')
+
+
+def test_flake8_has_the_settings_of_ament():
+    if find_spec('ament_flake8') is None:
+        pytest.skip('ament_flake8 is not installed')
+    ours, theirs = ConfigParser(), ConfigParser()
+    ours.read(ROOT / 'setup.cfg')
+    theirs.read_string(
+        files('ament_flake8').joinpath('configuration/ament_flake8.ini').read_text())
+    style = {key: value for key, value in theirs['flake8'].items()
+             if key not in ('show-source', 'statistics')}
+    assert style.items() <= dict(ours['flake8']).items()
+
+
+@pytest.mark.style
+def test_ament_pep257():
+    check('ament_pep257.main', *SOURCES)
+
+
+def test_every_file_states_copyright_and_licence():
+    names = [path for source in SOURCES for path in sorted((ROOT / source).glob('**/*.py'))]
+    assert len(names) > 200
+    assert [path for path in names if not path.read_text('utf-8').startswith(HEADER)] == []
+
+
+def test_ament_copyright():
+    check('ament_copyright.main', *SOURCES, 'CONTRIBUTING.md', 'LICENSE')
 
 
 @pytest.mark.skipif(

@@ -57,17 +57,17 @@ class Bench(NodeBench):
 
     @property
     def blocks(self):
-        """The blocks of vibration received."""
+        """Return the blocks of vibration received."""
         return self._blocks('vibration', RATE)
 
     @property
     def waveform(self):
-        """The blocks of the tach waveform received."""
+        """Return the blocks of the tach waveform received."""
         return self._blocks('tach_waveform', 3 * RATE)
 
     @property
     def pulses(self):
-        """The pulse times received."""
+        """Return the pulse times received."""
         return [time for item in self.received['tach_pulse'] for time in (
             messages.decode_pulse_reference(item)[0] if isinstance(item, TimeReference)
             else messages.decode_pulse_array(item))]

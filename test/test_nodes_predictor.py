@@ -50,7 +50,7 @@ class Bench:
 
     @property
     def received(self):
-        """The predictions received."""
+        """Return the predictions received."""
         return [messages.decode_prediction(item) for item in self.predictions]
 
     def latest(self, count):

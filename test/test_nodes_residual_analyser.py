@@ -466,12 +466,12 @@ class Chain:
 
     @property
     def residuals(self):
-        """The residuals received."""
+        """Return the residuals received."""
         return [messages.decode_residual(item) for item in self._residuals]
 
     @property
     def reports(self):
-        """The missing effects received."""
+        """Return the missing effects received."""
         return [json.loads(item.data) for item in self._reports]
 
     def play(self, until):

@@ -42,7 +42,7 @@ class Bench(NodeBench):
 
     @property
     def pulses(self):
-        """The pulse times received."""
+        """Return the pulse times received."""
         return [messages.decode_pulse_reference(item)[0][0]
                 for item in self.received['tach_pulse']]
 

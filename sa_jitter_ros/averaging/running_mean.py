@@ -42,7 +42,7 @@ class RunningMean(Protocol):
 
     @property
     def count(self) -> int:
-        """Number of arrays that make the mean."""
+        """Return the number of arrays that make the mean."""
 
     def update(self, values: Array) -> None:
         """Take the array of one more cycle."""
@@ -53,7 +53,7 @@ class RunningMean(Protocol):
 
     @property
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean, from the scatter of the arrays."""
+        """Return the standard error of the mean, from the scatter of the arrays."""
 
 
 class BlockMean:
@@ -96,7 +96,7 @@ class BlockMean:
 
     @property
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean; NaN below two arrays."""
+        """Return the standard error of the mean; NaN below two arrays."""
         if self.count < 2:
             return np.full(self._squares.shape, np.nan)
         return np.asarray(np.sqrt(self._squares / (self.count - 1) / self.count))
@@ -126,7 +126,7 @@ class SlidingMean:
 
     @property
     def count(self) -> int:
-        """Number of arrays in the window."""
+        """Return the number of arrays in the window."""
         return len(self._latest) + len(self._older)
 
     def update(self, values: Array) -> None:
@@ -165,7 +165,7 @@ class SlidingMean:
 
     @property
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean of the window; NaN below two arrays."""
+        """Return the standard error of the mean of the window; NaN below two arrays."""
         return self._window().standard_error
 
 
@@ -213,7 +213,7 @@ class ExponentialMean:
 
     @property
     def standard_error(self) -> FloatArray:
-        """Standard error of the mean; NaN below two arrays."""
+        """Return the standard error of the mean; NaN below two arrays."""
         share = self._squared_weights
         if self.count < 2 or share >= 1.0:  # the mean is the last array alone
             return np.full(self._variance.shape, np.nan)

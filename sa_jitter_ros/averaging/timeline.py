@@ -72,7 +72,7 @@ class Segment:
 
     @property
     def samples(self) -> FloatArray:
-        """Samples (sample, channel), without a copy."""
+        """Return the samples as (sample, channel), without a copy."""
         return self._data[self._begin:self._end]
 
     @property
@@ -223,7 +223,7 @@ class VibrationTimeline:
 
     @property
     def layout(self) -> tuple[int, float] | None:
-        """Number of channels and sampling rate (Hz), None before the first block."""
+        """Return the number of channels and sampling rate (Hz), None before the first block."""
         if self._last is None:
             return None
         return self._last.samples.shape[0], self._last.sample_rate

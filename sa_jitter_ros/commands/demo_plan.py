@@ -57,7 +57,7 @@ class Plan:
 
     @property
     def unit_label(self) -> str:
-        """Unit of the vibration in brackets, empty if it is unknown."""
+        """Return the unit of the vibration in brackets, empty if it is unknown."""
         return f'[{self.unit}]' if self.unit and self.unit != 'unknown' else ''
 
 

@@ -306,12 +306,12 @@ class _Setting:
 
     @cached_property
     def scatter(self) -> Array:
-        """The variance (order, source) of what leaks from each unit source into each order."""
+        """Return the variance (order, source) of leakage from each unit source to each order."""
         return _scatter(self.observation, self.processes)
 
     @cached_property
     def _of_unknown_pulses(self) -> _Source:
-        """What is predicted where nothing is known of the pulses: what `predict` returns."""
+        """Return what is predicted if nothing is known of the pulses: as `predict` does."""
         model = self.observation.model
         amplitudes = unit_amplitudes(model, self.effects)
         self.made.append(amplitudes)

@@ -8,6 +8,9 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
+# The name is that of the concept; a module in a package hides no builtin one.
+# flake8: noqa: A005
+
 """
 The trace: effects are added one at a time while a significant residual remains.
 

@@ -94,12 +94,12 @@ class PageServer:
 
     @property
     def requests(self) -> int:
-        """Number of answered requests."""
+        """Return the number of answered requests."""
         return self._server.requests
 
     @property
     def refused(self) -> int:
-        """Number of refused requests: no GET, a foreign host name, too many at once."""
+        """Return the number of refused requests: no GET, a foreign host name, too many at once."""
         return self._server.refused
 
     def close(self) -> None:

@@ -88,7 +88,7 @@ class PulseOutput:
 
     @property
     def subscribers(self) -> int:
-        """Number of subscribers."""
+        """Return the number of subscribers."""
         return int(self._publisher.get_subscription_count())
 
     def publish(self, times: NDArray[np.float64], keyphasor: str) -> int:

@@ -82,7 +82,7 @@ class IntervalJudge:
 
     @property
     def waiting(self) -> int:
-        """Number of pulses not yet matched to the target."""
+        """Return the number of pulses not yet matched to the target."""
         return len(self._pending)
 
     def take_regular(self, pulses: FloatArray) -> int:
