@@ -10,7 +10,7 @@
 
 """The forward model of every effect, against closed forms, quadrature and Monte Carlo."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 import doctest
 from inspect import signature
 
@@ -41,6 +41,8 @@ SMALL = {
     'additive_noise': {'std': 1.0},
     'amplitude_modulation': {'std': 0.2},
     'interfering_tone': {'frequency': 250.5, 'amplitude': 0.2},
+    'jitter_scale': {'scale': 1.5},
+    'path_delay': {'delay': 1e-3},
 }
 
 
@@ -85,6 +87,12 @@ def test_every_effect_lowers_the_mean_or_widens_the_distribution(name):
     wider = after.standard_deviation - before.standard_deviation
     if name == 'keyphasor_quantisation':  # takes the place of the declared jitter
         assert np.all(after.mean_attenuation < 1.0)
+    elif name == 'path_delay':  # which turns all averages of one speed alike
+        turns = np.array(MODEL.orders) * MODEL.fundamental_frequency * 1e-3
+        np.testing.assert_allclose(after.moments.mean, np.exp(2j * np.pi * turns)
+                                   * before.moments.mean, rtol=1e-9)
+        np.testing.assert_allclose(after.mean_attenuation, before.mean_attenuation, rtol=1e-9)
+        np.testing.assert_allclose(after.standard_deviation, before.standard_deviation, rtol=1e-6)
     else:
         assert np.all((lower > 1e-4) | (wider > 1e-6))
     assert after.model is MODEL
@@ -101,7 +109,7 @@ def test_no_effect_is_the_prediction_itself():
     ('excess_jitter', {}), ('correlated_jitter', {}), ('phase_wander', {}),
     ('speed_fluctuation', {}), ('amplitude_modulation', {}), ('clock_skew', {}),
     ('target_geometry', {'pulse_angles': (0.0, 0.0)}), ('missing_pulses', {}),
-    ('additive_noise', {}), ('interfering_tone', {})])
+    ('additive_noise', {}), ('interfering_tone', {}), ('jitter_scale', {}), ('path_delay', {})])
 def test_effects_of_no_size_leave_the_prediction_as_it_is(name, values, cycles):
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': cycles})
     declared, after = predict(model), predict(model, [make_effect(name, **values)])
@@ -113,6 +121,32 @@ def test_excess_jitter_is_independent_normal(rng):
     errors = declared_errors(rng, 20_000)
     errors = errors + rng.normal(0.0, 5e-5, errors.shape)
     check(predict(MODEL, [make_effect('excess_jitter', std=5e-5)]), average_of(errors))
+
+
+@pytest.mark.parametrize(('distribution', 'unit'), [
+    ('uniform', lambda rng, shape: rng.uniform(-5e-5, 5e-5, shape)),
+    ('normal', lambda rng, shape: rng.normal(0.0, 3e-5, shape)),
+    ('triangular', lambda rng, shape: rng.triangular(-1.0, 0.0, 1.0, shape) * 3e-5 * 6**0.5),
+    ('table', lambda rng, shape: rng.choice([-2e-5, -1e-5, 3e-5], shape))])
+@pytest.mark.parametrize('scale', [0.5, 2.5])
+def test_jitter_of_another_size_keeps_its_distribution(rng, distribution, unit, scale):
+    model = replace(MODEL, jitter_distribution=distribution, jitter_std=3e-5,
+                    jitter_table=(0.0, 1e-5, 5e-5))
+    errors = scale * unit(rng, (20_000, MODEL.trigger_cycles + 1))
+    check(predict(model, [make_effect('jitter_scale', scale=scale)]), average_of(errors))
+
+
+def test_a_scale_acts_on_the_declared_jitter_alone():
+    scale, more = make_effect('jitter_scale', scale=2.0), make_effect('excess_jitter', std=5e-5)
+    wider = replace(MODEL, keyphasor_rate=0.5 * MODEL.keyphasor_rate)
+    for effects in ([], [more]):
+        np.testing.assert_array_equal(predict(MODEL, [scale, *effects]).quantile_50,
+                                      predict(wider, effects).quantile_50)
+    none = make_effect('jitter_scale', scale=0.0)
+    assert predict(MODEL, [none]).mean_attenuation == pytest.approx(1.0, abs=1e-12)
+    clock = make_effect('keyphasor_quantisation', clock_rate=MODEL.keyphasor_rate)
+    np.testing.assert_array_equal(predict(MODEL, [clock, scale]).quantile_50,
+                                  predict(MODEL, [clock]).quantile_50)
 
 
 @pytest.mark.parametrize('correlation', [-0.6, 0.7])
@@ -317,7 +351,8 @@ def test_long_averages_with_known_errors_are_predicted_or_refused(name, cycles):
     ('target_geometry', {'pulse_angles': (0.0, 1e300)}), ('additive_noise', {'std': 1e300}),
     ('keyphasor_quantisation', {'period_std': 1e300}),
     ('keyphasor_quantisation', {'clock_rate': 1e-300}),
-    ('interfering_tone', {'amplitude': 1e300}), ('excess_jitter', {'std': 0.01})])
+    ('interfering_tone', {'amplitude': 1e300}), ('excess_jitter', {'std': 0.01}),
+    ('jitter_scale', {'scale': 1000.0})])
 def test_effects_beyond_what_is_sensible_are_refused(name, values):
     with pytest.raises(ModelError, match=r'not below .*: '):
         predict(MODEL, [make_effect(name, **values)])
@@ -365,7 +400,10 @@ def test_slow_motions_keep_their_spectrum_in_long_averages(cycles):
                              'orders': (1.0,)})
     steps = (np.arange(20_000) + 0.5) / 20_000
     for band, effect in (((0.02, 0.4), make_effect('amplitude_modulation', std=0.1)),
-                         ((0.02, 0.1), make_effect('phase_wander', std=1e-3, bandwidth=0.1))):
+                         ((0.02, 0.1), make_effect('phase_wander', std=1e-3, bandwidth=0.1)),
+                         ((0.004, 0.01), make_effect('phase_wander', std=1e-3, bandwidth=0.01)),
+                         ((0.004, 0.01), make_effect('amplitude_modulation', std=0.1,
+                                                     bandwidth=0.01))):
         frequency = band[0] + (band[1] - band[0]) * steps
         exact = effect.std**2 * np.mean(np.sinc(cycles * frequency) ** 2)
         # Beyond 200 cycles the spectrum is blurred; a correlation cut off was 90 % off at 200.
@@ -414,6 +452,9 @@ def test_parameters_become_effects():
     ('keyphasor_quantisation', {'clock_rate': 0.0}, 'more than 0'),
     ('target_geometry', {'pulse_angles': [0.0, float('inf')]}, 'finite'),
     ('missing_pulses', {'probability': 1.0}, 'at most 0.9'),
+    ('jitter_scale', {'scale': -1.0}, 'at least 0'),
+    ('path_delay', {'delay': 2.0}, 'at most 1'),
+    ('amplitude_modulation', {'bandwidth': 0.0}, 'at least 0.0001'),
     ('target_geometry', {'pulse_angles': 3.0}, 'give a list of angles'),
     ('interpolation_loss', {'method': 'nearest'}, 'band_limited, linear, cubic, spline'),
 ])

@@ -28,6 +28,7 @@ from sa_jitter_ros.effects.slope_test import slope_test
 from sa_jitter_ros.inference.cycle_reader import RIPPLE_VARIANCE
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.prediction.prediction import predict
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
@@ -399,6 +400,25 @@ def test_modulation_is_found_in_few_acquisitions(rng):
     assert all(fit(0.05).effect is not None for _ in range(20))
     p_values = [fit(0.0).p_value for _ in range(200)]
     assert abs(np.mean(p_values) - 0.5) < 4.0 / np.sqrt(12.0 * 200.0)
+
+
+@pytest.mark.parametrize('band', [(0.02, 0.4), (0.0, 0.05), (0.0, 0.005)])
+def test_a_found_modulation_predicts_the_scatter_of_the_averages(rng, band):
+    frequency = np.linspace(*band, 2000)
+    cycles = np.cos(2.0 * np.pi * np.multiply.outer(LAGS, frequency)) * np.sinc(frequency) ** 2
+    gain = 0.3 * stationary(rng, cycles.mean(axis=1) + 1e-9 * (LAGS == 0), 400)[:, :-1, None]
+    finding = EFFECTS['amplitude_modulation'].fit(evidence_of(
+        rng, np.zeros((400, PULSES)), radial=gain + rng.normal(0.0, 0.01, (400, PULSES - 1, 4))))
+    again = make_effect('amplitude_modulation', **finding.effect.values)
+    quiet = replace(MODEL, keyphasor_rate=1e12)
+    seen = gain.mean(axis=1).std()
+    assert predict(quiet, [again]).standard_deviation == pytest.approx(
+        np.full(2, seen), rel=4.0 / np.sqrt(800.0))
+    assert finding.effect.std == pytest.approx(0.3, abs=4.0 * finding.standard_errors['std'])
+    found, error = finding.effect.bandwidth, finding.standard_errors['bandwidth']
+    if band[0] == 0.02:  # the form of the spectrum is that of the model
+        assert found == pytest.approx(band[1], abs=3.5 * error)
+        assert 0.0 < error < 0.1
 
 
 def test_likelihood_prefers_what_is_there(rng):

@@ -104,6 +104,26 @@ def test_clock_skew_grows_with_time():
     assert pulses.times[-1] > 1001.0 - 1.01 / SPEED
 
 
+def test_jitter_scale_scales_the_declared_jitter_alone():
+    jitter = DeclaredJitter('triangular', STD)
+    declared = pulse_errors(jitter)
+    np.testing.assert_allclose(pulse_errors(jitter, one('jitter_scale', scale=2.5)),
+                               2.5 * declared, rtol=0, atol=1e-12)
+    more = one('excess_jitter', std=STD)
+    np.testing.assert_allclose(
+        pulse_errors(jitter, more, one('jitter_scale', scale=0.5)) - pulse_errors(more),
+        0.5 * declared, rtol=0, atol=1e-12)
+
+
+def test_path_delay_is_the_same_at_every_speed():
+    pulses = machine(one('path_delay', delay=3e-3), speed=((0, 20), (5, 60))).pulses(0.0, 5.0)
+    np.testing.assert_allclose(pulses.errors, 3e-3, rtol=0, atol=1e-12)
+    assert pulses.times[0] < 1.01 / 20.0 + 3e-3
+    # The keyphasor's clock shows the delay: its skew and grid come last.
+    late = machine(one('path_delay', delay=3e-3), one('clock_skew', skew=1e-2)).pulses(0.0, 5.0)
+    np.testing.assert_allclose(late.times, 1.01 * (late.true_times + 3e-3), rtol=1e-12)
+
+
 def test_missing_pulses():
     gearbox = machine(one('missing_pulses', probability=0.03))
     index = gearbox.pulses(0.0, 800.0).index
@@ -219,7 +239,8 @@ def test_effects_of_size_zero_change_nothing():
         'target_geometry': {'pulse_angles': (0.0,)}, 'clock_skew': {'skew': 0.0},
         'missing_pulses': {'probability': 0.0}, 'speed_fluctuation': {'acceleration_std': 0.0},
         'phase_wander': {'std': 0.0}, 'amplitude_modulation': {'std': 0.0},
-        'additive_noise': {'std': 0.0}, 'interfering_tone': {'frequency': 1.0, 'amplitude': 0.0}}
+        'additive_noise': {'std': 0.0}, 'interfering_tone': {'frequency': 1.0, 'amplitude': 0.0},
+        'jitter_scale': {'scale': 1.0}, 'path_delay': {'delay': 0.0}}
     assert options.keys() == EFFECTS.keys() - {'keyphasor_quantisation', 'interpolation_loss'}
     with_them, without = machine(*make_effects(options)), machine()
     np.testing.assert_allclose(with_them.vibration(0, 5000), without.vibration(0, 5000),
@@ -229,7 +250,7 @@ def test_effects_of_size_zero_change_nothing():
 
 
 @pytest.mark.parametrize(('options', 'message'), [
-    ({'excess_jiter': {'std': 1.0}}, "no effect 'excess_jiter': choose from excess_jitter"),
+    ({'excess_jiter': {'std': 1.0}}, "no effect 'excess_jiter': choose from jitter_scale"),
     ({'excess_jitter': {'sdt': 1.0}}, 'effect excess_jitter has std and not sdt'),
     ({'excess_jitter': {'std': -1.0}}, 'excess_jitter.std -1.0: must be finite and at least 0'),
     ({'correlated_jitter': {'std': 1.0, 'correlation': 1.0}}, 'above -0.9999 and below 0.9999'),
@@ -243,6 +264,9 @@ def test_effects_of_size_zero_change_nothing():
     ({'phase_wander': {'std': np.nan}}, 'std nan'),
     ({'phase_wander': {'std': 0.1, 'bandwidth': 0.5}}, 'bandwidth 0.5'),
     ({'amplitude_modulation': {'std': -0.1}}, 'std -0.1'),
+    ({'amplitude_modulation': {'std': 0.1, 'bandwidth': 0.0}}, 'bandwidth 0.0'),
+    ({'jitter_scale': {'scale': -1.0}}, 'jitter_scale.scale -1.0'),
+    ({'path_delay': {'delay': np.nan}}, 'path_delay.delay nan'),
     ({'interpolation_loss': {'method': 'magic'}}, "'magic': must be one of linear, cubic, spline"),
     ({'additive_noise': {'std': -0.1}}, 'additive_noise.std -0.1'),
     ({'interfering_tone': {'frequency': 0.0, 'amplitude': 1.0}}, 'frequency 0.0'),

@@ -17,12 +17,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sa_jitter_ros.effects.band import fading, flat_band_correlation, SLOW_BAND, slow_memory
+from sa_jitter_ros.effects.band import (
+    fading, flat_band_correlation, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
 from sa_jitter_ros.effects.evidence import Evidence, root
-from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal, unit_nodes
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 _SIGNIFICANT = 1e-3
 
@@ -38,12 +39,12 @@ class SlowGain:
     @property
     def correlation_length(self) -> int:
         """Return the memory in cycles."""
-        return slow_memory(self.trigger_cycles)
+        return slow_memory(self.trigger_cycles, self.band)
 
     def covariance(self, u: Array, v: Array, lag: int) -> Array:
         """Return Cov[a_k(u), a_{k+lag}(v)]."""
         apart = lag + v - u
-        return np.asarray(self.variance * fading(apart, self.trigger_cycles)
+        return np.asarray(self.variance * fading(apart, self.trigger_cycles, self.band)
                           * flat_band_correlation(apart, self.band))
 
     def characteristic(
@@ -65,20 +66,27 @@ class SlowGain:
 
 @dataclass(frozen=True)
 class AmplitudeModulation(Effect):
-    """A slow random gain of mean 1 and standard deviation `std`, common to a shaft's orders."""
+    """
+    A slow random gain of mean 1 and standard deviation `std`, common to a shaft's orders.
+
+    Its spectrum is that of `PhaseWander`: flat, with frequencies up to `bandwidth` times the
+    trigger rate. The narrower, the less of it an average takes out.
+    """
 
     name: ClassVar[str] = 'amplitude_modulation'
     summary: ClassVar[str] = 'slow modulation of the amplitude'
     scatters: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the gain', '1', minimum=0.0, maximum=1.0)
-    band: tuple[float, float] = SLOW_BAND
+    bandwidth: float = parameter(
+        SLOW_BAND[1], 'highest frequency of the gain, cycles a trigger cycle', '1',
+        minimum=NARROWEST, maximum=WIDEST)
 
     def processes(self, model: DeclaredModel) -> Sequence[Any]:
         """Return the gain, band-limited below half the trigger rate."""
         if self.std == 0.0:
             return ()
         processes: Sequence[AngleErrorProcess] = (
-            SlowGain(self.std**2, model.trigger_cycles, self.band),)
+            SlowGain(self.std**2, model.trigger_cycles, slow_band(self.bandwidth)),)
         return processes
 
     @classmethod
@@ -97,17 +105,20 @@ class AmplitudeModulation(Effect):
         variance, error = float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(len(rows)))
         # Without a modulation the lines are independent noise of a known size.
         p_value = _chance(variance * pairs / weight.sum(), weight / weight.sum(), product.size)
-        within = _variance_of_mean(1, SLOW_BAND)
-        variance, error = variance / within - known, error / within
+        if variance > 0.0:
+            noise = 1.0 / (weight.sum() * radial.shape[1])
+            slow = (common.mean(axis=1) / weight.sum()) ** 2 - noise
+            bandwidth, bandwidth_error = _bandwidth_of(slow, rows, radial.shape[1])
+            within = _variance_of_mean(1, slow_band(bandwidth))
+            variance, error = variance / within - known, error / within
         if variance <= 0.0 or p_value > _SIGNIFICANT:
             return absent(cls.name, 'the amplitudes of the lines do not move together: '
                           f'p = {p_value:.2g}', p_value=p_value)
         std, std_error = root(variance, error)
         text = (f'the amplitudes of all lines grow and shrink together by {std:.2%}, '
                 f'p = {p_value:.2g}')
-        slow = np.mean((common.mean(axis=1) / weight.sum()) ** 2) / variance
-        return Finding(cls.name, cls(std, _band_of(float(slow), radial.shape[1])),
-                       {'std': std_error}, p_value, text)
+        return Finding(cls.name, cls(std, bandwidth), {
+            'std': std_error, 'bandwidth': bandwidth_error}, p_value, text)
 
 
 def _chance(mean: float, weight: Array, count: int) -> float:
@@ -139,17 +150,24 @@ def _chance(mean: float, weight: Array, count: int) -> float:
 
 def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
     """Return the variance of the mean over some cycles of a unit modulation."""
-    u, w = unit_nodes(64)
-    lag = cycles * np.subtract.outer(u, u)
-    return float(w @ flat_band_correlation(lag, band) @ w)
+    x = cycles * np.array(band)
+    integral = (special.sici(2.0 * np.pi * x)[0] - np.sin(np.pi * x) ** 2 / (np.pi * x)) / np.pi
+    return float(np.diff(integral)[0] / np.diff(x)[0])  # of sinc(x)^2
 
 
-def _band_of(slow: float, cycles: int) -> tuple[float, float]:
-    """Return the band that leaves a share `slow` of the variance in averages of some cycles."""
-    if _variance_of_mean(cycles, SLOW_BAND) >= slow:
-        return SLOW_BAND
-    bands = [*((low, SLOW_BAND[1]) for low in np.linspace(SLOW_BAND[0], 0.0, 20)),
-             *((0.0, top) for top in np.geomspace(SLOW_BAND[1], 1e-4, 40))]
-    shares = np.array([_variance_of_mean(cycles, band) for band in bands])
-    low, top = bands[int(np.argmin(np.abs(shares - slow)))]
-    return float(low), float(top)
+def _bandwidth_of(slow: Array, fast: Array, cycles: int) -> tuple[float, float]:
+    """
+    Return the bandwidth that averages of some cycles show, and its error.
+
+    `slow` (acquisition,) are the squares of the averages, `fast` the variances of single cycles.
+    """
+    widths = np.geomspace(NARROWEST, WIDEST, 200)
+    bands = [slow_band(width) for width in widths]
+    shares = np.array([_variance_of_mean(cycles, band) / _variance_of_mean(1, band)
+                       for band in bands])
+    share = float(slow.mean() / fast.mean())
+    error = float(np.std(slow - share * fast, ddof=1) / np.sqrt(slow.size) / fast.mean())
+    low, bandwidth, high = np.exp(np.interp(
+        [share + error, share, share - error], np.minimum.accumulate(shares)[::-1],
+        np.log(widths)[::-1]))
+    return float(bandwidth), float(0.5 * (high - low))

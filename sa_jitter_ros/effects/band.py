@@ -27,26 +27,48 @@ SLOW_BAND = (0.02, 0.4)
 #: Of an acceleration, which is nearly constant within a trigger cycle.
 ACCELERATION_BAND = (0.05, 0.2)
 
-_LONGEST = 200  # cycles
+#: Widths of a slow motion's band, over the trigger rate; so low that no average changes in it.
+NARROWEST, WIDEST = 1e-4, 0.5
+
+# Cycles over which a correlation is followed: enough for ten periods of the highest frequency.
+_MEMORY, _LONGEST, _PERIODS = 200, 2000, 10.0
 _RULE = unit_nodes(256)  # enough for the turns of some hundred lags
 
 
-def slow_memory(trigger_cycles: int) -> int:
-    """Return the number of cycles over which slow motions are followed."""
-    return min(_LONGEST, trigger_cycles)
+def slow_band(bandwidth: float) -> tuple[float, float]:
+    """
+    Return the band of a slow motion whose highest frequency is `bandwidth`.
+
+    It begins where `SLOW_BAND` does, or at 0.4 of the bandwidth where that is lower.
+
+    >>> slow_band(0.4), slow_band(0.01)
+    ((0.02, 0.4), (0.004, 0.01))
+    """
+    return min(SLOW_BAND[0], 0.4 * bandwidth), bandwidth
 
 
-def fading(lag: ArrayLike, trigger_cycles: int) -> Array:
+def slow_memory(trigger_cycles: int, band: tuple[float, float]) -> int:
+    """Return the number of cycles over which motions in `band` are followed."""
+    return min(_reach(band), trigger_cycles)
+
+
+def fading(lag: ArrayLike, trigger_cycles: int, band: tuple[float, float]) -> Array:
     """
     Return the factor on correlations at `lag` that lets them end with the memory.
 
     1 where an average is no longer than the memory, so that they are exact. To cut them off would
     leave power at frequency 0, which no length of an average takes out; to fade them blurs the
-    spectrum by 1/300 of the trigger rate, less than its lowest frequencies.
+    spectrum by 1/300 of the trigger rate, less than its lowest frequencies, and less the slower
+    the motion is, down to 1/3000.
     """
-    if trigger_cycles <= _LONGEST:
+    reach = _reach(band)
+    if trigger_cycles <= reach:
         return np.ones(np.shape(lag))
-    return np.asarray(np.exp(-0.5 * (4.0 * np.asarray(lag) / _LONGEST) ** 2))
+    return np.asarray(np.exp(-0.5 * (4.0 * np.asarray(lag) / reach) ** 2))
+
+
+def _reach(band: tuple[float, float]) -> int:
+    return int(np.clip(_PERIODS / band[1], _MEMORY, _LONGEST))
 
 
 def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:

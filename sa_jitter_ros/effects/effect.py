@@ -106,8 +106,12 @@ class Effect(Influence):
 
     @classmethod
     def fit(cls, evidence: Evidence) -> 'Finding':
-        """Return the effect that fits the evidence best, what supports and what contradicts it."""
-        raise NotImplementedError
+        """
+        Return the effect that fits the evidence best, what supports and what contradicts it.
+
+        An effect that overrides nothing here can be declared, but is not looked for.
+        """
+        return absent(cls.name, 'it can be declared, but nothing looks for it in a recording')
 
     @property
     def values(self) -> Mapping[str, Any]:

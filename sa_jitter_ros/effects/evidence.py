@@ -22,7 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
-from sa_jitter_ros.prediction.influence import Influence, known_errors, mean_period, Pulses
+from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
+from sa_jitter_ros.prediction.influence import (
+    declared_jitter, Influence, known_errors, mean_period, Pulses)
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
@@ -129,15 +131,13 @@ class Evidence:
         return ticks_leave_room(whole, self.standard_errors, self.clock.rate)
 
     @property
-    def jitter_replaced(self) -> bool:
-        """Return whether an added effect replaces the declared jitter."""
-        return any(effect.replaces_jitter(self.model) for effect in self.explained)
+    def jitter(self) -> PulseErrorDistribution | None:
+        """Return what is left of the declared jitter beside the added effects, if anything."""
+        return declared_jitter(self.model, self.explained)
 
     def expected_autocovariance(self, lags: Array) -> Array:
         """Return what declared jitter and added effects explain at `lags`, in s^2."""
-        total = np.zeros(lags.shape)
-        if not self.jitter_replaced:
-            total = np.where(lags == 0, self.model.distribution.variance, 0.0)
+        total = np.where(lags == 0, self.jitter.variance if self.jitter else 0.0, 0.0)
         for effect in self.explained:
             total = total + effect.pulse_autocovariance(self.model, lags)
         return np.asarray(total)

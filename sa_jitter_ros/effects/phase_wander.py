@@ -16,7 +16,8 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import (
-    fading, flat_band_correlation, recovered_correlation, SLOW_BAND, slow_memory)
+    fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND, slow_band,
+    slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
@@ -36,7 +37,8 @@ class PhaseWander(Effect):
     """
     Slow random angle of `std` rad between the shaft of interest and its vibration.
 
-    Its spectrum is flat from a fiftieth of the trigger rate to `bandwidth` times that rate.
+    Its spectrum is flat from a fiftieth of the trigger rate to `bandwidth` times that rate; where
+    the bandwidth is below 0.05, from 0.4 of it.
     """
 
     name: ClassVar[str] = 'phase_wander'
@@ -45,8 +47,9 @@ class PhaseWander(Effect):
     needs_pulse_errors: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
-    bandwidth: float = parameter(SLOW_BAND[1], 'highest frequency of the motion over the trigger '
-                                 'rate', '1', minimum=_NARROW, maximum=0.5)
+    bandwidth: float = parameter(
+        SLOW_BAND[1], 'highest frequency of the motion, cycles a trigger cycle', '1',
+        minimum=NARROWEST, maximum=WIDEST)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the wander, band-limited below half the trigger rate."""
@@ -54,19 +57,19 @@ class PhaseWander(Effect):
             return ()
         require_below('phase_wander.std', self.std, 2.0 * np.pi, 'rad', 'a source that turns '
                       'freely relative to the shaft has no orders of it; lower it')
-        variance = (self.std / (2.0 * np.pi)) ** 2
+        variance, band = (self.std / (2.0 * np.pi)) ** 2, slow_band(self.bandwidth)
 
         def covariance(u: Array, v: Array, lag: int) -> Array:
             apart = lag + v - u
-            return np.asarray(variance * fading(apart, model.trigger_cycles)
-                              * flat_band_correlation(apart, _band(self.bandwidth)))
+            return np.asarray(variance * fading(apart, model.trigger_cycles, band)
+                              * flat_band_correlation(apart, band))
 
-        return (GaussianAngleError(covariance, slow_memory(model.trigger_cycles)),)
+        return (GaussianAngleError(covariance, slow_memory(model.trigger_cycles, band)),)
 
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return the autocovariance of the pulse errors that the recovery makes of the wander."""
         seconds = self.std / (2.0 * np.pi * model.fundamental_frequency)
-        return np.asarray(seconds**2 * recovered_correlation(lags, _band(self.bandwidth)))
+        return np.asarray(seconds**2 * recovered_correlation(lags, slow_band(self.bandwidth)))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -78,7 +81,7 @@ class PhaseWander(Effect):
             return absent(cls.name, 'the pulse times move as the recovered errors do: the '
                           f'vibration makes {slope.share:.2f} +- {slope.standard_error:.2f} of '
                           'the motion', p_value=slope.p_value)
-        fit = fit_covariance(evidence, _correlation, bounds=(_NARROW, 0.5))
+        fit = fit_covariance(evidence, _correlation, bounds=(_NARROW, WIDEST))
         bandwidth, bandwidth_error = fit.shape, fit.shape_error
         # Independent errors beside a wander must not swell it.
         beside = fit_covariance(
@@ -98,7 +101,7 @@ class PhaseWander(Effect):
         if rivals:
             whole = evidence.of_all
             better = max(fit_covariance(whole, white).gain, fit_memory(whole).gain - _FREEDOM)
-            wander = fit_covariance(whole, _correlation, bounds=(_NARROW, 0.5)).gain - _FREEDOM
+            wander = fit_covariance(whole, _correlation, bounds=(_NARROW, WIDEST)).gain - _FREEDOM
             if better > wander:
                 contradiction = (
                     'independent or autoregressive pulse errors explain them better: twice the '
@@ -110,9 +113,5 @@ class PhaseWander(Effect):
                        deciding_measurement=_DECIDING if rivals else '')
 
 
-def _band(bandwidth: float) -> tuple[float, float]:
-    return SLOW_BAND[0], bandwidth
-
-
 def _correlation(lags: Array, bandwidth: float) -> Array:
-    return recovered_correlation(lags, _band(bandwidth))
+    return recovered_correlation(lags, slow_band(bandwidth))

@@ -176,8 +176,8 @@ def _standard_errors(slopes: Sequence[Array], contrast: Array, whitened: Array, 
 
 def _fourth_cumulant(evidence: Evidence) -> float:
     """Return the fourth cumulant in s^4 of the declared jitter, 0 where something replaces it."""
-    jitter = evidence.model.distribution
-    if evidence.jitter_replaced:
+    jitter = evidence.jitter
+    if jitter is None:
         return 0.0
     draws = jitter.draw(np.random.default_rng(1), 20000)
     return float(stats.kurtosis(draws)) * jitter.variance**2
@@ -233,8 +233,8 @@ def _distribution_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
     """Compare the errors with declared jitter plus normal jitter of the fitted variance."""
     errors = evidence.errors.ravel()
     declared, draws = 0.0, np.zeros(1)
-    if not evidence.jitter_replaced:
-        jitter = evidence.model.distribution
+    jitter = evidence.jitter
+    if jitter is not None:
         declared = jitter.variance
         draws = np.sort(jitter.draw(np.random.default_rng(1), 20000))[::50]
     count = evidence.errors.shape[1]
@@ -254,13 +254,13 @@ def _distribution_p_value(evidence: Evidence, fit: CovarianceFit) -> float:
 def _moments_p_value(evidence: Evidence) -> float:
     """Compare skewness and kurtosis of the errors with drawn ones, declared plus normal jitter."""
     errors = evidence.errors[:, 1:-1]  # those at the ends are rough
-    jitter = evidence.model.distribution
+    jitter = evidence.jitter
     size = int(errors.size / _effective_repeats(errors))
     power = float(np.mean(errors**2))
-    known = 0.0 if evidence.jitter_replaced else min(jitter.variance, power)
+    known = 0.0 if jitter is None else min(jitter.variance, power)
     rng = np.random.default_rng(1)
     draws = rng.normal(0.0, np.sqrt(power - known), (_DRAWS, size))
-    if known:
+    if jitter is not None:
         draws += jitter.draw(rng, (_DRAWS, size))
     p_values = []
     for moment in (stats.skew, stats.kurtosis):

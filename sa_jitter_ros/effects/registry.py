@@ -27,8 +27,10 @@ from sa_jitter_ros.effects.effect import Effect, parameter_ranges
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.interfering_tone import InterferingTone
 from sa_jitter_ros.effects.interpolation_loss import InterpolationLoss
+from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.effects.missing_pulses import MissingPulses
+from sa_jitter_ros.effects.path_delay import PathDelay
 from sa_jitter_ros.effects.phase_wander import PhaseWander
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
@@ -38,7 +40,7 @@ from sa_jitter_ros.parameters import unwrapped
 EFFECTS: Mapping[str, type[Effect]] = {kind.name: kind for kind in (
     ExcessJitter, KeyphasorQuantisation, CorrelatedJitter, TargetGeometry, SpeedFluctuation,
     ClockSkew, PhaseWander, MissingPulses, InterpolationLoss, AdditiveNoise, AmplitudeModulation,
-    InterferingTone)}
+    InterferingTone, JitterScale, PathDelay)}
 
 
 def make_effect(name: str, **parameters: Any) -> Effect:

@@ -62,9 +62,11 @@ class SpeedFluctuation(Effect):
         covariance = _error_covariance(model.weights, variance)
 
         def faded(u: Array, v: Array, lag: int) -> Array:
-            return covariance(u, v, lag) * fading(lag + v - u, model.trigger_cycles)
+            return covariance(u, v, lag) * fading(
+                lag + v - u, model.trigger_cycles, ACCELERATION_BAND)
 
-        return (GaussianAngleError(faded, slow_memory(model.trigger_cycles)),)
+        return (GaussianAngleError(
+            faded, slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

@@ -87,6 +87,7 @@ EFFECT_DEFAULTS = {
     'speed_fluctuation.acceleration_std': 10.0, 'phase_wander.std': 0.01,
     'amplitude_modulation.std': 0.2, 'additive_noise.std': 0.5,
     'interfering_tone.frequency': 100.0, 'interfering_tone.amplitude': 0.5,
+    'jitter_scale.scale': 2.0, 'path_delay.delay': 1e-3,
 }
 
 

@@ -16,10 +16,10 @@ Errors are in seconds and a characteristic function takes a frequency in Hz, so 
 Where errors are given in fundamental cycles, the argument is simply the order.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from numbers import Real
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +30,7 @@ Shape = int | tuple[int, ...]
 
 _TAYLOR_TERMS = 8
 _TAYLOR_RADIUS = 0.08  # radians; 0.08^8 / 8! < 1e-13
+_Kind = TypeVar('_Kind', bound='_OfStd')
 _NORMAL_WIDTH = 8.0  # standard deviations; 6e-5 of a normal distribution lies outside
 
 
@@ -50,6 +51,9 @@ class PulseErrorDistribution(Protocol):
 
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
+
+    def scaled(self, factor: float) -> 'PulseErrorDistribution':
+        """Return the distribution of `factor` times the error."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,10 @@ class Uniform:
         """Return independent errors in s."""
         return rng.uniform(-0.5 * self.width, 0.5 * self.width, shape)
 
+    def scaled(self, factor: float) -> 'Uniform':
+        """Return the distribution of `factor` times the error."""
+        return Uniform(factor * self.width)
+
 
 @dataclass(frozen=True)
 class _OfStd:
@@ -90,6 +98,10 @@ class _OfStd:
     def variance(self) -> float:
         """Variance in s^2."""
         return self.std**2
+
+    def scaled(self: _Kind, factor: float) -> _Kind:
+        """Return the distribution of `factor` times the error."""
+        return replace(self, std=factor * self.std)
 
 
 @dataclass(frozen=True)
@@ -209,6 +221,10 @@ class Empirical:
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
         return np.asarray(rng.choice(self.table, shape))
+
+    def scaled(self, factor: float) -> 'Empirical':
+        """Return the distribution of `factor` times the error."""
+        return Empirical(factor * self.table)
 
 
 def is_number(value: object) -> bool:

@@ -19,12 +19,14 @@ have parameters and can be found in measured data.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
 
@@ -120,6 +122,10 @@ class Influence(Protocol):
         """Return whether this replaces the declared jitter."""
         return False
 
+    def jitter_factor(self, model: DeclaredModel) -> float:
+        """Return the factor on the errors of the declared jitter."""
+        return 1.0
+
     def pulse_autocovariance(self, model: DeclaredModel, lags: Array) -> Array:
         """Return the autocovariance in s^2 that the random errors of the pulses show at `lags`."""
         return np.zeros(np.shape(lags))
@@ -153,13 +159,21 @@ def require_modelled(model: DeclaredModel, influences: Sequence[Influence]) -> N
             raise ModelError(f'{item.name}: {reason}')
 
 
+def declared_jitter(model: DeclaredModel, influences: Sequence[Influence]
+                    ) -> PulseErrorDistribution | None:
+    """Return what influences make of the declared jitter, None where they leave nothing."""
+    factor = math.prod(item.jitter_factor(model) for item in influences)
+    if factor == 0.0 or any(item.replaces_jitter(model) for item in influences):
+        return None
+    return model.distribution if factor == 1.0 else model.distribution.scaled(factor)
+
+
 def random_processes(model: DeclaredModel, influences: Sequence[Influence]
                      ) -> tuple[AngleErrorProcess, ...]:
     """Return the random angle errors of declared jitter and influences."""
-    declared: tuple[AngleErrorProcess, ...] = (
-        IndependentPulseJitter(model.distribution, model.fundamental_frequency, model.weights),)
-    if any(item.replaces_jitter(model) for item in influences):
-        declared = ()
+    jitter = declared_jitter(model, influences)
+    declared: tuple[AngleErrorProcess, ...] = () if jitter is None else (
+        IndependentPulseJitter(jitter, model.fundamental_frequency, model.weights),)
     return (*declared, *(process for item in influences for process in item.processes(model)))
 
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import joint_characteristic
-from sa_jitter_ros.prediction.influence import Influence, known_errors, random_processes
+from sa_jitter_ros.prediction.influence import (
+    declared_jitter, Influence, known_errors, random_processes)
 from sa_jitter_ros.report.plotting import AFTER, BEFORE, with_effects
 from scipy.linalg import toeplitz
 
@@ -95,10 +96,10 @@ def _version(label: str, colour: str, evidence: Evidence, effects: tuple[Influen
     centred += covariance.mean() + patterns.T @ patterns / len(patterns)
     total = np.array([np.trace(centred, lag) / (count - lag) for lag in range(lags_of(evidence))])
     rng = np.random.default_rng(_SEED)
-    replaced = any(effect.replaces_jitter(model) for effect in effects)
-    jitter = np.zeros(_DRAWS) if replaced else model.distribution.draw(rng, _DRAWS)
-    rest = max(random[0] - (0.0 if replaced else model.distribution.variance), 0.0) + noise**2
-    draws = jitter + np.sqrt(rest) * rng.standard_normal(_DRAWS)
+    jitter = declared_jitter(model, effects)
+    rest = max(random[0] - (0.0 if jitter is None else jitter.variance), 0.0) + noise**2
+    draws = np.zeros(_DRAWS) if jitter is None else jitter.draw(rng, _DRAWS)
+    draws += np.sqrt(rest) * rng.standard_normal(_DRAWS)
     draws += rng.choice(patterns.ravel(), _DRAWS)
     u = cycle_places()
     small = 1e-2 / (max(np.sqrt(random[0]), _SMALL) * model.fundamental_frequency)

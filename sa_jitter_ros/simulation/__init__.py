@@ -29,8 +29,8 @@ from sa_jitter_ros.simulation.components import ChippedTooth, Component, mesh
 from sa_jitter_ros.simulation.effect import Effect, Setting
 from sa_jitter_ros.simulation.effects import (
     AdditiveNoise, AmplitudeModulation, ClockSkew, CorrelatedJitter, DeclaredJitter, EFFECTS,
-    ExcessJitter, InterferingTone, InterpolationLoss, KeyphasorQuantisation, make_effects,
-    MissingPulses, PhaseWander, SpeedFluctuation, TargetGeometry)
+    ExcessJitter, InterferingTone, InterpolationLoss, JitterScale, KeyphasorQuantisation,
+    make_effects, MissingPulses, PathDelay, PhaseWander, SpeedFluctuation, TargetGeometry)
 from sa_jitter_ros.simulation.gearbox import Gearbox
 from sa_jitter_ros.simulation.keyphasor import Keyphasor, Pulses
 from sa_jitter_ros.simulation.motion import Motion, Torsion
@@ -38,6 +38,7 @@ from sa_jitter_ros.simulation.random_streams import band_limited, SinusoidSum
 
 __all__ = ['EFFECTS', 'AdditiveNoise', 'AmplitudeModulation', 'ChippedTooth', 'ClockSkew',
            'Component', 'CorrelatedJitter', 'DeclaredJitter', 'Effect', 'ExcessJitter', 'Gearbox',
-           'InterferingTone', 'InterpolationLoss', 'Keyphasor', 'KeyphasorQuantisation',
-           'MissingPulses', 'Motion', 'PhaseWander', 'Pulses', 'Setting', 'SinusoidSum',
-           'SpeedFluctuation', 'TargetGeometry', 'Torsion', 'band_limited', 'make_effects', 'mesh']
+           'InterferingTone', 'InterpolationLoss', 'JitterScale', 'Keyphasor',
+           'KeyphasorQuantisation', 'MissingPulses', 'Motion', 'PathDelay', 'PhaseWander',
+           'Pulses', 'Setting', 'SinusoidSum', 'SpeedFluctuation', 'TargetGeometry', 'Torsion',
+           'band_limited', 'make_effects', 'mesh']

@@ -30,7 +30,7 @@ class Setting:
     Properties of the machine that effects may use.
 
     `sample_rate` of the vibration and `trigger_rate`, the nominal rate of trigger cycles, in Hz;
-    `motion` of the tach shaft.
+    `motion` of the tach shaft; `jitter_factor` on the errors of the declared jitter.
     """
 
     seed: int
@@ -39,6 +39,7 @@ class Setting:
     pulses_per_revolution: int
     trigger_rate: float
     motion: Motion
+    jitter_factor: float = 1.0
 
 
 class Effect:
@@ -59,6 +60,10 @@ class Effect:
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return a relative fluctuation of the speed."""
         return ZERO
+
+    def jitter_factor(self) -> float:
+        """Return a factor on the declared pulse errors."""
+        return 1.0
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray | float:
         """Return an angle (rad) that is added to the angle of a shaft in its vibration."""
@@ -91,12 +96,20 @@ class Effect:
         return np.ones(index.shape, dtype=np.bool_)
 
 
-def slow_process(setting: Setting, std: float, name: str, *, bandwidth: float = 0.4
-                 ) -> SinusoidSum:
-    """Return a random function of time, band-limited well below half the trigger rate."""
+def slow_process(setting: Setting, std: float, name: str, bandwidth: float) -> SinusoidSum:
+    """
+    Return a random function of time whose spectrum is flat up to `bandwidth` times trigger rate.
+
+    It begins at a fiftieth of that rate, or at 0.4 of the bandwidth where that is lower.
+    """
     rate = setting.trigger_rate
-    return band_limited(std=std, band=(0.02 * rate, bandwidth * rate), seed=setting.seed,
-                        name=name)
+    return band_limited(std=std, band=(min(0.02, 0.4 * bandwidth) * rate, bandwidth * rate),
+                        seed=setting.seed, name=name)
+
+
+def require_bandwidth(name: str, value: float) -> None:
+    """Raise ParameterError for a bandwidth of a slow process that is none."""
+    require_number(name, value, minimum=1e-4, below=0.5)
 
 
 def require_number(name: str, value: float, *, minimum: float = -math.inf,

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.simulation.effect import (
-    Effect, IndexArray, require_number, Setting, Signal, slow_process)
+    Effect, IndexArray, require_bandwidth, require_number, Setting, Signal, slow_process)
 from sa_jitter_ros.simulation.random_streams import (
     band_limited, FloatArray, RandomStream, SinusoidSum)
 from scipy.interpolate import CubicSpline
@@ -69,6 +69,10 @@ class DeclaredJitter(Effect):
     def pulse_delay(self, setting: Setting, index: IndexArray, times: FloatArray) -> FloatArray:
         """Return the error of each pulse."""
         place = _per_pulse(RandomStream(setting.seed, 'declared_jitter').uniform, index)
+        return setting.jitter_factor * self._at(place)
+
+    def _at(self, place: FloatArray) -> FloatArray:
+        """Return the errors below which a share `place` of all lies."""
         if self.distribution == 'table':
             errors = np.array(self.table) - np.mean(self.table)
             return np.asarray(errors[np.floor(place * errors.size).astype(np.int64)])
@@ -78,6 +82,21 @@ class DeclaredJitter(Effect):
             return self.std * np.asarray(ndtri(np.maximum(place, 1e-300)))
         folded = np.sqrt(2.0 * np.minimum(place, 1.0 - place))
         return self.std * math.sqrt(6.0) * np.sign(place - 0.5) * (1.0 - folded)
+
+
+@dataclass(frozen=True)
+class JitterScale(Effect):
+    """The declared pulse errors are `scale` times as large as declared."""
+
+    scale: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('jitter_scale.scale', self.scale, minimum=0)
+
+    def jitter_factor(self) -> float:
+        """Return the scale."""
+        return self.scale
 
 
 @dataclass(frozen=True)
@@ -136,6 +155,21 @@ class TargetGeometry(Effect):
         marks = np.array(self.pulse_angles)[index % len(self.pulse_angles)] / (2.0 * np.pi)
         nominal = index / setting.pulses_per_revolution
         return setting.motion.time_at(nominal + marks) - times
+
+
+@dataclass(frozen=True)
+class PathDelay(Effect):
+    """All pulses come late by `delay` s, early where it is negative."""
+
+    delay: float
+
+    def __post_init__(self) -> None:
+        """Check the parameters."""
+        require_number('path_delay.delay', self.delay)
+
+    def observed(self, setting: Setting, times: FloatArray) -> FloatArray:
+        """Return the later times."""
+        return times + self.delay
 
 
 @dataclass(frozen=True)
@@ -234,27 +268,34 @@ class PhaseWander(Effect):
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('phase_wander.std', self.std, minimum=0)
-        require_number('phase_wander.bandwidth', self.bandwidth, minimum=0.05, below=0.5)
+        require_bandwidth('phase_wander.bandwidth', self.bandwidth)
 
     def source_angle(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
         """Return the angle in rad of the shaft."""
-        return slow_process(setting, self.std, f'phase_wander {shaft}',
-                            bandwidth=self.bandwidth).value(times)
+        return slow_process(setting, self.std, f'phase_wander {shaft}', self.bandwidth
+                            ).value(times)
 
 
 @dataclass(frozen=True)
 class AmplitudeModulation(Effect):
-    """Slow random gain on the vibration of each shaft, of mean 1 and standard deviation `std`."""
+    """
+    Slow random gain on the vibration of each shaft, of mean 1 and standard deviation `std`.
+
+    Its frequencies are up to `bandwidth` times the trigger rate.
+    """
 
     std: float
+    bandwidth: float = 0.4
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('amplitude_modulation.std', self.std, minimum=0)
+        require_bandwidth('amplitude_modulation.bandwidth', self.bandwidth)
 
     def gain(self, setting: Setting, shaft: str, times: FloatArray) -> FloatArray:
         """Return the factor."""
-        return 1.0 + slow_process(setting, self.std, f'amplitude_modulation {shaft}').value(times)
+        return 1.0 + slow_process(setting, self.std, f'amplitude_modulation {shaft}',
+                                  self.bandwidth).value(times)
 
 
 def linear(samples: FloatArray, positions: FloatArray) -> FloatArray:
@@ -346,11 +387,13 @@ class InterferingTone(Effect):
         return np.asarray(self.amplitude * np.cos(2.0 * np.pi * (cycles % 1.0 + phase)))
 
 
-# Effects are applied in this order: the skew of a clock before its quantisation.
+# Effects are applied in this order: a delay before the clock, its skew before its quantisation.
 EFFECTS: Mapping[str, type[Effect]] = {
+    'jitter_scale': JitterScale,
     'excess_jitter': ExcessJitter,
     'correlated_jitter': CorrelatedJitter,
     'target_geometry': TargetGeometry,
+    'path_delay': PathDelay,
     'clock_skew': ClockSkew,
     'keyphasor_quantisation': KeyphasorQuantisation,
     'missing_pulses': MissingPulses,

@@ -133,7 +133,8 @@ class Gearbox:
                           keyphasor.pulses_per_revolution, rate, motion)
         terms = [effect.speed_fluctuation(setting) for effect in self.effects]
         fluctuation = reduce(add, terms, self.fluctuation)
-        return replace(setting, motion=replace(motion, fluctuation=fluctuation))
+        return replace(setting, motion=replace(motion, fluctuation=fluctuation),
+                       jitter_factor=math.prod(item.jitter_factor() for item in self.effects))
 
     # --- truth ------------------------------------------------------------------------------
 

@@ -1,0 +1,53 @@
+"""
+Path delay: the pulses come late by a constant time, relative to the vibration.
+
+Where order g turns at the frequency f, a delay d turns it by 2 pi g f d. At constant speed that is
+a phase, the same in every average. Where the speed changes from average to average, the phase
+follows it; where it changes within one, the cycles turn apart and the amplitude shrinks.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.prediction.influence import mean_period, Pulses
+from sa_jitter_ros.prediction.model import DeclaredModel
+
+
+@dataclass(frozen=True)
+class PathDelay(Effect):
+    """
+    Measured pulses are late by `delay` s, those of all cycles alike.
+
+    What the keyphasor's path delays more than that of the vibration counts positive.
+    """
+
+    name: ClassVar[str] = 'path_delay'
+    summary: ClassVar[str] = 'pulses late by a constant time'
+    delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
+                             's', minimum=-1.0, maximum=1.0)
+
+    def gain(self, model: DeclaredModel) -> ArrayLike:
+        """Return the turn of each order at the speed of the model."""
+        if self.delay == 0.0:
+            return 1.0
+        turns = np.asarray(model.orders) * model.fundamental_frequency * self.delay
+        return np.asarray(np.exp(2j * np.pi * turns))
+
+    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+        """
+        Return what the change of speed within the average at hand makes of the delay.
+
+        Angle errors count in s at the mean speed f of the average: a pulse at the speed f_k is
+        late by delay f_k of a revolution, delay (f_k / f - 1) beyond the turn of all.
+        """
+        measured = np.isfinite(pulses.times)
+        if self.delay == 0.0 or np.count_nonzero(measured) < 3:
+            return None
+        times, index = pulses.times[measured], pulses.index[measured]
+        ends = slice(int(np.argmax(measured)), len(measured) - int(np.argmax(measured[::-1])))
+        lost = None if pulses.missing is None else pulses.missing[ends.start:ends.stop - 1]
+        speed = np.gradient(index, times) * mean_period(pulses.times[ends], lost)
+        return np.asarray(self.delay * (np.interp(pulses.index, index, speed) - 1.0))
