@@ -45,6 +45,8 @@ class NodeBench:
     def __init__(self, graph, node_class, *, inputs, outputs, qos=INPUT_QOS, result_qos=None,
                  overrides=(), **parameters):
         self.graph, self.spin, self.settle = graph, graph.spin, graph.settle
+        if node_class.takes_data:
+            parameters.setdefault('stale_after', 0.0)
         self.node = graph.add(
             node_class, {name.replace('__', '.'): value for name, value in parameters.items()},
             parameter_overrides=list(overrides))

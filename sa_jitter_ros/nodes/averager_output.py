@@ -25,6 +25,8 @@ from std_msgs.msg import Float64MultiArray
 
 FloatArray = NDArray[np.float64]
 
+ROUNDING = 1e-9  # relative scatter of a constant that was resampled
+
 
 class ShaftOutput:
     """Publishers of one shaft and its condition indicators, which depend on earlier averages."""
@@ -54,7 +56,15 @@ class ShaftOutput:
         self._send('standard_error', header, average.standard_error)
         self._send('order_amplitude', header, amplitude_table(average), AMPLITUDE_FIELDS)
         self.published += 1
+        constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])
+        for channel, is_constant in enumerate(constant.tolist()):
+            self._node.set_missing(f'channel {channel} of vibration', (
+                f'constant at {average.waveform[channel, 0]:.6g}, look at its sensor and cable'
+                if is_constant else ''))
         correction = average.correction
+        refused = correction is not None and not correction.accepted
+        self._node.set_missing(f'correction of {self._name}',
+                               f'refused, {correction.reason}' if refused else '')
         if correction is not None and not correction.accepted:
             self.refused += 1
             self.refusal = correction.reason

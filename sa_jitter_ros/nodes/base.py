@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
+import socket
 import sys
 import traceback
 from typing import Any
@@ -30,10 +31,12 @@ from rclpy.qos import (DurabilityPolicy, HistoryPolicy, qos_check_compatible,
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sa_jitter_ros.errors import MessageError, SaJitterError
+from sa_jitter_ros.nodes.health import Flow, Health, Level
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.nodes.parameters import ParameterSet
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
                    'clock_deviation', 'messages_rejected')
@@ -66,15 +69,25 @@ class MonitoringNode(Node):
 
     `counts` are cumulative. A subclass updates them in `update_counts`, which is called before
     they are published, and describes its state in `summary`. The status is WARN after a count
-    increased or a warning was given. It is ERROR while a publisher of an input has an incompatible
-    quality of service, and while `faults` holds a text.
+    increased or a warning was given, while an input is silent or has too many publishers, and
+    while something that the user asked for is missing (`set_missing`). It is ERROR while a
+    publisher of an input has an incompatible quality of service, while an input is silent for
+    long, and while `faults` holds a text.
     """
+
+    takes_data = True  # whether silence of inputs is judged, by the parameter `stale_after`
 
     def __init__(self, name: str, parameters: Sequence[Parameter], **node_kwargs: Any) -> None:
         super().__init__(name, **node_kwargs)
-        self.parameters = ParameterSet(self, parameters)
+        self.parameters = ParameterSet(self, [
+            *parameters, HARDWARE_ID, *([STALE_AFTER] if self.takes_data else [])])
         self.counts: dict[str, int] = dict.fromkeys(DIAGNOSTIC_KEYS, 0)
         self.faults: dict[str, str] = {}
+        self.health = Health()
+        #: Largest number of publishers by topic whose messages do not mix; 0 for any number.
+        self.most_publishers: dict[str, int] = {}
+        self._inputs: dict[str, Subscription] = {}
+        self._missing: dict[str, str] = {}
         self._incompatible: dict[Subscription, str] = {}  # and the incompatible policy
         self._reported = dict(self.counts)
         self._last_warning = ''
@@ -89,7 +102,7 @@ class MonitoringNode(Node):
         return self.create_timer(period, callback, clock=self._steady)
 
     def create_input(self, kind: type, topic: str, callback: Callable[[Any], None],
-                     qos: QoSProfile = INPUT_QOS) -> Subscription:
+                     qos: QoSProfile = INPUT_QOS, *, most_publishers: int = 1) -> Subscription:
         """
         Subscribe to a topic; an error in the callback becomes a warning.
 
@@ -122,7 +135,13 @@ class MonitoringNode(Node):
             kind, topic, guarded, copy(qos),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
             qos_overriding_options=_OVERRIDABLE)
+        self._inputs[subscription.topic_name] = subscription
+        self.most_publishers[subscription.topic_name] = most_publishers
         return subscription
+
+    def watch_input(self, name: str, topic: str, look_at: str, **options: Any) -> Flow:
+        """Watch what comes on a topic: its callback calls `came` for data that can be used."""
+        return self.health.add(Flow(name, self.resolve_topic_name(topic), look_at, **options))
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
         """Return the publisher of a result."""
@@ -138,6 +157,57 @@ class MonitoringNode(Node):
     def show_warning(self, text: str) -> None:
         """Show a warning in the next diagnostics, but not in the log."""
         self._last_warning = text
+
+    def set_missing(self, what: str, reason: str) -> None:
+        """
+        Say why the user does not get something, in log and status, until the reason is ''.
+
+        The log has one line when it begins and one when it ends.
+        """
+        before = self._missing.pop(what, '')
+        if reason:
+            self._missing[what] = reason
+        if bool(reason) != bool(before):
+            if reason:
+                self.get_logger().warning(f'{what}: {reason}')
+            else:
+                self.get_logger().info(f'{what}: there again')
+
+    def _log(self, level: Level, line: str) -> None:
+        if level == Level.ERROR:  # rclpy wants one line of code for each severity
+            self.get_logger().error(line)
+        elif level == Level.WARN:
+            self.get_logger().warning(line)
+        else:
+            self.get_logger().info(line)
+
+    def _find_crowds(self) -> None:
+        """Find topics on which several publishers mix their messages."""
+        for topic, most in self.most_publishers.items():
+            crowd = ''
+            if 0 < most < self.count_publishers(topic):
+                offered = self.get_publishers_info_by_topic(topic)
+                names = ', '.join(sorted(_node_name(item) for item in offered))
+                crowd = (f'{len(offered)} publishers ({names}) mix their messages: stop all but '
+                         f'{most}, or remap them')
+            self.set_missing(f'one source of {topic}', crowd)
+
+    def _cause(self, flow: Flow) -> str:
+        """Return what the ROS graph shows of a silent flow."""
+        subscription = self._inputs.get(flow.what)
+        if subscription is None:
+            return flow.look_at
+        offered = self.get_publishers_info_by_topic(flow.what)
+        kind = _type_name(subscription.msg_type)
+        if not offered:
+            return ('nobody publishes it: start its source, and compare topics and namespaces '
+                    '(ros2 topic list)')
+        others = sorted({item.topic_type for item in offered} - {kind})
+        if others:
+            return (f'it is published as {", ".join(others)}, this node takes {kind}: set the '
+                    'parameter of its type')
+        names = ', '.join(sorted({_node_name(item) for item in offered}))
+        return f'{names} publishes nothing: {flow.look_at}'
 
     def _incompatibilities(self) -> list[str]:
         """Return a line for each input with an incompatible publisher."""
@@ -159,21 +229,43 @@ class MonitoringNode(Node):
         """Publish the node's status."""
         self.update_counts()
         text, values = self.summary()
-        status = DiagnosticStatus(level=DiagnosticStatus.OK, message=text, hardware_id='',
-                                  name=self.get_fully_qualified_name().lstrip('/'))
+        self._find_crowds()
         grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
         faults = [*self.faults.values(), *self._incompatibilities()]
-        if faults:
-            status.level, status.message = DiagnosticStatus.ERROR, '; '.join(faults)
-        elif grown or self._last_warning:
-            status.level = DiagnosticStatus.WARN
-            status.message = self._last_warning or f'{", ".join(grown)} increased'
+        silent = self.health.silent(self.get_parameter(STALE_AFTER.name).value
+                                    if self.takes_data else 0.0)
+        for _, flow in silent:
+            flow.cause = self._cause(flow)
+        missing = [f'{what}: {reason}' for what, reason in self._missing.items()]
+        problems = [*faults, *(flow.problem() for _, flow in silent), *missing]
+        if not silent and self._last_warning:  # else it is a consequence
+            problems.append(self._last_warning)
+        level = max([Level.ERROR if faults else Level.OK, *(level for level, _ in silent),
+                     Level.WARN if problems or grown else Level.OK])
+        for change, line in self.health.changes(silent):
+            self._log(change, line)
+        status = DiagnosticStatus(
+            level=bytes([level]), name=self.get_fully_qualified_name().lstrip('/'),
+            message='; '.join(problems) or (f'{", ".join(grown)} increased' if grown else text),
+            hardware_id=self.get_parameter(HARDWARE_ID.name).value or socket.gethostname())
         self._reported, self._last_warning = dict(self.counts), ''
-        shown = {**{key: str(count) for key, count in self.counts.items()}, **values}
+        shown = {**{key: str(count) for key, count in self.counts.items()},
+                 **self.health.ages(), **values}
         status.values = [KeyValue(key=key, value=value) for key, value in shown.items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(message)
+
+
+def _node_name(info: TopicEndpointInfo) -> str:
+    """Return the full name of the node of a publisher."""
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+def _type_name(kind: type) -> str:
+    """Return the name of a message type, as the graph has it."""
+    package, folder = kind.__module__.split('.')[:2]
+    return f'{package}/{folder}/{kind.__name__}'
 
 
 def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@
 
 """Node `jitter_predictor`: predicts how jitter changes each order of a synchronous average."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
@@ -19,11 +20,14 @@ import numpy as np
 from sa_jitter_ros.declaration import declaration_of, NODE, predictor_parameters, SHAFTS
 from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.messages import encode_prediction, PREDICTION_FIELDS, PredictionMessage
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict, Prediction
 from std_msgs.msg import Float64, Float64MultiArray
+
+STEP = 0.05  # relative change from one cycle to the next that no jitter makes: the mean starts anew
 
 
 def check(values: Values) -> None:
@@ -52,22 +56,26 @@ class JitterPredictor(MonitoringNode):
         self._predictions = {shaft: self.create_output(
             Float64MultiArray, f'{shaft}/prediction' if len(shafts) > 1 else 'prediction',
             LATCHED_QOS) for shaft in shafts}
+        self._speeds: deque[float] = deque(maxlen=self._values['trigger_cycles'])
         self.create_input(Float64, 'shaft_speed', self._on_speed)
+        self._speed_flow = self.watch_input(
+            'speed', 'shaft_speed', 'has the averager vibration and pulses? (see its status)',
+            judged=self._values['follow_shaft_speed'])
+        self._prediction_flow = self.health.add(Flow('prediction', 'prediction', judged=False))
         self.parameters.watch(check=check, apply=self._apply)
         self._predict(self._declaration.models)
+        self.get_logger().info(f'started: {self.summary()[0]}')
 
     def _apply(self, values: Values) -> None:
-        speed = self._trigger_speed
         follows = values['follow_shaft_speed'] and self._values['follow_shaft_speed']
         given = values['trigger_speed'] != self._values['trigger_speed']
+        if values['trigger_cycles'] != self._values['trigger_cycles']:
+            self._speeds = deque(self._speeds, maxlen=values['trigger_cycles'])
         self._values, self._declaration = values, declaration_of(values)
-        if follows and not given:
-            try:
-                self._predict(self._models_at(speed))
-                return
-            except ModelError as error:
-                self.warn(f'at the measured speed of {speed:.6g} Hz: {error}')
-        self._predict(self._declaration.models)
+        self._speed_flow.judged = values['follow_shaft_speed']
+        if not (follows and not given and self._predict_at(self._trigger_speed)):
+            self._speeds.clear()
+            self._predict(self._declaration.models)
 
     def _on_speed(self, message: Float64) -> None:
         if not self._values['follow_shaft_speed']:
@@ -75,20 +83,33 @@ class JitterPredictor(MonitoringNode):
         speed = message.data
         if not (math.isfinite(speed) and speed > 0.0):
             raise MessageError(f'shaft_speed is {speed} Hz: publish a positive number')
+        self._speed_flow.came()
+        if self._speeds and abs(speed - self._speeds[-1]) > STEP * self._speeds[-1]:
+            self._speeds.clear()
+        self._speeds.append(speed)
+        # Jitter moves the speed of one cycle, but hardly that of an average of trigger_cycles.
+        mean = len(self._speeds) / sum(1.0 / item for item in self._speeds)
         predicted = self._trigger_speed
-        if abs(speed - predicted) > self._values['speed_tolerance'] * predicted:
-            self._predict(self._models_at(speed))
+        if abs(mean - predicted) > self._values['speed_tolerance'] * predicted:
+            self._predict_at(mean)
 
-    def _models_at(self, trigger_speed: float) -> dict[str, DeclaredModel]:
-        """Return the declared models at a measured speed; raises ModelError."""
-        return {shaft: replace(model, trigger_speed=trigger_speed)
-                for shaft, model in self._declaration.models.items()}
+    def _predict_at(self, speed: float) -> bool:
+        """Predict at a measured speed (Hz); return whether it is possible."""
+        try:
+            self._predict({shaft: replace(model, trigger_speed=speed)
+                           for shaft, model in self._declaration.models.items()})
+        except ModelError as error:
+            self.set_missing('prediction', f'impossible at the measured {speed:.6g} Hz, {error}')
+            return False
+        return True
 
     def _predict(self, models: Mapping[str, DeclaredModel]) -> None:
         predictions = {shaft: predict(model, self._declaration.effects)
                        for shaft, model in models.items()}
+        self.set_missing('prediction', '')
         self._models = models
         self._published += 1
+        self._prediction_flow.came()
         for shaft, prediction in predictions.items():
             self._predictions[shaft].publish(encode_prediction(prediction_message(prediction)))
 

@@ -21,6 +21,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
+from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.live_view_board import (
     Attenuations, Board, CHANNELS, indicators_content, ORDERS, orders_content, PulseErrors,
     pulses_content, SPEEDS, table_content, waveform_content)
@@ -67,17 +68,22 @@ class LiveView(MonitoringNode):
         self._apply(values)
         for shaft in values['shafts']:
             self._watch_shaft(shaft)
+        self._average_flow = self.watch_input(
+            'average', f'{values["shafts"][0]}/order_amplitude',
+            'has it vibration and pulses? (see its status)')
+        self._prediction_flow = self.health.add(Flow('prediction', 'prediction', judged=False))
         self.create_input(Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS)
         self.create_input(Float64MultiArray, 'residual', self._on_residual, RESULT_QOS)
         self.create_input(String, 'missing_effect', self._on_missing_effect, LATCHED_QOS)
         self.create_input(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
-        self.create_input(DiagnosticArray, '/diagnostics', self._on_diagnostics, RESULT_QOS)
+        self.create_input(DiagnosticArray, '/diagnostics', self._on_diagnostics, RESULT_QOS,
+                          most_publishers=0)
         self.parameters.watch(check=lambda values: None, apply=self._apply)
         self._server = PageServer(self._board.since, host=values['host'], port=values['port'])
         if self._server.port != values['port'] != 0:
             self.warn(f'port {values["port"]} is in use: the page is on port '
                       f'{self._server.port}')
-        self.get_logger().info(f'open {self._server.address} in a browser')
+        self.get_logger().info(f'started: open {self._server.address} in a browser')
 
     def destroy_node(self) -> None:
         """Stop the page and destroy the node."""
@@ -106,6 +112,8 @@ class LiveView(MonitoringNode):
         def on_orders(message: Float64MultiArray) -> None:
             average = decode_average('order_amplitude', message)
             self._averages += 1
+            self._average_flow.came()
+            self._average_flow.allowance = average.header.end_time - average.header.start_time
             shown = average.values[:CHANNELS, :ORDERS]
             history = attenuations.add(shown[..., 0], shown[..., 5])
             self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))
@@ -125,6 +133,9 @@ class LiveView(MonitoringNode):
 
     def _on_prediction(self, message: Float64MultiArray) -> None:
         prediction = decode_prediction(message)
+        self._prediction_flow.came()
+        if not self._average_flow.allowance and prediction.trigger_speed > 0.0:
+            self._average_flow.allowance = prediction.trigger_cycles / prediction.trigger_speed
         self._board.put('prediction', partial(table_content, prediction, PREDICTION_FIELDS),
                         data=False)
 

@@ -88,6 +88,8 @@ class Pacer:
 class PlaybackNode(MonitoringNode):
     """Publishes a stream at a given rate; a subclass yields its parts in `portions`."""
 
+    takes_data = False
+
     def __init__(self, name: str, parameters: tuple[Parameter, ...], **node_kwargs: Any) -> None:
         super().__init__(name, PLAYBACK_PARAMETERS + parameters, **node_kwargs)
         values = self.parameters.values()

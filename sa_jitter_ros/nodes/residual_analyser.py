@@ -84,8 +84,14 @@ class ResidualAnalyser(MonitoringNode):
         # A predictor of several shafts publishes one prediction for each.
         for topic in ('prediction', f'{shaft}/prediction'):
             self.create_input(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
+        self._average_flow = self.watch_input(
+            'average', f'{shaft}/order_amplitude', 'has it vibration and pulses? (see its status)')
+        self._prediction_flow = self.watch_input(
+            'prediction', 'prediction', 'see the status of the predictor', once=True)
         self.create_steady_timer(_PERIOD, lambda: self._step())
         self.parameters.watch(check=lambda values: None, apply=self._apply)
+        self.get_logger().info(f'started: compares {self._values["acquisitions"]} averages of '
+                               f'{shaft} at once with {self._predictor_name}')
 
     def _apply(self, values: Values) -> None:
         self._values = values
@@ -95,14 +101,17 @@ class ResidualAnalyser(MonitoringNode):
 
     def _on_average(self, message: Float64MultiArray) -> None:
         average = average_of(decode_average('order_amplitude', message))
-        if np.isfinite(average.attenuation).any():
+        self._average_flow.came()
+        self._average_flow.allowance = average.end_time - average.start_time
+        corrected = bool(np.isfinite(average.attenuation).any())
+        if corrected:
             self._batch.add(average)
         else:
             self._uncorrected += 1
-            self.warn(
-                'order_amplitude has no corrected amplitudes, so that nothing is compared: set '
-                'correct_jitter: true in the averager; if the averager refuses the correction '
-                '(see its diagnostics), use a better keyphasor')
+        self.set_missing('comparison', '' if corrected else (
+            'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
+            'averager; if the averager refuses the correction (see its diagnostics), use a better '
+            'keyphasor'))
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)
@@ -121,6 +130,9 @@ class ResidualAnalyser(MonitoringNode):
                 and received.keyphasor_rate > 0.0 and received.trigger_cycles > 0):
             raise MessageError(f'prediction at {received.trigger_speed} Hz: send finite numbers, '
                                'a positive speed and a positive keyphasor rate')
+        self._prediction_flow.came()
+        if not self._average_flow.allowance:
+            self._average_flow.allowance = received.trigger_cycles / received.trigger_speed
         self._prediction = Published(
             table[:, 0], table[:, 1], table[:, 3], received.trigger_speed,
             received.keyphasor_rate, received.trigger_cycles, received.ratio,
@@ -143,8 +155,9 @@ class ResidualAnalyser(MonitoringNode):
             require_comparable(averages, self._prediction)
             table, found = compare(averages, self._prediction)
         except SaJitterError as error:
-            self.warn(str(error))
+            self.set_missing('residual', str(error))
             return
+        self.set_missing('residual', '')
         self._batch.averages.clear()
         self._batches += 1
         self._significant = found.p_value < SIGNIFICANT

@@ -15,6 +15,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -24,12 +25,17 @@ from sa_jitter_ros.nodes.averager_parameters import (gear_settings, keyphasor_pa
                                                      one_ratio, PARAMETERS, shaft_parameters,
                                                      shaft_settings)
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
+from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
                                           PULSE_TYPES)
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names
 from std_msgs.msg import Float64, Float64MultiArray
+
+FloatArray = NDArray[np.float64]
+
+MOST_SOURCES = 100  # names of keyphasors that are remembered
 
 
 class SynchronousAverager(MonitoringNode):
@@ -51,15 +57,26 @@ class SynchronousAverager(MonitoringNode):
         self._apply_indicators(values)
         self._values = values
         self._keyphasor: str | None = values['keyphasor'] or None
+        self._sources: set[str] = set()  # of tach pulses
         self._other_keyphasors = 0
+        self._cycles_per_second = 0.0
         self._samples = SampleInput(self, values)
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
         self.create_input(self._samples.message_type, 'vibration', self._on_vibration)
-        self.create_input(pulse_type, 'tach_pulse',
-                          self._on_pulse_array if pulse_type is Float64MultiArray
-                          else self._on_pulse_reference)
+        self._tach = self.create_input(pulse_type, 'tach_pulse',
+                                       self._on_pulse_array if pulse_type is Float64MultiArray
+                                       else self._on_pulse_reference)
+        self._vibration_flow = self.watch_input(
+            'vibration', 'vibration', 'look at sensor, amplifier and acquisition')
+        self._pulse_flow = self.watch_input(
+            'pulse', 'tach_pulse', 'does the shaft turn? look at keyphasor, cable and threshold')
+        self._average_flow = self.health.add(Flow(
+            'average', 'average', 'do the times of vibration and pulses overlap?',
+            after=('vibration', 'pulse')))
         self.parameters.watch(check=self._check, apply=self._apply)
+        self.get_logger().info(f'started: averages {values["trigger_cycles"]} trigger cycles of '
+                               f'{", ".join(names)}')
 
     # --- parameters ---
 
@@ -99,30 +116,41 @@ class SynchronousAverager(MonitoringNode):
         except SignalError:
             self.counts['messages_rejected'] += 1
             raise
+        self._vibration_flow.came()
         self._publish(averages)
 
     def _on_pulse_reference(self, message: Any) -> None:
         times, source = decode_pulse_reference(message)
         if self._keyphasor is None:
             self._keyphasor = source
+        if source not in self._sources and len(self._sources) < MOST_SOURCES:
+            self._sources.add(source)
         if source != self._keyphasor:
             self._other_keyphasors += 1
             self.warn(f'tach_pulse: pulses of keyphasor {source!r} are ignored, those of '
                       f'{self._keyphasor!r} are used: set the parameter keyphasor to choose')
             return
-        self._publish(self._averager.add_pulses(times))
+        self._add_pulses(times)
 
     def _on_pulse_array(self, message: Float64MultiArray) -> None:
-        self._publish(self._averager.add_pulses(decode_pulse_array(message)))
+        self._add_pulses(decode_pulse_array(message))
+
+    def _add_pulses(self, times: FloatArray) -> None:
+        if times.size:
+            self._pulse_flow.came()
+        self._publish(self._averager.add_pulses(times))
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
         revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
         for name, average in averages:
+            self._average_flow.came()
             self._shafts[name].publish(average)
         speed = self._averager.take_speed() * revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
+            self._cycles_per_second = speed / revolutions
         for line in self._averager.take_messages():
+            self._average_flow.look_at = line
             self.warn(line)
 
     # --- diagnostics ---
@@ -133,6 +161,11 @@ class SynchronousAverager(MonitoringNode):
         self._samples.show_warning()
         self.counts.update(averager.totals)
         self.counts['pulses_dropped'] += self._other_keyphasors
+        if self._cycles_per_second:
+            self._average_flow.allowance = (
+                self._values['trigger_cycles'] / self._cycles_per_second)
+        if self._tach.msg_type is not Float64MultiArray:  # each keyphasor may have a publisher
+            self.most_publishers[self._tach.topic_name] = len(self._sources)
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the number of averages and the counts of the pulse validation."""

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
+from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.signals import PulseOutput, sample_parameters, SampleInput, TACH_TYPE
 from sa_jitter_ros.parameters import Parameter
@@ -88,8 +89,14 @@ class TachDetector(MonitoringNode):
         self._waiting: deque[float] = deque()
         self._output = PulseOutput(self, values['tach_type'])
         self.create_input(self._samples.message_type, 'tach_waveform', self._on_waveform)
+        self._waveform_flow = self.watch_input(
+            'waveform', 'tach_waveform', 'look at the acquisition of the keyphasor')
+        self._pulse_flow = self.health.add(Flow(
+            'pulse', 'pulse in the waveform', 'does the shaft turn? look at keyphasor, cable and '
+            'threshold', after=('waveform',)))
         self.create_steady_timer(BURST_PERIOD, self._send_waiting)
         self.parameters.watch(check=detector_of, apply=self._apply)
+        self.get_logger().info(f'started: pulses of keyphasor {self._keyphasor!r}')
 
     def _apply(self, values: Values) -> None:
         self._keyphasor = values['keyphasor']
@@ -114,6 +121,7 @@ class TachDetector(MonitoringNode):
         except SignalError:
             self.counts['messages_rejected'] += 1
             raise
+        self._waveform_flow.came()
         for epoch, samples in self._timeline.take():
             same = math.isclose(samples.sample_rate, self._rate, rel_tol=SAME_RATE)
             if epoch != self._epoch or not same:  # the learnt levels are those of another run
@@ -127,6 +135,8 @@ class TachDetector(MonitoringNode):
 
     def _publish(self, times: FloatArray) -> None:
         self._pulses += len(times)
+        if len(times):
+            self._pulse_flow.came()
         if self._output.single:
             self._waiting.extend(times.tolist())
             self._send_waiting()

@@ -1,0 +1,117 @@
+"""
+What came last, and what stays away: the ages of a node's data on the steady clock.
+
+A `Flow` is one kind of data that a node takes or makes. `Health` holds those of one node, judges
+their silence and says once when it begins, grows and ends. It knows nothing of ROS.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from enum import IntEnum
+import math
+import time
+
+ERROR_FACTOR = 3.0  # silence is an error after so many times the time that makes it a warning
+
+
+class Level(IntEnum):
+    """Severity, numbered as in `diagnostic_msgs/DiagnosticStatus`."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+@dataclass
+class Flow:
+    """
+    Data of one kind: `name` is that of its age in the diagnostics, `what` its topic or a noun.
+
+    `look_at` says where the cause of silence may lie, `cause` what is known of it. Silence is
+    judged if `judged`, and not while one of the flows named in `after` is silent, which explains
+    it. It may last `allowance` (s) longer than that of others. Data that come `once` are not
+    repeated: only the first are waited for.
+    """
+
+    name: str
+    what: str
+    look_at: str = ''
+    judged: bool = True
+    after: tuple[str, ...] = ()
+    once: bool = False
+    allowance: float = 0.0
+    cause: str = ''
+    since: float = field(default_factory=lambda: time.monotonic())
+    last: float = math.nan
+    reported: Level = Level.OK
+
+    def came(self) -> None:
+        """Note that data came now."""
+        self.last = time.monotonic()
+
+    @property
+    def age(self) -> float:
+        """Seconds since the last data, NaN before the first."""
+        return time.monotonic() - self.last
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last data, or since the start."""
+        return time.monotonic() - (self.since if math.isnan(self.last) else self.last)
+
+    def level(self, stale_after: float) -> Level:
+        """Return how severe the silence is."""
+        seen = not math.isnan(self.last)
+        if stale_after <= 0.0 or not self.judged or (self.once and seen):
+            return Level.OK
+        silence = self.silence - self.allowance
+        if silence > ERROR_FACTOR * stale_after:
+            return Level.ERROR
+        return Level.WARN if silence > stale_after else Level.OK
+
+    def problem(self) -> str:
+        """Return what is silent, and where to look."""
+        silence = (f'since the start {self.silence:.0f} s ago' if math.isnan(self.last)
+                   else f'for {self.silence:.0f} s')
+        return f'no {self.what} {silence}: {self.cause or self.look_at}'
+
+
+class Health:
+    """The flows of one node by name."""
+
+    def __init__(self) -> None:
+        self.flows: dict[str, Flow] = {}
+        self._flowing = False
+
+    def add(self, flow: Flow) -> Flow:
+        """Watch a flow; return it."""
+        self.flows[flow.name] = flow
+        return flow
+
+    def ages(self) -> dict[str, str]:
+        """Return the age of each flow in s as a text, `nan` before its first data."""
+        return {f'{flow.name}_age': f'{flow.age:.1f}' for flow in self.flows.values()}
+
+    def silent(self, stale_after: float) -> list[tuple[Level, Flow]]:
+        """Return the silent flows, the worst first."""
+        levels = {name: flow.level(stale_after) for name, flow in self.flows.items()}
+        return sorted(((level, self.flows[name]) for name, level in levels.items()
+                       if level and not any(levels.get(other) for other in self.flows[name].after)),
+                      key=lambda item: -item[0])
+
+    def changes(self, silent: Iterable[tuple[Level, Flow]]) -> list[tuple[Level, str]]:
+        """Return the lines for the log: what became silent, or continues, since the last call."""
+        now = {flow.name: level for level, flow in silent}
+        lines = []
+        for flow in self.flows.values():
+            level = now.get(flow.name, Level.OK)
+            if level > flow.reported:
+                lines.append((level, flow.problem()))
+            elif flow.reported and level == Level.OK and self._flowing:
+                lines.append((Level.OK, f'{flow.what} continues'))
+            flow.reported = level
+        arrived = [flow for flow in self.flows.values() if flow.judged and not flow.after]
+        if not self._flowing and arrived and not any(math.isnan(flow.last) for flow in arrived):
+            self._flowing = True
+            lines.append((Level.OK, f'data flow: {", ".join(flow.what for flow in arrived)}'))
+        return lines
