@@ -214,8 +214,8 @@ class StreamingAverager:
         if keep:
             self.counts.pulses_dropped += keep * self.validator.pulses_per_trigger
             self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
-                          f'{limit:g} s for vibration: is it published, on the clock of the pulses? (raise '
-                          'it for a slower shaft only)')
+                          f'{limit:g} s for vibration: is it published, on the clock of the '
+                          'pulses? (raise it for a slower shaft only)')
         self._forget_used()
 
     # --- cycles ---

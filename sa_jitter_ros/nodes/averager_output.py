@@ -62,12 +62,12 @@ class ShaftOutput:
                 f'constant at {average.waveform[channel, 0]:.6g}, look at its sensor and cable'
                 if is_constant else ''))
         correction = average.correction
-        refused = correction is not None and not correction.accepted
+        refusal = '' if correction is None or correction.accepted else correction.reason
         self._node.set_missing(f'correction of {self._name}',
-                               f'refused, {correction.reason}' if refused else '')
-        if correction is not None and not correction.accepted:
+                               f'refused, {refusal}' if refusal else '')
+        if refusal:
             self.refused += 1
-            self.refusal = correction.reason
+            self.refusal = refusal
         elif correction is not None:
             self._send('corrected_average', header, correction.waveform)
             self._send('pulse_error', header, np.stack(

@@ -1,3 +1,13 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
 """
 What came last, and what stays away: the ages of a node's data on the steady clock.
 
@@ -95,9 +105,9 @@ class Health:
     def silent(self, stale_after: float) -> list[tuple[Level, Flow]]:
         """Return the silent flows, the worst first."""
         levels = {name: flow.level(stale_after) for name, flow in self.flows.items()}
-        return sorted(((level, self.flows[name]) for name, level in levels.items()
-                       if level and not any(levels.get(other) for other in self.flows[name].after)),
-                      key=lambda item: -item[0])
+        found = [(level, self.flows[name]) for name, level in levels.items()
+                 if level and not any(levels.get(other) for other in self.flows[name].after)]
+        return sorted(found, key=lambda item: -item[0])
 
     def changes(self, silent: Iterable[tuple[Level, Flow]]) -> list[tuple[Level, str]]:
         """Return the lines for the log: what became silent, or continues, since the last call."""

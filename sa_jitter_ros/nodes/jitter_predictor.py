@@ -27,7 +27,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict, Prediction
 from std_msgs.msg import Float64, Float64MultiArray
 
-STEP = 0.05  # relative change from one cycle to the next that no jitter makes: the mean starts anew
+STEP = 0.05  # relative change of the speed from one cycle to the next that no jitter makes
 
 
 def check(values: Values) -> None:
