@@ -11,10 +11,12 @@
 """Install the package: into a colcon workspace or, by pip, into any Python environment."""
 
 from glob import glob
+import sys
 
 from setuptools import find_packages, setup
 
 NAME = 'sa_jitter_ros'
+HOME = 'https://sa-jitter-ros.example'
 NODES = (
     'jitter_predictor',
     'live_view',
@@ -26,13 +28,34 @@ NODES = (
 )
 COMMANDS = ('close_loop', 'demo', 'design')
 
+
+def scripts():
+    """
+    Return the console scripts: name to module.
+
+    colcon and Debian packages call the command `install` or `develop` and put scripts where only
+    `ros2 run` looks (setup.cfg). pip builds a wheel, whose scripts are on everybody's PATH: each
+    has the prefix `sa_jitter_`, and a short name beside it unless that is a common word.
+    """
+    modules = {
+        **{name: f'{NAME}.nodes.{name}' for name in NODES},
+        **{name: f'{NAME}.commands.{name}' for name in COMMANDS},
+    }
+    if {'develop', 'install'}.intersection(sys.argv):
+        return modules
+    prefixed = {f'sa_jitter_{name}': module for name, module in modules.items()}
+    return prefixed | {name: module for name, module in modules.items() if '_' in name}
+
+
 setup(
     name=NAME,
-    version='0.1.0',
+    version='1.0.0',
     description='Synchronous averaging of vibration, with the effect of keyphasor jitter',
     author='sa_jitter_ros contributors',
     maintainer='sa_jitter_ros maintainers',
     maintainer_email='maintainers@sa-jitter-ros.example',
+    url=HOME,
+    project_urls={'Source': f'{HOME}/{NAME}', 'Bug tracker': f'{HOME}/{NAME}/issues'},
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'nodes/live_view_page/*']},
@@ -43,14 +66,13 @@ setup(
     ],
     python_requires='>=3.10',
     install_requires=[
-        'setuptools',
         'matplotlib>=3.6',
         'numpy>=1.24',
         'PyYAML>=6.0',
-        'rosbags>=0.10',
         'scipy>=1.10',
     ],
     extras_require={
+        'bags': ['rosbags>=0.10'],
         'mat73': ['h5py>=3.7'],
         'docs': ['myst-parser>=2,<6', 'sphinx>=7.2,<10'],
         'test': [
@@ -75,15 +97,12 @@ setup(
             'pytest-xdist>=3.1,<4',
             'ros-ament-flake8>=0.17.3',
             'ros-ament-pep257>=0.17.3',
+            'rosbags>=0.10',
             'ruff==0.17.6',
         ],
     },
     zip_safe=True,
     entry_points={
-        'console_scripts': [
-            *(f'{name} = {NAME}.nodes.{name}:main' for name in NODES),
-            *(f'{name} = {NAME}.commands.{name}:main' for name in COMMANDS),
-            f'sa_jitter_close_loop = {NAME}.commands.close_loop:main',
-        ],
+        'console_scripts': [f'{name} = {module}:main' for name, module in scripts().items()],
     },
 )

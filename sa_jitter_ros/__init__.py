@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from sa_jitter_ros.recordings.reading import read
     from sa_jitter_ros.recordings.recording import Recording
 
-__version__ = '0.1.0'
+__version__ = '1.0.0'
 __all__ = [
     'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'MessageError',
     'ModelError', 'ParameterError', 'Prediction', 'Recording', 'RecordingError', 'SaJitterError',

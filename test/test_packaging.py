@@ -31,25 +31,42 @@ from test_architecture import is_ros, MODULES, needs
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'sa_jitter_ros'
 PYPI_NAMES = {'yaml': 'PyYAML'}
-ROSDEP_KEYS = {'rosbags': 'python3-rosbags-pip'}
+OPTIONAL = {'h5py': 'mat73', 'rosbags': 'bags'}  # package to extra
+# Keys of rosdep that are Debian packages of Ubuntu 24.04 or of ROS 2, no names of pip.
+ROSDEP_KEYS = {
+    'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-hypothesis',
+    'python3-matplotlib', 'python3-numpy', 'python3-pytest', 'python3-scipy', 'python3-yaml',
+    'rcl_interfaces', 'rclpy', 'sensor_msgs', 'std_msgs'}
 
 
-@pytest.fixture(scope='module')
-def setup():
-    """Return what setup.py tells setuptools."""
+def setup_called(*arguments):
+    """Return what setup.py, called with arguments, tells setuptools."""
     keywords_of_setup = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(setuptools, 'setup', lambda **keywords: keywords_of_setup.update(keywords))
+        patch.setattr(sys, 'argv', ['setup.py', *arguments])
         patch.chdir(ROOT)
         runpy.run_path('setup.py')
     return keywords_of_setup
 
 
-@pytest.fixture(scope='module')
-def scripts(setup):
+def scripts_of(keywords_of_setup):
     """Return the console scripts: name to module."""
-    entries = (entry.split(' = ') for entry in setup['entry_points']['console_scripts'])
+    lines = keywords_of_setup['entry_points']['console_scripts']
+    entries = (line.split(' = ') for line in lines)
     return {name: target.removesuffix(':main') for name, target in entries}
+
+
+@pytest.fixture(scope='module')
+def setup():
+    """Return what setup.py tells setuptools when pip builds a wheel."""
+    return setup_called('bdist_wheel')
+
+
+@pytest.fixture(scope='module')
+def scripts():
+    """Return the console scripts for `ros2 run`: name to module."""
+    return scripts_of(setup_called('build', 'install'))
 
 
 @pytest.fixture(scope='module')
@@ -86,20 +103,27 @@ def test_names_and_versions_agree(manifest, setup):
 
 def test_manifest_declares_what_is_imported(manifest, packages):
     declared = {dependency.name for dependency in manifest.exec_depends}
-    assert {
-        package if is_ros(package) else ROSDEP_KEYS.get(package, f'python3-{package}')
-        for package in packages
-    } <= declared
+    assert {package if is_ros(package) else f'python3-{package}'
+            for package in packages - set(OPTIONAL)} <= declared
+
+
+def test_manifest_declares_nothing_that_apt_lacks(manifest):
+    assert {item.name for item in (*manifest.exec_depends, *manifest.test_depends)} <= ROSDEP_KEYS
+    assert {url.type for url in manifest.urls} == {'bugtracker', 'repository', 'website'}
 
 
 def test_setup_requires_what_is_imported_from_pypi(setup, packages):
     required = {re.match(r'[\w-]+', line)[0] for line in setup['install_requires']}
-    assert {PYPI_NAMES.get(name, name) for name in packages if not is_ros(name)} <= required
+    assert {PYPI_NAMES.get(name, name)
+            for name in packages - set(OPTIONAL) if not is_ros(name)} == required
+    for package, extra in OPTIONAL.items():
+        assert package in packages
+        assert re.match(r'[\w-]+', setup['extras_require'][extra][0])[0] == package
 
 
 def test_every_script_has_a_main(scripts):
     for name, module in scripts.items():
-        assert name.removeprefix('sa_jitter_') == module.rpartition('.')[2]
+        assert name == module.rpartition('.')[2]
         assert callable(importlib.import_module(module).main)
 
 
@@ -115,6 +139,14 @@ def test_every_main_has_a_script(scripts):
     assert mains == set(scripts.values())
 
 
+def test_pip_puts_no_common_word_on_the_path(setup, scripts):
+    installed = scripts_of(setup)
+    assert {name: module for name, module in installed.items() if name in scripts} == {
+        name: module for name, module in scripts.items() if '_' in name}
+    assert {name: module for name, module in installed.items() if name not in scripts} == {
+        f'sa_jitter_{name}': module for name, module in scripts.items()}
+
+
 def test_every_folder_with_modules_is_installed(setup):
     folders = {path.parent.relative_to(ROOT) for path in MODULES}
     assert {'.'.join(folder.parts) for folder in folders} == set(setup['packages'])
@@ -126,12 +158,12 @@ def test_every_configuration_is_installed(setup):
     assert 'package.xml' in files
 
 
-def test_pip_installed_the_tree_as_it_stands(scripts):
+def test_pip_installed_the_tree_as_it_stands(setup):
     installed = Path(sysconfig.get_path('purelib')) / NAME
     if not installed.is_dir():
         pytest.skip(f'{NAME} is not installed in {sys.prefix}: ./run installs it')
     assert modules_of(installed) == modules_of(ROOT / NAME)
-    for name, module in scripts.items():
+    for name, module in scripts_of(setup).items():
         assert os.access(Path(sysconfig.get_path('scripts')) / name, os.X_OK)
         (entry,) = {e.value for e in entry_points(group='console_scripts', name=name)}
         assert entry == f'{module}:main'
@@ -165,6 +197,21 @@ def test_colcon_builds_what_ros2_run_looks_for(tmp_path, scripts):
     assert (share / 'package.xml').is_file()
     configured = {path.name for path in (share / 'config').iterdir()}
     assert configured == {path.name for path in ROOT.glob('config/*')}
+
+
+@pytest.mark.build
+def test_debian_package_where_its_tools_are(tmp_path, scripts):
+    built = subprocess.run(
+        [sys.executable, ROOT / 'benchmarks' / 'debian_package.py', '--output', tmp_path / 'deb'],
+        capture_output=True, text=True, check=False)
+    if built.returncode == 2 and built.stderr.count('\n') == 1:
+        pytest.skip(built.stderr.strip())
+    assert built.returncode == 0, built.stderr
+    lines = dict(line.partition(': ')[::2] for line in built.stdout.splitlines())
+    assert lines['ros2 run finds'].split() == sorted(scripts)
+    assert lines['on the PATH'] == 'nothing'
+    assert all(re.fullmatch(r'python3-\w+|ros-jazzy-[\w-]+', name)
+               for name in lines['depends on'].split(', '))
 
 
 def run(folder, *command):

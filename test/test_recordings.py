@@ -581,6 +581,13 @@ def test_a_table_of_a_million_columns_gets_a_short_line(tmp_path):
     assert len(str(refused.value)) < 1000
 
 
+def test_a_bag_without_rosbags_is_refused_with_the_remedy(tmp_path, monkeypatch):
+    (tmp_path / 'metadata.yaml').touch()
+    monkeypatch.setitem(sys.modules, 'rosbags.rosbag2', None)
+    with pytest.raises(RecordingError, match=r'not installed: pip install .* or rosbags$'):
+        read(tmp_path)
+
+
 @pytest.mark.parametrize('suffix', ['npz', 'mat'])
 def test_given_fields_replace_those_of_the_file(recording, tmp_path, suffix):
     path = tmp_path / f'rig.{suffix}'

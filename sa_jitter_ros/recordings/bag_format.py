@@ -190,7 +190,8 @@ def _reader(path: Path) -> Iterator[Any]:
         from rosbags.rosbag2 import Reader
     except ImportError as error:
         raise RecordingError(
-            "reading bags needs the Python package rosbags: 'pip install rosbags'") from error
+            'bags are read with rosbags, which is not installed: pip install '
+            "'sa_jitter_ros[bags]' or rosbags") from error
     check_bag(path)
     with Reader(path) as reader:
         if reader.compression_mode == 'message':
