@@ -90,6 +90,24 @@ def test_distribution_that_is_named_but_not_sourced(refusal):
     assert 'imports rclpy' in line
 
 
+@pytest.mark.parametrize(('command', 'files', 'extras'), [
+    ('test', [], ['test']), ('demo', [], []), ('demo', ['rig.npz', '--output', 'out'], []),
+    ('demo', ['rig.mcap'], ['bags']), ('demo', ['bag'], ['bags']), ('demo', ['old.mat'], []),
+    ('demo', ['new.mat'], ['mat73'])])
+def test_extras_are_those_that_the_recording_needs(tmp_path, command, files, extras):
+    (tmp_path / 'bag').mkdir()
+    (tmp_path / 'bag' / 'metadata.yaml').touch()
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'rig.npz').write_bytes(b'PK\x03\x04')
+    (tmp_path / 'old.mat').write_bytes(b'MATLAB 5.0 MAT-file\x00')
+    (tmp_path / 'new.mat').write_bytes(b'MATLAB 7.3 MAT-file\x00')
+    function = re.search(r'(?ms)^needed_extras\(\) \{.*?^\}', RUN.read_text())[0]
+    script = f'shopt -s extglob\n{function}\ncommand={command}\nneeded_extras "$@"'
+    found = subprocess.run(['bash', '-euc', script, 'run', *files], cwd=tmp_path,
+                           capture_output=True, text=True, check=True)
+    assert found.stdout.split() == extras
+
+
 def test_quick_leaves_out_the_marks_that_contributing_explains(pytestconfig):
     marks = {line.partition(':')[0] for line in pytestconfig.getini('markers')
              if line in (ROOT / 'pyproject.toml').read_text()}

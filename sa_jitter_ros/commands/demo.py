@@ -141,6 +141,8 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
         unit = '' if plan.unit == 'unknown' else plan.unit
         nodes['live_view'] = {'vibration_unit': repr(unit), 'channel_names': plan.channels}
         nodes['residual_analyser'] = {'acquisitions': LIVE_ACQUISITIONS}
+    for name in nodes.keys() - {plan.source}:
+        nodes[name]['stale_after'] = 0.0  # data end when the source has ended
     return nodes
 
 
