@@ -27,8 +27,8 @@ from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
 from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
-    TRIGGER_CYCLES)
+    HARDWARE_ID, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
+    STALE_AFTER, TRIGGER_CYCLES)
 from sa_jitter_ros.prediction.model import DeclaredModel, DISTRIBUTIONS
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 
@@ -159,7 +159,8 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         declaration = declaration_of(converted)
     except SaJitterError as error:
         raise ModelError(f'{path}: {one_line(error)}') from error
-    unknown = sorted(name for name in values if name not in known and name != 'use_sim_time'
+    others = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # of the node, not of the model
+    unknown = sorted(name for name in values if name not in (*known, *others)
                      and not name.startswith('qos_overrides.'))
     return replace(declaration, unknown=tuple(unknown))
 

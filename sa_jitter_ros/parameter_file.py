@@ -12,6 +12,7 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+import stat
 from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
@@ -31,10 +32,7 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     a file that is missing, too large, nested too deep, or without parameters of the node.
     """
     try:
-        size = path.stat().st_size
-        if size > _LARGEST_FILE:
-            raise ParameterError(f'{size} bytes are too many for a parameter file: give at most '
-                                 f'{_LARGEST_FILE}')
+        require_regular_file(path)
         text = path.read_text(encoding='utf-8')
         _check_structure(text)
         content = yaml.load(text, _LOADER)
@@ -50,6 +48,34 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
         raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
                              f'"{node}:" or "/**:" and "ros__parameters:"')
     return {name: value for section in sections for name, value in _flattened(section, '')}
+
+
+def shipped(name: str) -> Path:
+    """
+    Return the path of a file of `config/`, in a checkout or where the package is installed.
+
+    Raises ParameterError where it is not installed.
+
+    >>> shipped('machine.yaml').name
+    'machine.yaml'
+    """
+    folder = Path(__file__).resolve().parent
+    places = [folder.parent / 'config' / name, *(
+        parent / 'share' / folder.name / 'config' / name for parent in folder.parents)]
+    for place in places:
+        if place.is_file():
+            return place
+    raise ParameterError(f'{name} is not installed with {folder}: give --params with its path')
+
+
+def require_regular_file(path: Path) -> None:
+    """Raise ParameterError for a file that is too large or may never end; OSError without it."""
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise ParameterError('is no regular file: give a parameter file (.yaml)')
+    if found.st_size > _LARGEST_FILE:
+        raise ParameterError(f'{found.st_size} bytes are too many for a parameter file: give at '
+                             f'most {_LARGEST_FILE}')
 
 
 def one_line(error: Exception) -> str:

@@ -34,8 +34,8 @@ def make_parser() -> Parser:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
                         help='recordings of one machine: .npz, .mat, .wav, .csv or rosbag2')
-    parser.add_argument('--declared', type=Path, required=True, metavar='MODEL.yaml',
-                        help='ROS parameter file of jitter_predictor')
+    parser.add_argument('--declared', '--params', type=Path, required=True, metavar='MODEL.yaml',
+                        help='ROS parameter file of jitter_predictor, or of the whole machine')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for report.json, report.html and the figures')
     parser.add_argument('--quiet', action='store_true', help='show no progress')

@@ -15,7 +15,7 @@ It plays a recording, or a simulated gearbox, through tach detector, averager an
 compares the measured with the predicted attenuation.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 import os
 from pathlib import Path
 import signal
@@ -33,12 +33,14 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, Parser, player_options, read_options)
-from sa_jitter_ros.commands.demo_plan import Plan, plan_recording, SIMULATED
+from sa_jitter_ros.commands.demo_plan import (
+    Plan, plan_recording, plan_simulation, with_machine)
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, PredictionMessage)
+from sa_jitter_ros.parameter_file import shipped
 from sa_jitter_ros.recordings import read
 from std_msgs.msg import Float64, Float64MultiArray
 
@@ -54,7 +56,7 @@ LIVE_ACQUISITIONS = 4  # averages in a residual
 class Watcher(Node):
     """Receives all results of one shaft and the diagnostics of all nodes."""
 
-    def __init__(self, **node_kwargs: Any) -> None:
+    def __init__(self, shaft: str, **node_kwargs: Any) -> None:
         super().__init__('demo', **node_kwargs)
         self.averages: dict[str, list[AverageMessage]] = {
             kind: [] for kind in ('synchronous_average', 'corrected_average', 'order_amplitude',
@@ -64,10 +66,10 @@ class Watcher(Node):
         self.status: dict[str, dict[str, str]] = {}
         self.status_time: dict[str, float] = {}
         for kind in self.averages:
-            self.create_subscription(Float64MultiArray, f'shaft/{kind}', self._add_to(kind),
+            self.create_subscription(Float64MultiArray, f'{shaft}/{kind}', self._add_to(kind),
                                      RESULT_QOS)
-        self.create_subscription(Float64MultiArray, 'prediction', self._on_prediction,
-                                 LATCHED_QOS)
+        for topic in ('prediction', f'{shaft}/prediction'):  # of one shaft, of several
+            self.create_subscription(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
         self.create_subscription(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
@@ -105,11 +107,13 @@ class Watcher(Node):
         return ' | '.join(parts)
 
 
-def node_command(name: str, parameters: dict[str, object]) -> list[str]:
+def node_command(name: str, parameters: Mapping[str, object], params: Path | None = None
+                 ) -> list[str]:
     """Return the command line of one of this package's nodes with parameters."""
     command = [sys.executable, '-c',
                f'from sa_jitter_ros.nodes.{name} import main; raise SystemExit(main())',
-               '--ros-args', '--log-level', 'warn']
+               '--ros-args', '--log-level', 'warn',
+               *(['--params-file', str(params)] if params else [])]
     for key, value in parameters.items():
         text = (f'[{", ".join(map(repr, value))}]' if isinstance(value, (list, tuple))
                 else str(value))
@@ -118,21 +122,28 @@ def node_command(name: str, parameters: dict[str, object]) -> list[str]:
 
 
 def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]:
-    """Return the nodes to start and their parameters; `live` adds those of the web page."""
+    """
+    Return the nodes to start and their parameters beside those of the machine file.
+
+    `live` adds the nodes of the web page, and lets the signals run without end.
+    """
     nodes: dict[str, dict[str, object]] = {
-        'synchronous_averager': {
-            'pulses_per_revolution': plan.pulses_per_revolution,
-            'pulses_per_trigger': plan.pulses_per_trigger, 'missing_teeth': plan.missing_teeth,
-            'trigger_cycles': plan.trigger_cycles, 'shaft.ratio': plan.ratio,
-            'shaft.orders': plan.orders, 'correct_jitter': True,
-            'keyphasor_rate': plan.keyphasor_rate},
-        'jitter_predictor': {
-            'keyphasor_rate': plan.keyphasor_rate, 'trigger_speed': plan.speed,
-            'pulses_per_revolution': plan.pulses_per_revolution,
-            'pulses_per_trigger': plan.pulses_per_trigger,
-            'trigger_cycles': plan.trigger_cycles, 'ratio': plan.ratio, 'orders': plan.orders,
-            'follow_shaft_speed': True},
+        'synchronous_averager': {}, 'jitter_predictor': {},
         plan.source: {**plan.source_parameters, 'playing': False}}
+    if plan.params is None:
+        keyphasor = {'keyphasor_rate': plan.keyphasor_rate, 'trigger_cycles': plan.trigger_cycles,
+                     'pulses_per_revolution': plan.pulses_per_revolution,
+                     'pulses_per_trigger': plan.pulses_per_trigger}
+        nodes['synchronous_averager'] = {
+            **keyphasor, 'missing_teeth': plan.missing_teeth, f'{plan.shaft}.ratio': plan.ratio,
+            f'{plan.shaft}.orders': plan.orders, 'correct_jitter': True}
+        nodes['jitter_predictor'] = {
+            **keyphasor, 'trigger_speed': plan.speed, 'ratio': plan.ratio, 'orders': plan.orders,
+            'follow_shaft_speed': True}
+    if plan.source == 'machine_simulator':
+        nodes[plan.source]['duration'] = 0.0 if live else plan.seconds
+    elif live:
+        nodes[plan.source]['loop'] = True
     if plan.waveform:
         # The declared jitter is that of a pulse time which is the first sample past the threshold.
         nodes['tach_detector'] = {'interpolate': False, 'tach_type': PULSE_BLOCKS}
@@ -142,13 +153,18 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
         nodes['live_view'] = {'vibration_unit': repr(unit), 'channel_names': plan.channels}
         nodes['residual_analyser'] = {'acquisitions': LIVE_ACQUISITIONS}
     for name in nodes.keys() - {plan.source}:
-        nodes[name]['stale_after'] = 0.0  # data end when the source has ended
+        # The nodes wait for each other first; unless live, the data end before the nodes.
+        nodes[name]['stale_after'] = START_TIMEOUT if live else 0.0
     return nodes
 
 
 def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
           children: Sequence[subprocess.Popen[bytes]], *, live: bool = False) -> None:
-    """Start the signals, print the progress, and return when the last average has come."""
+    """
+    Start the signals, print the progress, and return when the last average has come.
+
+    Signals that are `live` do not end: return when all of the plan was played once.
+    """
     def spin(seconds: float) -> None:
         end = time.monotonic() + seconds
         while (remaining := end - time.monotonic()) > 0.0:
@@ -190,9 +206,23 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
         if len(watcher.amplitudes()) > count:
             last, count = now, len(watcher.amplitudes())
         ended = watcher.status.get(plan.source, {}).get('message', '').startswith('ended')
+        if live and now - start > plan.seconds + LAST_AVERAGE:
+            break
         silence = now - watcher.status_time.get(plan.source, start)
         if (ended and now - last > LAST_AVERAGE) or silence > SILENCE_TIMEOUT:
             break
+
+
+def stay(children: Sequence[subprocess.Popen[bytes]]) -> int:
+    """Wait for Ctrl-C or SIGTERM, or the end of a node; return its status, 0 after a signal."""
+    try:
+        while True:
+            for child in children:
+                if child.poll() is not None:
+                    return child.returncode
+            time.sleep(0.5)
+    except KeyboardInterrupt:
+        return 0
 
 
 def stop(children: Sequence[subprocess.Popen[bytes]]) -> None:
@@ -225,10 +255,10 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
         print(f'\nstandard deviation of the pulse errors: {1e6 * std:.3g} us recovered from the '
               f'vibration, {1e6 * declared:.3g} us declared')
     averager = watcher.status.get('synchronous_averager', {})
-    refused = averager.get('shaft.corrections_refused')
+    refused = averager.get(f'{plan.shaft}.corrections_refused')
     if refused:
         print(f'note: the correction of {refused} averages was refused: '
-              f'{averager["shaft.refusal"]}')
+              f'{averager[f"{plan.shaft}.refusal"]}')
     end = watcher.status.get(plan.source, {}).get('message', '')
     for note in (plan.note, end if end.startswith('ended early') else ''):
         if note:
@@ -251,6 +281,9 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--keyphasor-rate', type=float, default=0.0, metavar='HZ',
                         help='round pulse times up to a clock of this rate, as if the keyphasor '
                         'had been sampled with it')
+    parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
+                        help='parameter file of the machine (for the simulated gearbox: '
+                        'machine.yaml of this package)')
     parser.add_argument('--live', action='store_true',
                         help='show all results live on a web page, until Ctrl-C')
     parser.add_argument('--output', type=Path, default=Path('out'),
@@ -262,11 +295,14 @@ def main(args: Sequence[str] | None = None) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores SIGINT
         signal.signal(number, signal.default_int_handler)
     try:
-        plan = SIMULATED
         if options.recording:
             plan = plan_recording(
                 options.recording, read(options.recording, **read_options(options)),
                 keyphasor_rate=options.keyphasor_rate, parameters=player_options(options))
+            if options.params:
+                plan = with_machine(plan, options.params)
+        else:
+            plan = plan_simulation(options.params or shipped('machine.yaml'))
         options.output.mkdir(parents=True, exist_ok=True)  # fails before the run, not after it
         print(f'{plan.title}: {plan.seconds:.3g} s, {len(plan.channels)} channels, '
               f'{plan.speed:.4g} Hz, {plan.trigger_cycles} trigger cycles per average')
@@ -274,16 +310,19 @@ def main(args: Sequence[str] | None = None) -> int:
             print('to watch it live in a web browser: ./run demo --live')
         os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         rclpy.init(context=context)
-        watcher = Watcher(context=context)
+        watcher = Watcher(plan.shaft, context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(watcher)
-        children += [subprocess.Popen(node_command(name, parameters))
+        children += [subprocess.Popen(node_command(name, parameters, plan.params))
                      for name, parameters in processes(plan, live=options.live).items()]
         watch(plan, watcher, executor, children, live=options.live)
         report(plan, watcher, options.output)
         if options.live:
-            print('the page stays until Ctrl-C', flush=True)
-            executor.spin()
+            watcher.destroy_node()  # it would keep all results
+            print('machine and page stay until Ctrl-C', flush=True)
+            ended = stay(children)
+            if ended:
+                raise SaJitterError(f'a node ended with status {ended}')
     except (SaJitterError, OSError) as error:
         print(f'demo: {error}', file=sys.stderr)
         return 2

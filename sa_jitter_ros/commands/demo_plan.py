@@ -11,14 +11,16 @@
 """How the demo averages a recording, and the model that it declares for it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
@@ -26,6 +28,7 @@ FloatArray = NDArray[np.float64]
 FIRST_SECONDS = 10.0  # part of a recording from which its plan is made
 ORDERS = 6  # orders to show if the recording names none
 AVERAGES = 8  # averages to make of a recording
+SIMULATED_SECONDS = 20.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class Plan:
     `source` is the node that plays them, with `source_parameters`, for `seconds`. `speed` of the
     tach shaft and `keyphasor_rate` are in Hz; `pulses_per_trigger` is 0 for all pulses of a
     revolution. `waveform` is true if the pulses come from a tach waveform; `note` is for the user.
+    With `params`, a machine file, the nodes take their parameters from it.
     """
 
     source: str
@@ -54,6 +58,8 @@ class Plan:
     pulses_per_trigger: int = 0
     missing_teeth: int = 0
     note: str = ''
+    shaft: str = 'shaft'
+    params: Path | None = None
 
     @property
     def unit_label(self) -> str:
@@ -61,18 +67,28 @@ class Plan:
         return f'[{self.unit}]' if self.unit and self.unit != 'unknown' else ''
 
 
-_SPEED, _RATIO, _CLOCK, _SECONDS = 16.6, 2.40789, 3000.0, 20.0
-SIMULATED = Plan(
-    source='machine_simulator',
-    source_parameters={
-        'speed': _SPEED, 'shaft.ratio': _RATIO, 'shaft.teeth': 19,
-        'shaft.harmonics': (1.0, 0.5, 0.25), 'shaft.sidebands': 0.1,
-        'speed_fluctuation_std': 2e-4, 'channel_gains': (1.0, 0.6), 'noise_std': 0.3,
-        'sample_rate': 20000.0, 'keyphasor_rate': _CLOCK, 'duration': _SECONDS, 'seed': 1},
-    title='simulated gearbox, gear of 19 teeth', seconds=_SECONDS,
-    channels=('channel 0', 'channel 1'), unit='m/s^2', speed=_SPEED, keyphasor_rate=_CLOCK,
-    pulses_per_revolution=1, ratio=_RATIO, trigger_cycles=30,
-    orders=(18.0, 19.0, 20.0, 37.0, 38.0, 39.0, 57.0))
+def plan_simulation(params: Path) -> Plan:
+    """Return the plan for the simulated gearbox of a machine file; raises SaJitterError."""
+    gains = read_parameters(params, 'machine_simulator').get('channel_gains', [1.0])
+    labels = read_parameters(params, 'live_view')
+    names = labels.get('channel_names', [])
+    if len(names) != len(gains):
+        names = [f'channel {i}' for i in range(len(gains))]
+    plan = Plan(
+        source='machine_simulator', source_parameters={}, title='simulated gearbox',
+        seconds=SIMULATED_SECONDS, channels=tuple(names), unit=labels.get('vibration_unit', ''),
+        speed=0.0, keyphasor_rate=0.0, pulses_per_revolution=1, ratio=1.0, trigger_cycles=1,
+        orders=())
+    planned = with_machine(plan, params)
+    return replace(planned, speed=read_declaration(params).models[planned.shaft].trigger_speed)
+
+
+def with_machine(plan: Plan, params: Path) -> Plan:
+    """Return a plan for the first shaft of a machine file; raises SaJitterError."""
+    shaft, model = next(iter(read_declaration(params).models.items()))
+    return replace(plan, params=params, shaft=shaft, **{name: getattr(model, name) for name in (
+        'keyphasor_rate', 'pulses_per_revolution', 'pulses_per_trigger', 'ratio',
+        'trigger_cycles', 'orders')})
 
 
 def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 import numpy as np
 from sa_jitter_ros.commands.command_line import Parser
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.prediction.comb import Leakage
 from sa_jitter_ros.prediction.design import (
@@ -58,25 +59,31 @@ def make_parser() -> Parser:
     parser = Parser(prog='design', description=__doc__, epilog=EXAMPLES,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     machine = parser.add_argument_group('machine and average')
-    machine.add_argument('--orders', type=float, nargs='+', required=True, metavar='ORDER',
+    machine.add_argument('--params', type=Path, metavar='MACHINE.yaml',
+                         help='ROS parameter file with a section of jitter_predictor: the machine, '
+                         'where the options below do not say otherwise')
+    machine.add_argument('--shaft', default='', metavar='NAME',
+                         help='shaft of interest in that file (default: its first)')
+    machine.add_argument('--orders', type=float, nargs='+', metavar='ORDER',
                          help='orders to monitor, multiples of the shaft of interest')
-    machine.add_argument('--trigger-speed', type=float, required=True, metavar='HZ',
+    machine.add_argument('--trigger-speed', type=float, metavar='HZ',
                          help='speed of the tach shaft, which carries the keyphasor, Hz')
-    machine.add_argument('--ratio', type=float, default=1.0,
+    machine.add_argument('--ratio', type=float,
                          help='speed of the shaft of interest / speed of the tach shaft (1)')
-    machine.add_argument('--pulses-per-revolution', type=int, default=1, metavar='N',
+    machine.add_argument('--pulses-per-revolution', type=int, metavar='N',
                          help='keyphasor pulses per revolution of the tach shaft (1)')
-    machine.add_argument('--pulses-per-trigger', type=int, default=0, metavar='N',
+    machine.add_argument('--pulses-per-trigger', type=int, metavar='N',
                          help='pulses per trigger cycle (default: all pulses of a revolution)')
-    machine.add_argument('--jitter-distribution', choices=RATE_DISTRIBUTIONS, default='uniform',
+    machine.add_argument('--jitter-distribution', choices=RATE_DISTRIBUTIONS,
                          help='distribution of the pulse error; the keyphasor rate determines '
                          'its width (uniform)')
-    machine.add_argument('--noise-std', type=float, default=0.0, metavar='X',
+    machine.add_argument('--noise-std', type=float, metavar='X',
                          help='standard deviation of white noise per vibration sample, in units '
                          "of the component's amplitude (0)")
-    machine.add_argument('--sample-rate', type=float, default=0.0, metavar='HZ',
+    machine.add_argument('--sample-rate', type=float, metavar='HZ',
                          help='sampling rate of the vibration, Hz; needed with --noise-std')
-    settings = parser.add_argument_group('settings (chosen if not given)')
+    settings = parser.add_argument_group(
+        'settings (chosen if not given; those in MACHINE.yaml are not taken)')
     settings.add_argument('--keyphasor-rate', type=float, metavar='HZ',
                           help='rate at which the keyphasor is sampled, Hz')
     settings.add_argument('--trigger-cycles', type=int, metavar='N',
@@ -102,6 +109,32 @@ def make_parser() -> Parser:
     parser.add_argument('--output', type=Path, default=Path('design.png'), metavar='FILE',
                         help='file of the figure: png, pdf or svg (design.png)')
     return parser
+
+
+def parse(args: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options, with the machine's from its file or their defaults; SaJitterError."""
+    parser = make_parser()
+    options = parser.parse_args(args)
+    machine: dict[str, Any] = {
+        'ratio': 1.0, 'pulses_per_revolution': 1, 'pulses_per_trigger': 0,
+        'jitter_distribution': 'uniform', 'noise_std': 0.0, 'sample_rate': 0.0}
+    if options.params:
+        declaration = read_declaration(options.params)
+        shaft = options.shaft or next(iter(declaration.models))
+        if shaft not in declaration.models:
+            raise ParameterError(f'--shaft is {shaft!r}: {options.params} has '
+                                 f'{", ".join(declaration.models)}')
+        machine = {name: getattr(declaration.models[shaft], name)
+                   for name in ('orders', 'trigger_speed', *machine)}
+    for name, value in machine.items():
+        if getattr(options, name) is None:
+            setattr(options, name, value)
+    missing = [f'--{name.replace("_", "-")}' for name in ('orders', 'trigger_speed')
+               if getattr(options, name) is None]
+    if missing:
+        parser.error(f'the following arguments are required: {", ".join(missing)} (or --params)')
+    del options.params, options.shaft
+    return options
 
 
 def table(found: Design, options: argparse.Namespace) -> str:
@@ -257,10 +290,10 @@ def draw_detection(
 
 def main(args: Sequence[str] | None = None) -> int:
     """Choose or assess settings, print a table and write the figure; return the exit status."""
-    options = make_parser().parse_args(args)
-    keywords: dict[str, Any] = vars(options).copy()
-    output = keywords.pop('output')
     try:
+        options = parse(args)
+        keywords: dict[str, Any] = vars(options).copy()
+        output = keywords.pop('output')
         formats = Figure().canvas.get_supported_filetypes()
         if output.suffix.lstrip('.').lower() not in formats:
             raise ParameterError(f'--output {output}: give a file that ends in .png, .pdf or .svg')

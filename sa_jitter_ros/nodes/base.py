@@ -12,6 +12,8 @@
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from itertools import pairwise
+from pathlib import Path
 import socket
 import sys
 import traceback
@@ -32,10 +34,11 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from sa_jitter_ros.errors import MessageError, SaJitterError
+from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import Flow, Health, Level
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.nodes.parameters import ParameterSet
+from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
@@ -270,23 +273,31 @@ def _type_name(kind: type) -> str:
 
 def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
     """Run one node until SIGINT or SIGTERM; return 0, or 2 after one line on a bad argument."""
+    return run_nodes([node_class], args)
+
+
+def run_nodes(node_classes: Sequence[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
+    """Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`."""
     use_one_thread()
+    nodes: list[Node] = []
     try:
+        _check_parameter_files(sys.argv if args is None else args)
         rclpy.init(args=args)
-    except RuntimeError as error:  # rcl cannot read the command line or a parameter file
+    except (ParameterError, RuntimeError) as error:  # rcl cannot read the command line or a file
         print(f'error: {error}', file=sys.stderr)
         return 2
-    node = None
     try:
         try:
-            node = node_class()
+            for node_class in node_classes:
+                nodes.append(node_class())
         except (InvalidParameterTypeException, RuntimeError) as error:  # of rclpy's own parameters
             if rclpy.ok():
                 print(f'error: {error}', file=sys.stderr)
                 return 2
             raise
         executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        for node in nodes:
+            executor.add_node(node)
         executor.spin()
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -297,7 +308,17 @@ def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) 
         if rclpy.ok():  # else the shutdown interrupted a callback
             raise
     finally:
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _check_parameter_files(args: Sequence[str]) -> None:
+    """Raise ParameterError for a parameter file that rcl would read without end."""
+    for option, name in pairwise(args):
+        if option == '--params-file' and Path(name).exists():
+            try:
+                require_regular_file(Path(name))
+            except ParameterError as error:
+                raise ParameterError(f'{name}: {error}') from None
