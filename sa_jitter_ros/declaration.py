@@ -19,7 +19,6 @@ which is the default, `ratio` and `orders` belong to it; with several, each has 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-import re
 from typing import Any
 
 from sa_jitter_ros.effects import Effect, enabled_effects
@@ -69,8 +68,6 @@ FOLLOWING = (
     Parameter('speed_tolerance', 1e-3, 'relative change of the speed that starts a new '
               'prediction', minimum=0.0, maximum=1.0),
 )
-# rcl reads these texts as numbers, YAML 1.1 does not.
-_FLOAT = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
 
 
 @dataclass(frozen=True)
@@ -152,7 +149,7 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         if values and not known.keys() & values.keys():
             raise ModelError(f'none of {", ".join(values)} is a parameter of {NODE}: give the '
                              f'parameter file of {NODE}')
-        converted = {name: known[name].convert(_as_rcl_reads(value, known[name]))
+        converted = {name: known[name].convert(value)
                      for name, value in values.items() if name in known}
         if not converted.get('sample_rate'):
             converted['sample_rate'] = sample_rate
@@ -163,12 +160,3 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     unknown = sorted(name for name in values if name not in (*known, *others)
                      and not name.startswith('qos_overrides.'))
     return replace(declaration, unknown=tuple(unknown))
-
-
-def _as_rcl_reads(value: Any, item: Parameter) -> Any:
-    """Return a value of a file; texts that rcl reads as floats become floats."""
-    if isinstance(value, list):
-        return [_as_rcl_reads(each, item) for each in value]
-    if item.kind is float and isinstance(value, str) and _FLOAT.fullmatch(value):
-        return float(value)
-    return value

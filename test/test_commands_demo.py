@@ -15,14 +15,16 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import demo
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, Parser, player_options, read_options)
-from sa_jitter_ros.commands.demo_plan import plan_recording
+from sa_jitter_ros.commands.demo_plan import plan_recording, plan_simulation, with_machine
 from sa_jitter_ros.errors import RecordingError, SaJitterError
+from sa_jitter_ros.parameter_file import shipped
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource
@@ -216,6 +218,45 @@ def test_node_that_does_not_end_is_killed(monkeypatch):
     demo.stop([deaf])
     assert deaf.returncode == -signal.SIGKILL
     deaf.stdout.close()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_live_demo_stays_until_a_signal(number):
+    node = subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)'])
+    before = signal.signal(number, signal.default_int_handler)
+    sender = threading.Timer(0.1, os.kill, (os.getpid(), number))
+    sender.start()
+    try:
+        assert demo.stay([node]) == 0
+    finally:
+        signal.signal(number, before)
+        demo.stop([node])
+
+
+def test_live_demo_ends_with_the_status_of_a_node_that_ends():
+    node = subprocess.Popen([sys.executable, '-c', 'raise SystemExit(3)'])
+    assert demo.stay([node]) == 3
+
+
+@pytest.mark.parametrize('live', [False, True])
+def test_simulated_gearbox_is_that_of_the_machine_file(live):
+    path = shipped('machine.yaml')
+    plan = plan_simulation(path)
+    assert (plan.shaft, plan.speed, plan.ratio, plan.keyphasor_rate, plan.trigger_cycles) == (
+        'input', 16.6, 2.40789, 3000.0, 30)
+    assert plan.channels == ('input bearing', 'output bearing')
+    nodes = demo.processes(plan, live=live)
+    assert nodes['machine_simulator'] == {
+        'playing': False, 'duration': 0.0 if live else plan.seconds}
+    assert ('live_view' in nodes) == live
+    command = demo.node_command('jitter_predictor', nodes['jitter_predictor'], plan.params)
+    assert command[command.index('--params-file') + 1] == str(path)
+
+
+def test_machine_file_is_for_recordings_too(recording):
+    plan = with_machine(plan_recording(recording, read(recording)), shipped('machine.yaml'))
+    assert (plan.source, plan.shaft, plan.orders[0]) == ('recording_player', 'input', 18.0)
+    assert demo.processes(plan, live=True)['recording_player']['loop'] is True
 
 
 @pytest.mark.parametrize('chosen', [None, 'OFF'])

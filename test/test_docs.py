@@ -284,14 +284,13 @@ def topics_of(made):
 
 @cache
 def all_topics():
-    """Return the topics of all nodes, with the shaft names of the defaults and of config/."""
+    """Return the topics of all nodes, with the default shaft and with two shafts."""
     found = set()
     for name in NODES:
         extra = ['-p', 'tach:=both'] if name == 'machine_simulator' else []
         with node(name, *extra) as made:
             found |= topics_of(made)
-    with node('synchronous_averager', '--params-file',
-              str(ROOT / 'config' / 'synchronous_averager.yaml')) as made:
+    with node('synchronous_averager', '-p', 'shafts:=[input, output]') as made:
         found |= topics_of(made)
     with node('jitter_predictor', '-p', 'shafts:=[input, output]') as made:
         return found | topics_of(made)

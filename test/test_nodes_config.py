@@ -8,50 +8,179 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The parameter files and the transport profile of the package start its nodes."""
+"""The machine file and the transport profile of the package start its nodes."""
 
 import os
 from pathlib import Path
+import signal
 import subprocess
 import sys
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+import numpy as np
 import pytest
-from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sa_jitter_ros.commands import close_loop, design
+from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
+from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
+from sa_jitter_ros.nodes.recording_player import RecordingPlayer
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector
+from sa_jitter_ros.parameter_file import read_parameters, shipped
+from std_msgs.msg import Float64MultiArray
 import yaml
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config'
-NODES = {'jitter_predictor': JitterPredictor, 'machine_simulator': MachineSimulator,
+MACHINE = CONFIG / 'machine.yaml'
+NODES = {'jitter_predictor': JitterPredictor, 'live_view': LiveView,
+         'machine_simulator': MachineSimulator, 'recording_player': RecordingPlayer,
          'residual_analyser': ResidualAnalyser, 'synchronous_averager': SynchronousAverager,
          'tach_detector': TachDetector}
+#: The truth of the simulated machine: amplitudes of its orders on channel 0.
+TRUE = {18.0: 0.1, 19.0: 1.0, 20.0: 0.1, 37.0: 0.05, 38.0: 0.5, 39.0: 0.05, 57.0: 0.25}
+SECONDS, RATE = 24.0, 12.0  # of machine time; times real time
 
 
-def flat(parameters, prefix=''):
-    """Return parameters by their full name."""
-    result = {}
-    for key, value in parameters.items():
-        result.update(flat(value, f'{prefix}{key}.') if isinstance(value, dict)
-                      else {f'{prefix}{key}': value})
-    return result
+def add(graph, name, **parameters):
+    """Start a node from the machine file, with further parameters."""
+    return graph.add(
+        NODES[name], cli_args=['--ros-args', '--params-file', str(MACHINE)],
+        parameter_overrides=[Parameter(key, value=value) for key, value in parameters.items()])
+
+
+def test_machine_file_has_a_section_for_every_node():
+    sections = yaml.safe_load(MACHINE.read_text())
+    assert sections.keys() == {'/**', *(f'/**/{name}' for name in NODES)}
+    assert shipped('machine.yaml') == MACHINE
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_parameter_file_starts_its_node_and_every_entry_counts(name):
-    path = CONFIG / f'{name}.yaml'
-    given = flat(yaml.safe_load(path.read_text())['/**']['ros__parameters'])
-    context = Context()
-    context.init(args=['--ros-args', '--params-file', str(path)])
-    try:
-        node = NODES[name](context=context)
-        for key, value in given.items():
+def test_every_entry_of_its_section_counts_in_a_node_and_no_other(name, ros_graph, tmp_path):
+    given = read_parameters(MACHINE, name)
+    assert given['hardware_id'] == 'simulated_gearbox'
+    extra = {'live_view': {'port': 0}, 'recording_player': {'recording': str(tmp_path / 'a.npz')}}
+    np.savez(tmp_path / 'a.npz', vibration=np.zeros(100), sample_rate=1e3, pulse_times=[0.0, 0.1])
+    node = add(ros_graph, name, **extra.get(name, {}))
+    for key, value in given.items():
+        if key not in extra.get(name, {}):
             assert node.get_parameter(key).value == value
-        node.destroy_node()
-    finally:
-        context.try_shutdown()
+    assert node._parameter_overrides.keys() <= given.keys() | extra.get(name, {}).keys()
+    assert all(node.has_parameter(key) for key in node._parameter_overrides)
+
+
+def test_sections_describe_the_same_machine():
+    sections = [read_parameters(MACHINE, name) for name in NODES]
+    shared = {key for section in sections for key in section} - {'keyphasor'}
+    for key in shared:
+        values = [section[key] for section in sections if key in section]
+        assert all(value == values[0] for value in values), key
+    simulated, averaged = sections[2], sections[5]
+    assert averaged['input.mesh_orders'] == [simulated['input.teeth']]
+    assert sections[0]['trigger_speed'] == simulated['speed']
+    assert len(sections[1]['channel_names']) == len(simulated['channel_gains'])
+    assert {section['keyphasor'] for section in sections if 'keyphasor' in section} == {
+        'output_shaft'}
+
+
+def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
+    names = ('synchronous_averager', 'jitter_predictor', 'residual_analyser', 'live_view')
+    changes = {'residual_analyser': {'acquisitions': 12}, 'live_view': {'port': 0}}
+    for name in names:
+        add(ros_graph, name, **changes.get(name, {}))
+    amplitudes = ros_graph.capture('input/order_amplitude', Float64MultiArray)
+    indicators = ros_graph.capture('input/condition_indicator', Float64MultiArray)
+    predictions = ros_graph.capture('prediction', Float64MultiArray, latched=True)
+    residuals = ros_graph.capture('residual', Float64MultiArray)
+    status = ros_graph.capture('/diagnostics', DiagnosticArray)
+    add(ros_graph, 'machine_simulator', duration=SECONDS, rate=RATE)
+    assert ros_graph.spin(lambda: residuals)
+    status.clear()
+    assert ros_graph.spin(lambda: {item.status[0].name for item in status} >= set(names))
+    for item in (each.status[0] for each in status):
+        assert item.hardware_id == 'simulated_gearbox'
+        if item.name in names:  # the simulator may warn that the computer is slow
+            assert item.level == DiagnosticStatus.OK, item.message
+
+    tables = np.stack([messages.decode_average('order_amplitude', item).values
+                       for item in amplitudes])
+    count, (noise, corrected, attenuation) = len(tables), (
+        tables[..., messages.AMPLITUDE_FIELDS.index(name)]
+        for name in ('noise_standard_deviation', 'corrected_amplitude', 'attenuation'))
+    assert count >= 12
+    true = np.array([TRUE[order] for order in tables[0, 0, :, 0]])
+    for channel, gain in enumerate((1.0, 0.6)):
+        error = np.sqrt(np.mean(noise[:, channel] ** 2, axis=0) / count)
+        np.testing.assert_array_less(
+            np.abs(corrected[:, channel].mean(axis=0) - gain * true), 5.0 * error)
+    table = messages.decode_prediction(predictions[-1]).values
+    scatter = table[:, 3] / np.sqrt(count) + noise[:, 0].mean(axis=0) / true / np.sqrt(count)
+    np.testing.assert_array_less(
+        np.abs(attenuation[:, 0].mean(axis=0) - table[:, 1]), 5.0 * scatter)
+    assert messages.decode_residual(residuals[0]).p_value > 1e-3
+    assert np.isfinite(messages.decode_average(
+        'condition_indicator', indicators[-1]).values).all()
+
+
+def test_commands_read_the_machine_file(capsys, tmp_path):
+    declaration = read_declaration(MACHINE)
+    assert declaration.unknown == ()
+    assert declaration.model.orders == tuple(TRUE)
+    assert design.main(['--params', str(MACHINE), '--output', str(tmp_path / 'a.png')]) == 0
+    assert '57' in capsys.readouterr().out
+    assert design.main(['--params', str(MACHINE), '--shaft', 'out']) == 2
+    assert capsys.readouterr().err == f"design: --shaft is 'out': {MACHINE} has input\n"
+    np.savez(tmp_path / 'rig.npz', vibration=np.zeros(100), sample_rate=2e4)
+    assert close_loop.main([str(tmp_path / 'rig.npz'), '--params', str(MACHINE), '--output',
+                            str(tmp_path)]) == 2
+    assert 'keyphasor' in capsys.readouterr().err
+
+
+CHAIN = 'from sa_jitter_ros.commands.chain import main; raise SystemExit(main())'
+
+
+@pytest.mark.processes
+def test_chain_runs_its_nodes_in_one_process(process_environment):
+    process = subprocess.Popen(
+        [sys.executable, '-c', CHAIN, '--params', str(MACHINE), '--with', 'live_view',
+         '--ros-args', '-p', 'port:=0', '-p', 'trigger_cycles:=12'],
+        env=process_environment, text=True, stderr=subprocess.PIPE)
+    lines = []
+    while sum('started' in line for line in lines) < 4:
+        lines.append(process.stderr.readline())
+        assert lines[-1], ''.join(lines)
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 0, errors
+    text = ''.join(lines)  # -p wins over the section of the node
+    assert '[synchronous_averager]: started: averages 12 trigger cycles of input' in text
+    for name in ('jitter_predictor', 'residual_analyser', 'live_view'):
+        assert f'[{name}]: started' in text
+
+
+def test_chain_names_the_nodes_that_it_can_add(process_environment):
+    done = subprocess.run([sys.executable, '-c', CHAIN, '--with', 'demo'], text=True, check=False,
+                          env=process_environment, capture_output=True, timeout=600)
+    assert done.returncode == 2
+    assert done.stderr.count('\n') == 1
+    assert 'live_view' in done.stderr
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize('kind', ['fifo', 'device'])
+def test_parameter_file_without_end_is_refused(process_environment, tmp_path, kind):
+    path = Path('/dev/zero')
+    if kind == 'fifo':
+        path = tmp_path / 'fifo.yaml'
+        os.mkfifo(path)
+    for command in (['--params', str(path)], ['--ros-args', '--params-file', str(path)]):
+        done = subprocess.run([sys.executable, '-c', CHAIN, *command], text=True, check=False,
+                              env=process_environment, capture_output=True, timeout=600)
+        assert (done.returncode, done.stderr) == (
+            2, f'error: {path}: is no regular file: give a parameter file (.yaml)\n')
 
 
 SEGMENT = """

@@ -38,7 +38,6 @@ from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.live_view_server import is_name_of_this_machine, PORTS_TRIED
 from std_msgs.msg import Float64, Float64MultiArray, String
-import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDERS = np.array([19.0, 38.0, 57.0])
@@ -418,13 +417,6 @@ def test_the_port_is_free_again_after_the_node(ros_graph):
     node.destroy_node()
     with socket.socket() as probe:
         assert probe.connect_ex(('127.0.0.1', port)) != 0
-
-
-def test_the_parameter_file_starts_the_node(ros_graph):
-    text = (ROOT / 'config' / 'live_view.yaml').read_text(encoding='utf-8')
-    given = yaml.safe_load(text)['/**']['ros__parameters']
-    node = ros_graph.add(LiveView, given)
-    assert {name: node.get_parameter(name).value for name in given} == given
 
 
 def test_labels_change_while_it_runs(bench):

@@ -56,7 +56,7 @@ LIVE_ACQUISITIONS = 4  # averages in a residual
 class Watcher(Node):
     """Receives all results of one shaft and the diagnostics of all nodes."""
 
-    def __init__(self, shaft: str, **node_kwargs: Any) -> None:
+    def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('demo', **node_kwargs)
         self.averages: dict[str, list[AverageMessage]] = {
             kind: [] for kind in ('synchronous_average', 'corrected_average', 'order_amplitude',
@@ -65,13 +65,16 @@ class Watcher(Node):
         self.speed = float('nan')
         self.status: dict[str, dict[str, str]] = {}
         self.status_time: dict[str, float] = {}
+        self.create_subscription(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+
+    def subscribe(self, shaft: str) -> None:
+        """Receive the results of a shaft."""
         for kind in self.averages:
             self.create_subscription(Float64MultiArray, f'{shaft}/{kind}', self._add_to(kind),
                                      RESULT_QOS)
         for topic in ('prediction', f'{shaft}/prediction'):  # of one shaft, of several
             self.create_subscription(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
-        self.create_subscription(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
-        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
     def _add_to(self, kind: str) -> Callable[[Float64MultiArray], None]:
         return lambda message: self.averages[kind].append(decode_average(kind, message))
@@ -173,6 +176,7 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
             if ended:
                 raise SaJitterError(f'a node ended with status {ended[0].returncode}')
 
+    watcher.subscribe(plan.shaft)
     print('waiting for the nodes ...', flush=True)
     end = time.monotonic() + START_TIMEOUT
     inputs = ['vibration', 'tach_pulse', *(['tach_waveform'] if plan.waveform else [])]
@@ -310,7 +314,7 @@ def main(args: Sequence[str] | None = None) -> int:
             print('to watch it live in a web browser: ./run demo --live')
         os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         rclpy.init(context=context)
-        watcher = Watcher(plan.shaft, context=context)
+        watcher = Watcher(context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(watcher)
         children += [subprocess.Popen(node_command(name, parameters, plan.params))

@@ -60,8 +60,8 @@ def make_parser() -> Parser:
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     machine = parser.add_argument_group('machine and average')
     machine.add_argument('--params', type=Path, metavar='MACHINE.yaml',
-                         help='ROS parameter file with a section of jitter_predictor: the machine, '
-                         'where the options below do not say otherwise')
+                         help='ROS parameter file with a section of jitter_predictor: the '
+                         'machine, where the options below do not say otherwise')
     machine.add_argument('--shaft', default='', metavar='NAME',
                          help='shaft of interest in that file (default: its first)')
     machine.add_argument('--orders', type=float, nargs='+', metavar='ORDER',

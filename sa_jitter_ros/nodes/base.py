@@ -37,7 +37,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import Flow, Health, Level
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.nodes.parameters import ParameterSet
+from sa_jitter_ros.nodes.parameters import command_line_parameters, ParameterSet
 from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 
@@ -271,17 +271,22 @@ def _type_name(kind: type) -> str:
     return f'{package}/{folder}/{kind.__name__}'
 
 
-def run_node(node_class: Callable[[], Node], args: Sequence[str] | None = None) -> int:
+def run_node(node_class: Callable[..., Node], args: Sequence[str] | None = None) -> int:
     """Run one node until SIGINT or SIGTERM; return 0, or 2 after one line on a bad argument."""
     return run_nodes([node_class], args)
 
 
-def run_nodes(node_classes: Sequence[Callable[[], Node]], args: Sequence[str] | None = None) -> int:
+def run_nodes(node_classes: Sequence[Callable[..., Node]], args: Sequence[str] | None = None
+              ) -> int:
     """Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`."""
     use_one_thread()
     nodes: list[Node] = []
+    options: dict[str, Any] = {}
+    given = sys.argv if args is None else args
     try:
-        _check_parameter_files(sys.argv if args is None else args)
+        if _check_parameter_files(given):
+            # rcl lets the section of a node in a file win over -p for all nodes.
+            options['parameter_overrides'] = command_line_parameters(given)
         rclpy.init(args=args)
     except (ParameterError, RuntimeError) as error:  # rcl cannot read the command line or a file
         print(f'error: {error}', file=sys.stderr)
@@ -289,7 +294,7 @@ def run_nodes(node_classes: Sequence[Callable[[], Node]], args: Sequence[str] | 
     try:
         try:
             for node_class in node_classes:
-                nodes.append(node_class())
+                nodes.append(node_class(**options))
         except (InvalidParameterTypeException, RuntimeError) as error:  # of rclpy's own parameters
             if rclpy.ok():
                 print(f'error: {error}', file=sys.stderr)
@@ -314,11 +319,14 @@ def run_nodes(node_classes: Sequence[Callable[[], Node]], args: Sequence[str] | 
     return 0
 
 
-def _check_parameter_files(args: Sequence[str]) -> None:
-    """Raise ParameterError for a parameter file that rcl would read without end."""
-    for option, name in pairwise(args):
-        if option == '--params-file' and Path(name).exists():
-            try:
-                require_regular_file(Path(name))
-            except ParameterError as error:
-                raise ParameterError(f'{name}: {error}') from None
+def _check_parameter_files(args: Sequence[str]) -> bool:
+    """Return whether there are any; raise ParameterError for one that rcl would read for ever."""
+    names = [name for option, name in pairwise(args) if option == '--params-file']
+    for name in names:
+        try:
+            require_regular_file(Path(name))
+        except ParameterError as error:
+            raise ParameterError(f'{name}: {error}') from None
+        except OSError:
+            pass  # rcl says what is wrong
+    return bool(names)

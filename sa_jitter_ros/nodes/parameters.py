@@ -18,6 +18,7 @@ that match none. Before a change it calls `check` with all new values, which rai
 """
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 import math
 import re
 from typing import Any
@@ -27,6 +28,7 @@ from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescr
 from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import Parameter
 
 Values = dict[str, Any]
@@ -63,6 +65,25 @@ def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.para
                  str: rclpy.Parameter.Type.STRING_ARRAY}
         return rclpy.parameter.Parameter(name, kinds[element], value)
     return rclpy.parameter.Parameter(name, value=value)
+
+
+def command_line_parameters(args: Sequence[str]) -> list[rclpy.parameter.Parameter]:
+    """
+    Return the parameters of all nodes on a command line, `-p NAME:=VALUE`.
+
+    >>> [(item.name, item.value) for item in command_line_parameters(
+    ...     ['--ros-args', '-p', 'rate:=5e-6', '--param', 'shafts:=[a, b]', '-p', 'node:x:=1'])]
+    [('rate', 5e-06), ('shafts', ['a', 'b'])]
+    """
+    found = []
+    for option, rule in pairwise(args):
+        name, separator, text = rule.partition(':=')
+        if option in ('-p', '--param') and separator and ':' not in name:
+            try:
+                found.append(rclpy.parameter.Parameter(name, value=value_of(text)))
+            except (ParameterError, TypeError):
+                continue  # rcl says what is wrong
+    return found
 
 
 def require_node_name(parameter: str, name: str) -> None:
