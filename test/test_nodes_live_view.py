@@ -15,7 +15,6 @@ import http.client
 import json
 import math
 import os
-from pathlib import Path
 import re
 import shutil
 import signal
@@ -39,7 +38,6 @@ from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.live_view_server import is_name_of_this_machine, PORTS_TRIED
 from std_msgs.msg import Float64, Float64MultiArray, String
 
-ROOT = Path(__file__).resolve().parents[1]
 ORDERS = np.array([19.0, 38.0, 57.0])
 NAN = float('nan')
 REPORT = {
