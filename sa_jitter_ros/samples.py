@@ -15,6 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+_RESOLUTION = 1e-3  # of a sample: to what times must be known
+_ABSOLUTE = 2.0**31  # s: the range of ROS times, and of times since 1970 until 2038
+
 
 def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
     """
@@ -29,6 +32,25 @@ def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
     finite = np.concatenate(([False], every.all(axis=0), [False])).astype(np.int8)
     return [(int(begin), int(end))
             for begin, end in np.flatnonzero(np.diff(finite)).reshape(-1, 2)]
+
+
+def unresolved(time: float, sample_rate: float) -> str:
+    """
+    Say why a float64 cannot hold the times around `time` (s) of samples at a rate (Hz), or ''.
+
+    It must resolve a thousandth of a sample. ROS times are admitted at every rate: they are
+    rounded to 0.24 us.
+
+    >>> unresolved(1.8e9, 1e5)
+    ''
+    >>> unresolved(1e12, 1e4).partition(':')[0]
+    'time 1e+12 s is so large that a float64 rounds it to 1.2 samples'
+    """
+    step = float(np.spacing(abs(time))) * sample_rate
+    if abs(time) <= _ABSOLUTE or step <= _RESOLUTION:
+        return ''
+    return (f'time {time:.6g} s is so large that a float64 rounds it to {step:.2g} samples: give '
+            'seconds since the start of the measurement')
 
 
 @dataclass(frozen=True)

@@ -330,3 +330,16 @@ def test_whatever_comes_every_stretch_is_consecutive_and_memory_bounded(blocks):
         held(timeline)
         assert sum(len(item.samples) for item in timeline.segments) <= 200
         assert len(timeline.segments) <= 201
+
+
+@pytest.mark.parametrize(('time', 'resolved'), [
+    (1.8e9, True), (-1.8e9, True), (1e10, False), (-1e12, False), (1e15, False)])
+def test_times_that_a_float_does_not_resolve_are_refused(time, resolved):
+    timeline = VibrationTimeline()
+    if resolved:
+        timeline.add(block(0, 100, time=time, rate=12800.0))
+        assert held(timeline) == [(0, 0.0, 99.0)]
+        return
+    with pytest.raises(SignalError, match='so large that a float64 rounds it to '):
+        timeline.add(block(0, 100, time=time, rate=12800.0))
+    assert timeline.counts.blocks_rejected == 1

@@ -32,6 +32,7 @@ import pytest
 from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import live_view_board as board
+from sa_jitter_ros.nodes import live_view_server as server
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.live_view import LiveView
@@ -326,6 +327,26 @@ def test_only_get_is_served(bench):
     assert b.status()['requests_refused'] == len(methods)
 
 
+def test_connections_that_drip_are_ended_and_the_page_stays(bench, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(server, 'time', clock)
+    b = bench()
+    slow = [socket.create_connection(('127.0.0.1', b.port)) for _ in range(server.CONNECTIONS)]
+    for connection in slow:
+        connection.sendall(b'GET / HT')
+    assert b.spin(lambda: len(b.node._server._server._deadlines) == len(slow))
+    clock.now += server.REQUEST_SECONDS / 2
+    slow[0].sendall(b'TP/1.1\r\nHost: localhost\r\n\r\n')  # this one arrives in time
+    assert slow[0].recv(100).startswith(b'HTTP')
+    for connection in slow[1:]:
+        connection.sendall(b'T')  # a byte more does not prolong it
+    clock.now += server.REQUEST_SECONDS / 2 + 1.0
+    assert [connection.recv(100) for connection in slow[1:]] == [b''] * (len(slow) - 1)
+    assert b.ask('/')[0] == 200
+    for connection in slow:
+        connection.close()
+
+
 def test_other_paths_are_not_found(bench):
     b = bench()
     for path in ('/nothing', '/../live_view.py', '/%2e%2e/live_view.py', '//etc/passwd', '*',
@@ -539,7 +560,8 @@ def test_the_demo_prints_an_address_that_answers(process_environment, tmp_path):
         parts = json.loads(connection.getresponse().read())['parts']
         connection.close()
         assert parts['settings']['content']['vibration_unit'] == 'm/s^2'
-        assert parts['settings']['content']['channel_names'] == ['channel 0', 'channel 1']
+        assert parts['settings']['content']['channel_names'] == [
+            'input bearing', 'output bearing']
     finally:
         demo.send_signal(signal.SIGINT)
         demo.communicate(timeout=600.0)  # reads on: it may be printing

@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 import io
+import os
 import struct
 import sys
 import tracemalloc
@@ -76,6 +77,7 @@ def test_blocks_without_samples_are_refused(recording):
     ({'ratio': -1.0}, 'ratio -1.0'),
     ({'orders': (1.0, np.inf)}, 'orders inf'),
     ({'start_time': np.inf}, 'start_time inf'),
+    ({'start_time': 1e12}, r'start_time: time 1e.12 s is so large that a float64 rounds it'),
     ({'start_time': -1e16}, 'start_time is -1e.16 s: must be within 1e.15 s'),
     ({'sample_rate': 5e-324}, 'sample_rate is 5e-324 Hz: must be from 1e-12 to'),
     ({'tach_rate': 1e300}, 'tach_rate is 1e.300 Hz: must be from 1e-12 to'),
@@ -983,3 +985,15 @@ def test_measured_recordings(shared_data, name, channels, samples, pulses, acqui
 def test_trigger_edges_are_no_recording(shared_data):
     with pytest.raises(RecordingError, match='no vibration'):
         read(shared_data / 'engine_edges_civic_K20_cranking.npz')
+
+
+@pytest.mark.parametrize('make', [
+    lambda path: os.mkfifo(path), lambda path: path.symlink_to('/dev/zero')])
+@pytest.mark.parametrize('name', ['rig.npz', 'rig.wav', 'bag/bag_0.mcap'])
+def test_a_pipe_or_device_is_refused(tmp_path, name, make):
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    make(path)
+    opened = path if path.parent == tmp_path else path.parent
+    with pytest.raises(RecordingError, match=f'{path.name} is a pipe or a device: give a file'):
+        read(opened)

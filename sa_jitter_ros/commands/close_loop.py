@@ -21,7 +21,8 @@ from collections.abc import Sequence
 from pathlib import Path
 import sys
 
-from sa_jitter_ros.commands.command_line import add_recording_options, Parser, read_options
+from sa_jitter_ros.commands.command_line import (
+    add_recording_options, Parser, read_options, require_writable, show)
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop
@@ -45,7 +46,7 @@ def make_parser() -> Parser:
 
 def run(options: argparse.Namespace) -> Loop:
     """Close the loop on the recordings; raises SaJitterError."""
-    def show(text: str) -> None:
+    def progress(text: str) -> None:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
@@ -55,21 +56,20 @@ def run(options: argparse.Namespace) -> Loop:
         print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
               f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
     return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
-                      progress=show)
+                      progress=progress)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)
     try:
+        require_writable(options.output)
         found = run(options)
         found.write(options.output)
     except (SaJitterError, OSError) as error:
         print(f'close_loop: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    print(found)
-    print(f'report: {options.output / "report.html"}')
-    return 0
+    return show('close_loop', found, f'report: {options.output / "report.html"}')
 
 
 if __name__ == '__main__':

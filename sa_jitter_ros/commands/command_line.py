@@ -11,8 +11,14 @@
 """Command lines: a parser with errors of one line, and the options of commands for recordings."""
 
 import argparse
+from contextlib import suppress
+from io import UnsupportedOperation
+import os
+from pathlib import Path
+import sys
 from typing import Any, NoReturn
 
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
@@ -25,6 +31,41 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Print the error and exit with status 2."""
         self.exit(2, f'{self.prog}: {message}\n')
+
+
+def show(program: str, *lines: object) -> int:
+    """
+    Print the result of a command and return its exit status: 2 after one line if that fails.
+
+    A reader that has seen enough, as `head`, is no failure.
+    """
+    try:
+        print(*lines, sep='\n', flush=True)
+    except BrokenPipeError:
+        discard_output()
+    except OSError as error:
+        discard_output()
+        print(f'{program}: standard output: {error.strerror}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def discard_output() -> None:
+    """Discard what could not be printed, which Python would try to print once more at its end."""
+    with suppress(UnsupportedOperation):  # a test has replaced it by a buffer
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def require_writable(folder: Path) -> None:
+    """Raise ParameterError for a folder that cannot be made or written, before the work begins."""
+    place = folder.absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise ParameterError(f'--output {folder}: {place} is a file: give a folder')
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise ParameterError(f'--output {folder}: no permission to write in {place}: give another '
+                             'folder')
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:

@@ -32,7 +32,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, Parser, player_options, read_options)
+    add_recording_options, discard_output, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import (
     Plan, plan_recording, plan_simulation, with_machine)
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
@@ -328,6 +328,8 @@ def main(args: Sequence[str] | None = None) -> int:
             if ended:
                 raise SaJitterError(f'a node ended with status {ended}')
     except (SaJitterError, OSError) as error:
+        if isinstance(error, OSError) and error.filename is None:
+            discard_output()  # it may be what cannot be written
         print(f'demo: {error}', file=sys.stderr)
         return 2
     except KeyboardInterrupt:

@@ -26,7 +26,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, LogLocator, MaxNLocator, NullFormatter
 import numpy as np
-from sa_jitter_ros.commands.command_line import Parser
+from sa_jitter_ros.commands.command_line import Parser, show
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.prediction.comb import Leakage
@@ -298,13 +298,13 @@ def main(args: Sequence[str] | None = None) -> int:
         if output.suffix.lstrip('.').lower() not in formats:
             raise ParameterError(f'--output {output}: give a file that ends in .png, .pdf or .svg')
         found = design(**keywords)
-        print(table(found, options))
+        if status := show('design', table(found, options)):
+            return status
         draw(found, options).savefig(output)
     except (SaJitterError, OSError) as error:
         print(f'design: {with_options(str(error))}', file=sys.stderr)
         return 2
-    print(f'\nfigure: {output}')
-    return 0
+    return show('design', f'\nfigure: {output}')
 
 
 def with_options(text: str) -> str:

@@ -16,6 +16,7 @@ Host header prevents DNS rebinding, by which a foreign site could read the data.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from errno import EADDRINUSE
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -26,6 +27,7 @@ import socket
 from socketserver import TCPServer
 import sys
 from threading import BoundedSemaphore, Thread
+import time
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -33,6 +35,8 @@ from sa_jitter_ros.errors import ParameterError
 
 PORTS_TRIED = 20  # from `port` on, so that a second view on the same host starts, too
 CONNECTIONS = 32  # at once; more are closed
+REQUEST_SECONDS = 10.0  # for all of a request to arrive
+ANSWER_SECONDS = 60.0  # for the answer to leave, which a slow line carries
 KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
 HEADERS = {
     'Cache-Control': 'no-store',
@@ -132,6 +136,7 @@ class _Server(ThreadingHTTPServer):
         super().__init__((host, port), _Handler)
         self.requests = self.refused = 0
         self._free = BoundedSemaphore(CONNECTIONS)
+        self._deadlines: dict[socket.socket, float] = {}
 
     def server_bind(self) -> None:
         """Bind without a query to a name server."""
@@ -140,6 +145,7 @@ class _Server(ThreadingHTTPServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         """Serve in a thread, unless there are too many connections."""
         if self._free.acquire(blocking=False):
+            self.allow(request, REQUEST_SECONDS)
             super().process_request(request, client_address)
         else:
             self.refused += 1
@@ -150,7 +156,22 @@ class _Server(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
+            self._deadlines.pop(request, None)
             self._free.release()
+
+    def allow(self, connection: socket.socket, seconds: float) -> None:
+        """Let a connection last so long from now on."""
+        self._deadlines[connection] = time.monotonic() + seconds
+
+    def service_actions(self) -> None:
+        """End connections that last too long, however slowly their bytes drip."""
+        now = time.monotonic()
+        for connection, deadline in list(self._deadlines.items()):
+            if now > deadline:
+                self.refused += 1
+                self._deadlines.pop(connection, None)
+                with suppress(OSError):  # it may have ended
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore that a browser closed the connection."""
@@ -160,11 +181,12 @@ class _Server(ThreadingHTTPServer):
 
 class _Handler(BaseHTTPRequestHandler):
     server: _Server
-    timeout = 10.0  # s for a request to arrive
+    timeout = ANSWER_SECONDS
     server_version, sys_version = 'live_view', ''
 
     def do_GET(self) -> None:
         """Answer with a file of the page or with the snapshot."""
+        self.server.allow(self.connection, ANSWER_SECONDS)
         path, _, query = self.path.partition('?')
         if not is_name_of_this_machine(self.headers.get('Host', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'open this page by its address or as localhost')

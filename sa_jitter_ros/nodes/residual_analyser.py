@@ -285,8 +285,13 @@ class ResidualAnalyser(MonitoringNode):
     # --- diagnostics ---
 
     def update_counts(self) -> None:
-        """Count the averages that were not used because they overlap."""
+        """Count averages that overlap; say early that the prediction is of other averages."""
         self.counts.update(averages_overlapping=self._batch.overlapping)
+        if self._batch.averages and self._prediction is not None:
+            try:
+                require_comparable(self._batch.averages[-1:], self._prediction)
+            except SaJitterError as error:
+                self.set_missing('residual', str(error))
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the number of averages in the batch and the last verdict."""

@@ -95,6 +95,10 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     with recording_errors(path):
         if not path.exists():
             raise RecordingError('no such file or folder: check the path')
+        for item in [path, *(path.iterdir() if path.is_dir() else ())]:
+            if item.exists() and not (item.is_file() or item.is_dir()):
+                raise RecordingError(f'{item.name} is a pipe or a device: give a file or a '
+                                     'rosbag2 folder')
         suffix = 'bag' if path.is_dir() else path.suffix.lower()
         if suffix not in ('bag', *_SUFFIXES):
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '

@@ -1,0 +1,44 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What commands say where their output cannot be written, and in which order."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+from sa_jitter_ros.commands import close_loop, command_line
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize(('output', 'status', 'says'), [
+    ('/dev/full', 2, 'design: standard output: No space left on device\n'), ('head', 0, '')])
+def test_output_that_cannot_be_printed_is_one_line(tmp_path, output, status, says):
+    command = [sys.executable, '-m', 'sa_jitter_ros.commands.design', '--orders', '3',
+               '--trigger-speed', '20', '--output', str(tmp_path / 'a.png')]
+    target = subprocess.PIPE if output == 'head' else Path(output).open('w')
+    process = subprocess.Popen(command, stdout=target, stderr=subprocess.PIPE, text=True)
+    (process.stdout or target).close()  # head has seen enough
+    errors = process.stderr.read()
+    process.stderr.close()
+    assert (process.wait(), errors) == (status, says)
+
+
+def test_loop_refuses_a_folder_that_it_cannot_write_before_it_reads(
+        tmp_path, capsys, monkeypatch):
+    (tmp_path / 'file').touch()
+    arguments = ['none.npz', '--params', 'none.yaml', '--output']
+    assert close_loop.main([*arguments, str(tmp_path / 'file' / 'out')]) == 2
+    assert capsys.readouterr().err == (
+        f'close_loop: --output {tmp_path}/file/out: {tmp_path}/file is a file: give a folder\n')
+    monkeypatch.setattr(command_line.os, 'access', lambda path, mode: False)
+    assert close_loop.main([*arguments, str(tmp_path / 'new')]) == 2
+    assert 'no permission to write in' in capsys.readouterr().err
