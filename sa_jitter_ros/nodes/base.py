@@ -174,7 +174,7 @@ class MonitoringNode(Node):
             if reason:
                 self.get_logger().warning(f'{what}: {reason}')
             else:
-                self.get_logger().info(f'{what}: there again')
+                self.get_logger().info(f'{what}: well again')
 
     def _log(self, level: Level, line: str) -> None:
         if level == Level.ERROR:  # rclpy wants one line of code for each severity
@@ -193,7 +193,7 @@ class MonitoringNode(Node):
                 names = ', '.join(sorted(_node_name(item) for item in offered))
                 crowd = (f'{len(offered)} publishers ({names}) mix their messages: stop all but '
                          f'{most}, or remap them')
-            self.set_missing(f'one source of {topic}', crowd)
+            self.set_missing(f'single source of {topic}', crowd)
 
     def _cause(self, flow: Flow) -> str:
         """Return what the ROS graph shows of a silent flow."""

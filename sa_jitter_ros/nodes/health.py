@@ -38,9 +38,10 @@ class Flow:
     Data of one kind: `name` is that of its age in the diagnostics, `what` its topic or a noun.
 
     `look_at` says where the cause of silence may lie, `cause` what is known of it. Silence is
-    judged if `judged`, and not while one of the flows named in `after` is silent, which explains
-    it. It may last `allowance` (s) longer than that of others. Data that come `once` are not
-    repeated: only the first are waited for.
+    judged if `judged`. It counts from `since` or the last data. What is made of other flows,
+    `after`, is judged while these flow: `since` is when they began. Silence may last `allowance`
+    (s) longer than that of others. Data that come `once` are not repeated: only the first are
+    waited for.
     """
 
     name: str
@@ -54,6 +55,7 @@ class Flow:
     since: float = field(default_factory=lambda: time.monotonic())
     last: float = math.nan
     reported: Level = Level.OK
+    reported_at: float = -math.inf
 
     def came(self) -> None:
         """Note that data came now."""
@@ -66,8 +68,8 @@ class Flow:
 
     @property
     def silence(self) -> float:
-        """Seconds since the last data, or since the start."""
-        return time.monotonic() - (self.since if math.isnan(self.last) else self.last)
+        """Seconds since the last data, or since they could come."""
+        return time.monotonic() - (self.last if self.last > self.since else self.since)
 
     def level(self, stale_after: float) -> Level:
         """Return how severe the silence is."""
@@ -81,8 +83,8 @@ class Flow:
 
     def problem(self) -> str:
         """Return what is silent, and where to look."""
-        silence = (f'since the start {self.silence:.0f} s ago' if math.isnan(self.last)
-                   else f'for {self.silence:.0f} s')
+        silence = (f'since the start {self.silence:.0f} s ago'
+                   if math.isnan(self.last) and not self.after else f'for {self.silence:.0f} s')
         return f'no {self.what} {silence}: {self.cause or self.look_at}'
 
 
@@ -104,10 +106,12 @@ class Health:
 
     def silent(self, stale_after: float) -> list[tuple[Level, Flow]]:
         """Return the silent flows, the worst first."""
-        levels = {name: flow.level(stale_after) for name, flow in self.flows.items()}
-        found = [(level, self.flows[name]) for name, level in levels.items()
-                 if level and not any(levels.get(other) for other in self.flows[name].after)]
-        return sorted(found, key=lambda item: -item[0])
+        for flow in self.flows.values():
+            causes = [self.flows[name] for name in flow.after]
+            if any(math.isnan(item.last) or item.level(stale_after) for item in causes):
+                flow.since = time.monotonic()
+        found = [(flow.level(stale_after), flow) for flow in self.flows.values()]
+        return sorted((item for item in found if item[0]), key=lambda item: -item[0])
 
     def changes(self, silent: Iterable[tuple[Level, Flow]]) -> list[tuple[Level, str]]:
         """Return the lines for the log: what became silent, or continues, since the last call."""
@@ -117,9 +121,11 @@ class Health:
             level = now.get(flow.name, Level.OK)
             if level > flow.reported:
                 lines.append((level, flow.problem()))
-            elif flow.reported and level == Level.OK and self._flowing:
-                lines.append((Level.OK, f'{flow.what} continues'))
-            flow.reported = level
+                flow.reported, flow.reported_at = level, time.monotonic()
+            elif flow.reported and flow.last > flow.reported_at:
+                flow.reported = level
+                if self._flowing:
+                    lines.append((Level.OK, f'{flow.what} continues'))
         arrived = [flow for flow in self.flows.values() if flow.judged and not flow.after]
         if not self._flowing and arrived and not any(math.isnan(flow.last) for flow in arrived):
             self._flowing = True
