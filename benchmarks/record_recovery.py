@@ -13,7 +13,8 @@ How exactly pulse errors are recovered from whole recordings of another simulato
 
 `python benchmarks/record_recovery.py` draws machines (`independent_machines`), lets happen to them
 what their declared model lacks (`independent_effects`), fits each recording
-(`record_fit`) and compares its pulse errors and lines with the true ones. `--gear0 FILE` does
+(`inference/record_fit.py`) and compares its pulse errors and lines with the true ones. `--gear0
+FILE` does
 the same with the measured gearbox whose keyphasor is timed by a clock of 6 kHz, and compares with
 what the averager recovers.
 """
@@ -29,8 +30,8 @@ from independent_effects import draw_case
 from independent_machines import Array, Machine, pulses, record
 import numpy as np
 from page import table
-from record_fit import fit_record, RecordFit
 import sa_jitter_ros as sa
+from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
 from worse_pulses import with_slower_clock
 
 EFFECTS = ((), ('excess_jitter',), ('correlated_jitter',), ('target_geometry',), ('clock_skew',),

@@ -30,10 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import attenuation, noise_floor, without_leakage
-from sa_jitter_ros.errors import ModelError, RecordingError, SignalError
-from sa_jitter_ros.inference.cycle_reader import CycleReader, recover, ripple_error
+from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.inference.cycle_reader import CycleReader
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
-from sa_jitter_ros.inference.undeclared_orders import undeclared_orders
+from sa_jitter_ros.inference.record_recovery import (
+    leaking_orders, recover_record, RecordRecovery, RESOLVED)
 from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
@@ -67,7 +68,8 @@ class Acquisition:
     and `cycles` (cycle, channel, order) those of single cycles. `noise` (channel, order) is the
     standard deviation of an amplitude along its radius, `noise_floor` the part of it that the
     spectrum around the order shows. `ripple` (cycle,) is the factor of u (1 - u) in the error
-    inside a cycle (s).
+    inside a cycle (s). Unless the errors are `recovered`, because their standard errors are as
+    large as they are, the corrected amplitudes are the raw ones, and `reason` says why.
     """
 
     first: int
@@ -118,7 +120,8 @@ class Observation:
 
     `orders` are the declared ones, `sources` these and the undeclared orders that leak into them.
     The amplitudes of an acquisition are those of `sources`. The trigger_speed of `model` is the
-    measured mean; `declared_speed` (Hz) is the declared one.
+    measured mean; `declared_speed` (Hz) is the declared one. `recoveries` are those of the
+    recordings, none on line.
     """
 
     model: DeclaredModel
@@ -131,6 +134,13 @@ class Observation:
     against_reference: bool
     declared_speed: float
     name: str = ''
+    recoveries: tuple[RecordRecovery, ...] = ()
+
+    @property
+    def compared(self) -> tuple[int, ...]:
+        """Return the acquisitions whose attenuation is known."""
+        return tuple(a for a, item in enumerate(self.acquisitions)
+                     if self.against_reference or item.recovered)
 
     def stacked(self, field: str) -> NDArray[Any]:
         """Return one field of all acquisitions as an array."""
@@ -146,8 +156,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     searched for. A reference keyphasor is not used if the vibration wanders against it, or the
     speed ripples between its pulses, so much that the average with it loses amplitude. Raises
     RecordingError if there is no whole acquisition or the reference keyphasor is worse than the
-    keyphasor, ModelError if the declared model does not fit the recording, SignalError if there is
-    no reference keyphasor and the pulse errors cannot be recovered.
+    keyphasor, ModelError if the declared model does not fit the recording.
     """
     if recording.samples * recording.channels > _MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
@@ -175,26 +184,20 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             'trigger_cycles or record longer'
             + ''.join(f' ({remark})' for remark in pulses.remarks))
     rows = tuple(range(samples.shape[1]))
-    orders = np.array(sources if len(sources) else [
-        *once, *undeclared_orders(reader, pulses, model, starts, rows)])
+    recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses, model)
+    orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
     if pulses.reference is not None and not _reference_serves(
-            reader, pulses, model, starts, np.array(once), rows):
+            reader, pulses, recovery, model, starts, np.array(once)):
         pulses = replace(pulses, reference=None)
     found = []
     for count, first in enumerate(starts):
-        found.append(_acquire(reader, pulses, model, first, orders, rows))
+        found.append(_acquire(reader, pulses, recovery, model, first, orders))
         if progress is not None:
             progress((count + 1) / len(starts))
-    if pulses.reference is None:
-        reason = found[0].reason
-        found = [item for item in found if item.recovered]
-        if not found:
-            raise SignalError('the pulse errors cannot be recovered from the vibration: '
-                              f'{reason}, or give reference_pulse_times')
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, declared_speed,
-        recording.description)
+        recording.description, (recovery,))
 
 
 def together(observations: Sequence[Observation]) -> Observation:
@@ -229,23 +232,21 @@ def together(observations: Sequence[Observation]) -> Observation:
                        weights=[len(item.acquisitions) for item in observations])
     return replace(first, model=replace(first.model, trigger_speed=float(speed)), pulses=pulses,
                    acquisitions=tuple(acquisition for item in observations
-                                      for acquisition in item.acquisitions))
+                                      for acquisition in item.acquisitions),
+                   recoveries=tuple(recovery for item in observations
+                                    for recovery in item.recoveries))
 
 
 def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]
                     ) -> FloatArray:
-    """Return the pulse errors (acquisition, N_t + 1) from some channels, NaN where refused."""
-    samples = np.ascontiguousarray(recording.read().T)
-    reader = CycleReader(samples - samples.mean(axis=0), recording.start_time,
-                         recording.sample_rate, 'band_limited')
-    rows = tuple(channels)
-    errors = []
-    for item in observation.acquisitions:
-        recovery = recover(reader, item.bridged, observation.model, rows, with_ripple=False,
-                           additional_orders=observation.sources)
-        errors.append(recovery.errors[item.number] if recovery.accepted
-                      else np.full(item.times.size, np.nan))
-    return np.array(errors)
+    """Return the pulse errors (acquisition, N_t + 1) that some channels show."""
+    samples = np.ascontiguousarray(recording.read().T[:, list(channels)])
+    recovery = recover_record(samples - samples.mean(axis=0), recording.start_time,
+                              recording.sample_rate, observation.pulses, observation.model,
+                              known=observation.recoveries[0].undeclared)
+    errors = np.array([recovery.errors[item.first:item.first + item.times.size]
+                       for item in observation.acquisitions])
+    return np.asarray(errors - errors.mean(axis=1, keepdims=True))
 
 
 def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:
@@ -269,14 +270,14 @@ def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLa
     return found
 
 
-def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel,
-                      starts: Sequence[int], orders: FloatArray, rows: tuple[int, ...]) -> bool:
+def _reference_serves(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,
+                      model: DeclaredModel, starts: Sequence[int], orders: FloatArray) -> bool:
     """Whether, in a few acquisitions, the reference keyphasor keeps the amplitudes."""
     bare = replace(pulses, reference=None)
     kept, gained = [], []
     for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
-        item = _acquire(reader, pulses, model, first, orders, rows)
-        other = _acquire(reader, bare, model, first, orders, rows)
+        item = _acquire(reader, pulses, recovery, model, first, orders)
+        other = _acquire(reader, bare, recovery, model, first, orders)
         with np.errstate(divide='ignore', invalid='ignore'):
             best = other if other.recovered else item
             clear = best.noise < _CLEAR * np.abs(best.corrected)
@@ -293,28 +294,20 @@ def _reference_serves(reader: CycleReader, pulses: RecordPulses, model: Declared
     return not kept or not bool(np.any(np.median(kept, axis=0) < 1.0 - _LOSS))
 
 
-def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, first: int,
-             sources: FloatArray, rows: tuple[int, ...]) -> Acquisition:
+def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,
+             model: DeclaredModel, first: int, sources: FloatArray) -> Acquisition:
     """Return the acquisition that begins at trigger pulse `first`."""
     count = model.trigger_cycles
     times = pulses.times[first:first + count + 1]
     missing = pulses.missing[first:first + count]
     span = slice(pulses.number[first], pulses.number[first + count] + 1)
     bridged, measured = pulses.bridged[span], numbered(missing)
-    recovery = recover(reader, bridged, model, rows, with_ripple=True, additional_orders=sources)
-    with_ripple = recovery.accepted and not missing.any()
-    if not recovery.accepted:
-        recovery = recover(reader, bridged, model, rows, with_ripple=False,
-                           additional_orders=sources)
-    errors = np.full(times.size, np.nan)
-    standard_errors, ripple = errors.copy(), np.full(count, np.nan)
-    ripple_uncertainty = float('nan')
-    corrected_pulses: FloatArray = bridged
-    if recovery.accepted:
-        errors, standard_errors = recovery.errors[measured], recovery.standard_errors[measured]
-        if with_ripple:
-            ripple, ripple_uncertainty = recovery.ripple, ripple_error(recovery, model)
-        corrected_pulses = bridged - recovery.errors
+    late = recovery.bridged_errors[span]
+    late = late - late[measured].mean()
+    errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
+    ripple = recovery.ripple[span.start:span.stop - 1]
+    reason = _unresolved(bridged - late, standard_errors, recovery, model)
+    corrected_pulses: FloatArray = bridged if reason else bridged - late
     law = angle_law(model.angle_law)
     used = slice(first - law.before, first + count + 1 + law.after)
     corrected_law = LINEAR_LAW  # the recovery is a model of the linear law
@@ -323,7 +316,8 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
         corrected_pulses = pulses.reference[span.start - law.before:span.stop + law.after]
         errors = times - pulses.reference[span][measured]
     errors = errors - errors.mean()
-    ripple_is_clear = with_ripple and np.mean(ripple**2) > _RIPPLE * ripple_uncertainty**2
+    ripple_is_clear = not reason and np.mean(ripple**2) > _RIPPLE * (
+        recovery.ripple_standard_error**2)  # false with a missing pulse
     corrected_ripple = ripple if pulses.reference is None and ripple_is_clear else None
     raw = reader.average(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
@@ -337,5 +331,20 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, model: DeclaredModel, fi
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, bridged, errors, standard_errors, raw.cycle_amplitudes,
-        clean_cycles, corrected.noise, floor, ripple, ripple_uncertainty, recovery.accepted,
-        recovery.reason)
+        clean_cycles, corrected.noise, floor, ripple, recovery.ripple_standard_error, not reason,
+        reason)
+
+
+def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: RecordRecovery,
+                model: DeclaredModel) -> str:
+    """Return why the errors of an acquisition tell nothing of its amplitudes, '' if they do."""
+    size = max(float(np.sqrt(model.distribution.variance)), recovery.jitter_std)
+    typical = float(np.sqrt(np.mean(standard_errors**2)))
+    if not np.isfinite(typical):
+        return 'the vibration holds no declared order'
+    if typical >= RESOLVED * size:
+        return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
+                f'{RESOLVED:g} of the size of the pulse errors, {size:.3g} s')
+    if np.any(np.diff(corrected) <= 0.0):
+        return 'a recovered error is larger than a trigger cycle'
+    return ''

@@ -13,8 +13,8 @@
 from independent_effects import draw_case
 import numpy as np
 import pytest
-from record_fit import fit_record
 from record_recovery import fitted
+from sa_jitter_ros.inference.record_fit import fit_record
 
 
 @pytest.mark.machines

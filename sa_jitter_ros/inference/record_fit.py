@@ -72,6 +72,8 @@ _WIDE, _SKIRT = 20, 24
 _SLOPES, _SLOPE_STEP, _SLOPE_GAIN = 400, 0.3, 0.7
 _WEAK = 3.0  # the last fit expects pulse errors this much larger: they are hardly shrunk
 _SAMPLED = 60  # variances of which the median stands for all
+_LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
+_LEAST_KEPT = 1e-3  # of a bend by its prior, below which the vibration tells nothing of it
 _RIDGE = 1e-9
 
 
@@ -80,18 +82,22 @@ class RecordFit:
     """
     Pulse errors and lines of a stretch of a recording.
 
-    `errors` and `standard_errors` (pulse,) in s, measured minus true, their mean 0; `ripple`
-    (cycle,) is the factor of u (1 - u) in the error inside a cycle (s), `ripple_standard_error`
-    its standard error. `orders` (order,), the declared ones first, and `tones` (tone,) in Hz are
-    the lines; `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells
-    which orders certainly turn with the shaft: the speed varies enough to show it. `jitter_std`
-    (s) is the estimated size of the pulse errors.
+    `errors` and `standard_errors` (pulse,) in s, measured minus true, their mean 0;
+    `noise_autocovariance` (lag,) in s^2 is that of what the errors are wrong by. `bends` (cycle,
+    2) are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
+    `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
+    of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the lines;
+    `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells which orders
+    certainly turn with the shaft: the speed varies enough to show it. `jitter_std` (s) is the
+    estimated size of the pulse errors.
     """
 
     errors: Array
     standard_errors: Array
-    ripple: Array
-    ripple_standard_error: float
+    noise_autocovariance: Array
+    bends: Array
+    bend_standard_errors: Array
+    declared: int
     orders: Array
     tones: Array
     amplitudes: ComplexArray
@@ -101,14 +107,14 @@ class RecordFit:
 
 def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
                measured: BoolArray, cycle_length: float, orders: Sequence[float],
-               jitter_std: float, known: RecordFit | None = None) -> RecordFit:
+               jitter_std: float, known: tuple[Array, Array] | None = None) -> RecordFit:
     """
     Fit consecutive trigger cycles of a recording.
 
     `samples` (sample, channel) begin at `start_time` (s); `times` (pulse,) are the trigger pulses,
     of which some are `measured` (pulse,) and the others were put in evenly. `cycle_length` is r;
-    `jitter_std` (s) the declared size of the pulse errors. With `known` the lines are those of an
-    earlier fit, and none is looked for.
+    `jitter_std` (s) the declared size of the pulse errors. `known` are undeclared orders, and
+    tones (Hz), of an earlier fit; then none is looked for.
     """
     top = max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)
     period = float(np.diff(times).mean())
@@ -117,7 +123,7 @@ def fit_record(samples: Array, sample_rate: float, start_time: float, times: Arr
                      jitter_std)
     states.follow_trend()
     if known is not None:
-        states.add(known.orders[len(orders):], known.tones)
+        states.add(*known)
     states.fit_amplitudes()
     _search(states, known is None)
     for _ in range(_LAST_STEPS):
@@ -486,24 +492,26 @@ class _States:
         """Move each undeclared line to where the residual has nothing left of it."""
         self._make_tables()
         residual = self._residual()
-        angle = self.cycle_length * (np.arange(self.times.size - 1)[:, None] + self.u)
-        for i in range(self.declared, self.amplitudes.shape[1]):
-            tone = i - self.orders.size
-            coordinate = angle if tone < 0 else self.place
-            coordinate = coordinate - coordinate.mean()
-            top = bottom = 0.0
-            for c, row in enumerate(self.amplitudes):
-                one = np.zeros(row.size, np.complex128)
-                one[i] = 2j * np.pi * row[i]
-                moved = coordinate * self._signal(one)
-                top += self.weight[c] * float(np.sum(moved * residual[:, :, c]))
-                bottom += self.weight[c] * float(np.sum(moved**2))
+        cycle = np.arange(self.times.size - 1) - 0.5 * (self.times.size - 1)
+        angle = self.cycle_length * (cycle[:, None] + self.u)
+        time = self.place - self.place.mean()
+        count = self.orders.size
+        top, bottom = np.zeros(self.amplitudes.shape[1]), np.zeros(self.amplitudes.shape[1])
+        for c, (weight, row) in enumerate(zip(self.weight, self.amplitudes)):
+            moved = np.append(self._sums(angle * residual[:, :, c])[:, :count].sum(axis=0),
+                              self._sums(time * residual[:, :, c])[:, count:].sum(axis=0))
+            top += weight * np.real(2j * np.pi * row * moved)
+            bottom += weight * 2.0 * np.pi**2 * np.abs(row) ** 2
+        whole = self.whole[:, None]
+        for chosen, coordinate in ((slice(self.declared, count), angle),
+                                   (slice(count, None), time)):
             most = 0.5 / float(np.ptp(coordinate))
-            step = float(np.clip(top / bottom, -most, most)) if bottom else 0.0
-            if tone < 0:
-                self.orders[i] += step
-            else:
-                self.tones[tone] += step
+            curve = float(np.sum(coordinate**2 * whole))
+            with np.errstate(divide='ignore', invalid='ignore'):
+                step = np.nan_to_num(top[chosen] / (bottom[chosen] * curve), posinf=0.0,
+                                     neginf=0.0).clip(-most, most)
+            lines = self.orders[self.declared:] if chosen.stop else self.tones
+            lines += step
 
     def prune(self, least: float) -> None:
         """Take out undeclared lines whose amplitudes are noise."""
@@ -523,14 +531,36 @@ class _States:
         self.step(weak=_WEAK)
         self.step(weak=_WEAK, move=False)
         errors = self.states[:, 0] - self.states[self.measured, 0].mean()
-        variance = float(np.median(self._variances(1, _SAMPLED)))
-        kept = max(1.0 - variance / self.size[1] ** 2, 0.0)  # of a bend
-        with np.errstate(divide='ignore', invalid='ignore'):
-            ripple = self.states[:-1, 1] / kept
-            ripple_error = float(np.sqrt(variance / np.float64(kept)))
+        bends, bend_errors = self.states[:-1, 1:3].copy(), np.full(2, np.inf)
+        for i in range(2):
+            variance = float(np.median(self._variances(1 + i, _SAMPLED)))
+            kept = 1.0 - variance / self.size[1 + i] ** 2  # not shrunk
+            if kept > _LEAST_KEPT:
+                bends[:, i] /= kept
+                bend_errors[i] = np.sqrt(variance / kept)
         return RecordFit(
-            errors, np.sqrt(self._variances(0)), ripple, ripple_error, self.orders, self.tones,
-            self.amplitudes[:, :self.orders.size], self._turning(), float(self.size[0]))
+            errors, np.sqrt(self._variances(0)), self._autocovariance(), bends, bend_errors,
+            self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
+            self._turning(), float(self.size[0]))
+
+    def _autocovariance(self) -> Array:
+        """Return the mean posterior autocovariance of the pulse errors about their mean."""
+        factor, inner, schur, scale = self.solved
+        pulses, width = self.states.shape
+        lags = min(_LAGS, pulses - 1)
+        chosen = np.unique(np.linspace(0, pulses - 1 - lags, _SAMPLED).astype(int))
+        unit = np.zeros((width * pulses, chosen.size + 1))
+        unit[width * chosen, np.arange(chosen.size)] = scale[width * chosen]
+        unit[::width, -1] = scale[::width] * self.measured / self.measured.sum()
+        found = cho_solve_banded(factor, unit)
+        found += inner @ cho_solve(schur, inner.T @ unit)
+        found = (found * scale[:, None])[::width]
+        shared = found[:, -1]
+        mean = float(shared @ self.measured) / self.measured.sum()
+        each = chosen[:, None] + np.arange(lags + 1)
+        return np.asarray(np.mean(
+            found[each, np.arange(chosen.size)[:, None]] - shared[each]
+            - shared[chosen][:, None] + mean, axis=0))
 
     def _turning(self) -> BoolArray:
         """Tell which orders have more power over angle than any tone near them has over time."""
@@ -567,11 +597,17 @@ def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
     for channel, limit in zip(power.T, (0.5 * least * window.sum()) ** 2):
         floor = np.full(len(power), limit)
         for wide in (max(_WIDE, int(span / 2)), _SKIRT):
-            middles = np.arange(0, len(power), max(1, wide // 2))
-            medians = [np.median(channel[max(0, i - wide):i + wide]) for i in middles]
-            floor = np.maximum(floor, np.interp(np.arange(len(power)), middles, medians))
+            floor = np.maximum(floor, _medians(channel, wide))
         ratio += channel * np.log(2.0) / floor
     return ratio, power.sum(axis=1)
+
+
+def _medians(power: Array, reach: int) -> Array:
+    """Return the median of the values up to `reach` bins away, between some bins linearly."""
+    size = min(2 * reach, len(power))
+    starts = np.arange(0, len(power) - size + 1, max(1, reach // 2))
+    windows = np.lib.stride_tricks.sliding_window_view(power, size)[starts]
+    return np.interp(np.arange(len(power)), starts + size // 2, np.median(windows, axis=1))
 
 
 def _between(values: Array) -> float:

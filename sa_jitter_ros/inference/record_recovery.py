@@ -1,0 +1,289 @@
+"""
+The pulse errors of a whole recording, recovered from its vibration.
+
+The record fit takes every unbroken stretch of a recording at once: a run of trigger pulses that
+are numbered without a doubt, inside the vibration. Undeclared lines are looked for in the longest
+stretch. They help where they are steady, and disturb where they change from cycle to cycle: then
+what they leave alternates from pulse to pulse. Whether the errors come from a fit with them or
+from one with declared lines only is decided by the pulses: measured times less errors are those of
+a shaft, which turns smoothly, plus what the errors are wrong by.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
+from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.inference.beat import METHODS
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.pulses.resampling import gain
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+BoolArray = NDArray[np.bool_]
+
+_EDGE = 15  # samples at either end that interpolation cannot read
+_FEWEST = 8  # pulses in a stretch
+_LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
+#: Largest standard error of resolved pulse errors, in parts of their size.
+RESOLVED = 0.7
+_APART = 1.5  # in what a stretch resolves: lines that it keeps apart
+# Second differences that are larger than this many of their median are no motion.
+_OUTLIER = 6.0
+# Lines of an average within which an order is one that the shafts are known to have; amplitude, in
+# parts of the channel's strongest declared order, and number of orders that leak.
+_ON_LINE, _STRONG, _MOST = 0.1, 2e-3, 40
+# A modulation that lines share: sidebands of so many orders; how much of their power may be no
+# part of it; factor by which images of an interpolator may be larger or smaller; multiples.
+_FEWEST_LINES, _UNLIKE, _OTHER_SIZE, _MULTIPLES = 2, 0.15, 1.3, 3
+
+
+@dataclass(frozen=True)
+class RecordRecovery:
+    """
+    Pulse errors of a recording, recovered from its vibration.
+
+    `times` (n,) in s are the measured trigger pulses, `missing` (n - 1,) the number of missing
+    ones in each interval. `errors` and `standard_errors` (n,) in s are measured minus true, with
+    mean 0 in each stretch, NaN outside of them; `bridged_errors` and `bridged_standard_errors`
+    (m,) have those of the interpolated pulses, too. `ripple` and `bend` (m - 1,) are the factors
+    of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s), NaN beside a missing
+    pulse, with their standard errors. `noise_autocovariance` (lag,) in s^2 is that of what
+    `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
+    tones (Hz) that were fitted beside the declared ones. `fits` are those of the stretches.
+    """
+
+    times: FloatArray
+    missing: NDArray[np.int64]
+    number: NDArray[np.int64]
+    bridged_errors: FloatArray
+    bridged_standard_errors: FloatArray
+    ripple: FloatArray
+    ripple_standard_error: float
+    bend: FloatArray
+    bend_standard_error: float
+    noise_autocovariance: FloatArray
+    jitter_std: float
+    undeclared: tuple[FloatArray, FloatArray]
+    fits: tuple[RecordFit, ...]
+
+    @property
+    def errors(self) -> FloatArray:
+        """Return the errors of the measured pulses (n,)."""
+        return self.bridged_errors[self.number]
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """Return the standard errors of the errors of the measured pulses (n,)."""
+        return self.bridged_standard_errors[self.number]
+
+
+def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
+                   model: DeclaredModel, *,
+                   known: tuple[FloatArray, FloatArray] | None = None) -> RecordRecovery:
+    """
+    Recover the pulse errors of a recording.
+
+    `samples` (sample, channel) begin at `start_time` (s). With the undeclared orders and tones
+    (Hz) that are `known`, no other is looked for. Nothing is refused: where the vibration tells
+    nothing, standard errors are as large as the errors expected, or NaN.
+    """
+    def fits(lines: tuple[FloatArray, FloatArray] | None) -> list[RecordFit | None]:
+        found: list[RecordFit | None] = [None] * len(stretches)
+        for i in sorted(range(len(stretches)), key=lambda i: stretches[i].start
+                        - stretches[i].stop):
+            found[i] = fit = _fitted(samples, start_time, rate, pulses, stretches[i], model, lines)
+            if lines is None and fit is not None:
+                lines = fit.orders[len(model.orders):], fit.tones
+        return found
+
+    stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
+    recovery = _joined(pulses, stretches, fits(known))
+    if known is None and sum(item.size for item in recovery.undeclared):
+        none = np.zeros(0), np.zeros(0)
+        bare = _joined(pulses, stretches, fits(none))
+        if _roughness(bare) < _roughness(recovery):
+            return replace(bare, fits=recovery.fits)
+    return recovery
+
+
+def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> list[slice]:
+    """Return the unbroken stretches of the bridged pulses inside the vibration."""
+    times = pulses.bridged
+    with np.errstate(invalid='ignore'):
+        inside = (times > begin + edge) & (times < end - edge)  # false where NaN
+    breaks = ~inside
+    breaks[1:] |= ~inside[:-1]
+    breaks[pulses.number[pulses.starts_run]] = True
+    bounds = np.append(np.flatnonzero(breaks), times.size)
+    starts = np.append(0, bounds[:-1])
+    return [slice(a, b) for a, b in zip(starts.tolist(), bounds.tolist())
+            if b - a >= _FEWEST and inside[a]]
+
+
+def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
+            stretch: slice, model: DeclaredModel,
+            known: tuple[FloatArray, FloatArray] | None) -> RecordFit | None:
+    """Return the fit of a stretch; None where its equations have no solution."""
+    times = pulses.bridged[stretch]
+    measured = np.zeros(pulses.bridged.size, np.bool_)
+    measured[pulses.number[~pulses.doubtful]] = True
+    if known is not None:
+        span = model.cycle_length * (times.size - 1)
+        known = (_apart(known[0], model.orders, _APART / span),
+                 _apart(known[1], (), _APART / float(np.ptp(times))))
+    first = max(int((times[0] - start_time) * rate) - _EDGE, 0)
+    last = int((times[-1] - start_time) * rate) + _EDGE
+    try:
+        return fit_record(
+            samples[first:last + 1], rate, start_time + first / rate, times,
+            measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
+            jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER),
+            known=known)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _apart(lines: FloatArray, others: Sequence[float], least: float) -> FloatArray:
+    """Return the lines that are at least so far from all before them and from others."""
+    kept: list[float] = []
+    for line in lines.tolist():
+        if all(abs(line - other) > least for other in (*others, *kept)):
+            kept.append(line)
+    return np.array(kept)
+
+
+def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[RecordFit | None]
+            ) -> RecordRecovery:
+    """Return the recovery that the fits of some stretches make."""
+    count = pulses.bridged.size
+    errors, standard_errors = np.full(count, np.nan), np.full(count, np.nan)
+    bends = np.full((max(count - 1, 0), 2), np.nan)
+    good = [fit for fit in fits if fit is not None]
+    for stretch, fit in zip(stretches, fits):
+        if fit is not None:
+            errors[stretch], standard_errors[stretch] = fit.errors, fit.standard_errors
+            bends[stretch.start:stretch.stop - 1] = fit.bends
+    measured = np.zeros(count, np.bool_)
+    measured[pulses.number] = True
+    bends[~(measured[:-1] & measured[1:])] = np.nan
+    weights = [fit.errors.size for fit in good]
+    lags = min((fit.noise_autocovariance.size for fit in good), default=0)
+
+    def mean(values: Sequence[FloatArray]) -> FloatArray:
+        return np.asarray(np.average(values, axis=0, weights=weights))
+
+    empty = np.zeros(0)
+    longest = max(good, key=lambda fit: fit.errors.size, default=None)
+    bend_errors = np.sqrt(mean([fit.bend_standard_errors**2 for fit in good])
+                          ) if good else np.full(2, np.inf)
+    return RecordRecovery(
+        pulses.times, pulses.missing, pulses.number, errors, standard_errors, bends[:, 0],
+        float(bend_errors[0]), bends[:, 1], float(bend_errors[1]),
+        mean([fit.noise_autocovariance[:lags] for fit in good]) if good else empty,
+        float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
+        (empty, empty) if longest is None else (
+            longest.orders[longest.declared:], longest.tones), tuple(good))
+
+
+def _roughness(recovery: RecordRecovery) -> float:
+    """Return the RMS of the second differences of the times of the corrected pulses."""
+    corrected = recovery.times - recovery.errors
+    whole = (recovery.missing[1:] == 0) & (recovery.missing[:-1] == 0)
+    second = np.diff(corrected, 2)[whole]
+    second = np.abs(second[np.isfinite(second)])
+    if not second.size:
+        return float('nan')
+    return float(np.sqrt(np.mean(np.minimum(second, _OUTLIER * np.median(second)) ** 2)))
+
+
+def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float]:
+    """
+    Return the undeclared orders that leak into the declared ones, strongest first.
+
+    These are orders that a shaft must have, and those that certainly turn with the shaft.
+    Sidebands that change all lines in phase are a modulation of the amplitudes, no lines.
+    """
+    if not recovery.fits:
+        return []
+    fit = max(recovery.fits, key=lambda item: item.errors.size)
+    declared = fit.declared
+    level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
+    share = np.max(np.abs(fit.amplitudes) / level, axis=0)
+    modulating = _modulating(fit, model)
+    found: list[float] = []
+    for i in (declared + np.argsort(-share[declared:])).tolist():
+        if share[i] < _STRONG or len(found) == _MOST:
+            break
+        exact = _exact(float(fit.orders[i]), model)
+        order = float(fit.orders[i]) if exact is None else exact
+        wanted = order == round(order) or (
+            not modulating[i] and (exact is not None or fit.turning[i]))
+        if wanted and order not in (*model.orders, *found):
+            found.append(order)
+    return found
+
+
+def _modulating(fit: RecordFit, model: DeclaredModel) -> BoolArray:
+    """
+    Tell which undeclared orders (order,) are sidebands of a modulation that the lines share.
+
+    An interpolator with the response H makes images of all lines, H(f + fs) and H(f - fs) over
+    H(f) times as large, which the drift between two clocks puts beside the lines; a gain that
+    varies makes sidebands of one size. In both cases one phase goes with all of them.
+    """
+    declared = fit.orders[:fit.declared]
+    least = _APART / (model.cycle_length * (fit.errors.size - 1))
+    apart = fit.orders[:, None] - declared
+    near = np.argmin(np.abs(apart), axis=1)
+    offsets = apart[np.arange(near.size), near]
+    relative = declared * model.fundamental_frequency / model.sample_rate
+    shapes = [(np.ones((2, declared.size)), np.inf)]
+    for method in METHODS:
+        images = np.array([gain(method, relative + turn) for turn in (-1.0, 1.0)])
+        images = np.abs(images / gain(method, relative))
+        shapes += [(images, _OTHER_SIZE), (images[::-1], _OTHER_SIZE)]
+    found = np.zeros(fit.orders.size, np.bool_)
+    for distance in np.unique(np.abs(offsets[fit.declared:])):
+        sides = np.zeros((2, *fit.amplitudes[:, :fit.declared].shape), np.complex128)
+        for i in np.flatnonzero(np.abs(np.abs(offsets) - distance) < least):
+            if i >= fit.declared:
+                side = fit.amplitudes[:, i] / fit.amplitudes[:, near[i]]
+                sides[int(offsets[i] < 0.0)][:, near[i]] = (
+                    side if offsets[i] > 0.0 else side.conj())
+        if np.count_nonzero(np.any(sides != 0.0, axis=(0, 1))) < min(_FEWEST_LINES, fit.declared):
+            continue
+        if any(_follow(sides, shape[:, None], np.abs(fit.amplitudes[:, :fit.declared]), most)
+               for shape, most in shapes):
+            strong = np.abs(fit.amplitudes).max(axis=0)
+            strong[:fit.declared] = np.inf
+            for multiple in distance * np.arange(1, _MULTIPLES + 1):
+                beside = np.abs(np.abs(fit.orders[:, None] - fit.orders) - multiple) < least
+                found |= np.any(beside & (strong > strong[:, None]), axis=1)
+    found[:fit.declared] = False
+    return found
+
+
+def _follow(sides: ComplexArray, shape: FloatArray, level: FloatArray, most: float) -> bool:
+    """
+    Tell whether sidebands follow a shape, up to a phase and a size that is known to a factor.
+
+    `sides` (side, channel, line) are sidebands over their lines, 0 where none was found, conjugate
+    below the lines; `level` (channel, line) are the lines.
+    """
+    weight = np.where(sides != 0.0, shape * level, 0.0)
+    scaled = np.divide(sides, shape, where=weight > 0.0, out=np.zeros_like(sides))
+    common = np.sum(weight * scaled) / weight.sum()
+    away = np.sum(weight * np.abs(scaled - common) ** 2) / weight.sum()
+    return bool(away < _UNLIKE * abs(common) ** 2 and 1.0 / most < abs(common) < most)
+
+
+def _exact(order: float, model: DeclaredModel) -> float | None:
+    """Return the line of the trigger cycle, or the whole order, that an order is; or None."""
+    near = _ON_LINE / (model.trigger_cycles * model.cycle_length)
+    for exact in (round(order * model.cycle_length) / model.cycle_length, float(round(order))):
+        if abs(order - exact) < near:
+            return exact
+    return None
