@@ -112,12 +112,14 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
         return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', False, (),
                    (), nan, nan, nan, nan, {})
     found = report['missing_effects']
+    chi2 = [float('nan') if value is None else value for value in (
+        report[when]['chi2_per_dof'] for when in ('error_before', 'error_after'))]
     return Run(
         effects, seed, text, seconds, status, error.getvalue().strip(), report['verdict'],
         item.noise_colour > 0.0, tuple(one['name'] for one in found),
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
         _rms(report['error_before']), _rms(report['error_after']),
-        report['error_before']['chi2_per_dof'], report['error_after']['chi2_per_dof'],
+        *chi2,
         {f'{one["name"]}.{name}': _standard_errors(value, case.truth[one['name']][name])
          for one in found for name, value in one['parameters'].items()
          if name in case.truth.get(one['name'], {}) and value['standard_error'] is not None})
@@ -137,6 +139,8 @@ def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str,
 
 
 def _rms(error: Mapping[str, Any]) -> float:
+    if error['rms'] is None:  # no line is compared
+        return float('nan')
     return float(np.sqrt(max(error['rms']**2 - error['rms_standard_error']**2, 0.0)))
 
 

@@ -61,8 +61,9 @@ class Case:
         return ', '.join(item['name'] for item in self.content['missing_effects']) or '-'
 
     def value(self, when: str, key: str) -> float:
-        """Return a number of the residual; `when` is before or after."""
-        return float(self.content[f'error_{when}'][key])
+        """Return a number of the residual, NaN without one; `when` is before or after."""
+        value = self.content[f'error_{when}'][key]
+        return float('nan' if value is None else value)
 
 
 def gear0(clock: float, channels: Sequence[int] = ()) -> Callable[[Path], Recording]:
@@ -160,6 +161,10 @@ def table(cases: Sequence[Case], first: str) -> str:
         if case.error:
             lines.append(f'| {case.title} | - | not used {"| " * 8}|')
             continue
+        if not case.content['lines']:
+            lines.append(f'| {case.title} | {case.content["acquisitions"]["held_out"]} | '
+                         f'{case.content["verdict"]} | {case.effects} {"| - " * 7}|')
+            continue
         numbers = [f'{case.value(when, key):.{digits}}'
                    for key, digits in (('rms', '4f'), ('chi2_per_dof', '3g'), ('p_value', '2g'))
                    for when in ('before', 'after')]
@@ -216,7 +221,7 @@ def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
 
 def error_figure(cases: Sequence[Case]) -> Figure:
     """Draw the held-out error of every case that could be used, before and after."""
-    used = [case for case in cases if not case.error]
+    used = [case for case in cases if case.content.get('lines')]
     place = np.arange(len(used))
     figure = Figure(figsize=(10.0, 3.4), layout='constrained')
     axes = figure.subplots()
@@ -258,6 +263,8 @@ def main() -> None:
             print(f'\n{case.title}: {case.error}')
         for item in case.content.get('missing_effects', ()):
             print(f'\n{case.title}: {item["name"]}: {item["evidence"]}')
+        if case.content and not case.content['lines']:
+            print(f'\n{case.title}: {case.content["remarks"][-1]}')
     if options.figures:
         options.figures.mkdir(parents=True, exist_ok=True)
         for name, figure in (('measured-gearbox', grid_figure(gearbox, options.data)),

@@ -25,7 +25,6 @@ from sa_jitter_ros.effects.lattice import Clock, find_clock
 from sa_jitter_ros.effects.pulse_covariance import (
     _distribution_p_value, fit_covariance, log_likelihood, white)
 from sa_jitter_ros.effects.slope_test import slope_test
-from sa_jitter_ros.inference.cycle_reader import RIPPLE_VARIANCE
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
@@ -38,6 +37,11 @@ MODEL = DeclaredModel(keyphasor_rate=5_000.0, trigger_speed=25.0, trigger_cycles
 ACQUISITIONS, PULSES = 12, 21
 PERIOD = 0.04
 NOISE = 1.5e-6
+COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
+# Variance of a ripple that is fitted beside pulse errors, for noise of unit power over a cycle: at
+# the frequency w (per cycle), that is the inverse of the mean square of u (1 - u) without its best
+# fit by straight lines between the pulses.
+RIPPLE_VARIANCE = np.mean(1.0 / (1.0 / 30.0 - (1.0 + COSINE) / (24.0 * (2.0 + COSINE))))
 
 
 def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noise_density=None,

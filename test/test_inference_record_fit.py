@@ -56,7 +56,7 @@ def test_a_tone_is_no_order():
 @pytest.mark.machines
 def test_a_speed_that_moves_inside_the_cycle_is_found_as_such():
     run = fitted(('speed_fluctuation',), 200)
-    assert np.std(run.fit.ripple) > 5.0 * run.fit.ripple_standard_error
+    assert np.std(run.fit.bends[:, 0]) > 5.0 * run.fit.bend_standard_errors[0]
     assert np.std(run.wrong) < 0.2 * np.std(run.true)
 
 

@@ -45,8 +45,7 @@ def choose_lines(observation: Observation) -> Lines:
     Return the lines worth comparing.
 
     They have at least 20 % of their order's strongest channel and a coherence from cycle to cycle
-    of 0.9 times that of the best line, which noise and modulation lower too. Raises SignalError
-    where there is none.
+    of 0.9 times that of the best line, which noise and modulation lower too. There may be none.
     """
     orders = observation.orders.size
     cycles = _cycles(observation)
@@ -59,10 +58,6 @@ def choose_lines(observation: Observation) -> Lines:
     if good.any():
         good &= coherence >= _COHERENT * coherence[good].max()
     channel, order = np.nonzero(good)
-    if channel.size == 0:
-        raise SignalError(
-            f'no declared order ({", ".join(f"{g:g}" for g in observation.orders)}) is coherent '
-            'from cycle to cycle on any channel: declare orders that the vibration holds')
     return Lines(channel, order)
 
 

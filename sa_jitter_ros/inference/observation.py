@@ -183,7 +183,6 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             f'{model.trigger_cycles} consecutive trigger cycles inside the vibration: lower '
             'trigger_cycles or record longer'
             + ''.join(f' ({remark})' for remark in pulses.remarks))
-    rows = tuple(range(samples.shape[1]))
     recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses, model)
     orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
     if pulses.reference is not None and not _reference_serves(
@@ -305,7 +304,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     late = recovery.bridged_errors[span]
     late = late - late[measured].mean()
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
-    ripple = recovery.ripple[span.start:span.stop - 1]
+    ripple = recovery.ripple[span.start + measured[:-1]]
     reason = _unresolved(bridged - late, standard_errors, recovery, model)
     corrected_pulses: FloatArray = bridged if reason else bridged - late
     law = angle_law(model.angle_law)
@@ -338,7 +337,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
 def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: RecordRecovery,
                 model: DeclaredModel) -> str:
     """Return why the errors of an acquisition tell nothing of its amplitudes, '' if they do."""
-    size = max(float(np.sqrt(model.distribution.variance)), recovery.jitter_std)
+    size = max(float(np.sqrt(model.distribution.variance)), recovery.size)
     typical = float(np.sqrt(np.mean(standard_errors**2)))
     if not np.isfinite(typical):
         return 'the vibration holds no declared order'

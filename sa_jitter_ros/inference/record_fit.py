@@ -70,10 +70,14 @@ _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that
 # Neighbourhoods of which the median is the floor: half an order, at least some bins; the skirt.
 _WIDE, _SKIRT = 20, 24
 _SLOPES, _SLOPE_STEP, _SLOPE_GAIN = 400, 0.3, 0.7
-_WEAK = 3.0  # the last fit expects pulse errors this much larger: they are hardly shrunk
+_MOST_SLOPE = 5e-3  # beyond it, other lines are taken for the declared ones
+_SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
+# The last fit expects pulse errors that are so many times as large as they, or their standard
+# errors, are, so that they are hardly shrunk; up to so many turns of the highest declared order.
+_WEAK, _MOST_TURNS = 3.0, 0.25
 _SAMPLED = 60  # variances of which the median stands for all
 _LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
-_LEAST_KEPT = 1e-3  # of a bend by its prior, below which the vibration tells nothing of it
+_LEAST_KEPT = 1e-6  # of a bend by its prior, below which the vibration tells nothing of it
 _RIDGE = 1e-9
 
 
@@ -86,10 +90,10 @@ class RecordFit:
     `noise_autocovariance` (lag,) in s^2 is that of what the errors are wrong by. `bends` (cycle,
     2) are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
     `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
-    of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the lines;
-    `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells which orders
-    certainly turn with the shaft: the speed varies enough to show it. `jitter_std` (s) is the
-    estimated size of the pulse errors.
+    of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
+    lines; `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells which
+    orders certainly turn with the shaft: the speed varies enough to show it. `jitter_std` (s) is
+    the estimated size of the pulse errors.
     """
 
     errors: Array
@@ -298,7 +302,8 @@ class _States:
         moving = np.stack([self._signal(of_orders * row) for row in self.amplitudes], axis=2)
         solution = self._solve(residual, (rate, moving), weak)
         change, amplitudes = solution
-        size = float(np.sqrt(np.mean(change[:, 0] ** 2)))
+        self.change = change[:, 0]
+        size = float(np.sqrt(np.mean(self.change**2)))
         if move:
             most = _STEP / (self.orders[:self.declared].max() * self.frequency)
             part = min(1.0, most / max(size, 1e-300))
@@ -405,8 +410,8 @@ class _States:
         if self.all_free:
             least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
             for i, limit in enumerate(least, 1):
-                power = np.mean(self.states[2:-2, i] ** 2) + np.median(
-                    self._variances(i, _SAMPLED))
+                told = 1.0 - np.median(self._variances(i, _SAMPLED)) / self.size[i] ** 2
+                power = np.mean(self.states[2:-2, i] ** 2) / max(told, _LEAST_KEPT)
                 self.size[i] = max(np.sqrt(power), limit)
 
     def free_all(self) -> None:
@@ -427,13 +432,20 @@ class _States:
         spectrum = np.abs(np.fft.rfft(flat * np.hanning(len(flat))[:, None], axis=0)) ** 2
         power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
         step = _SLOPE_STEP / self.orders.max() / self.span
-        number = np.arange(-_SLOPES, _SLOPES + 1)
+        most = min(_SLOPES, int(_MOST_SLOPE / step))
+        number = np.arange(-most, most + 1)
         slope = step * number
         score = np.sum([np.log(1e-3 * power.max() + np.interp(
             g * (1.0 + slope) * self.span, np.arange(power.size), power)) for g in self.orders],
             axis=0)
         best = slope[np.argmax(score - 1e-3 * np.abs(number))]
-        if score.max() - score[_SLOPES] > _SLOPE_GAIN * self.declared and abs(best) > 1.5 * step:
+        ratio = sum(item * np.log(2.0) / _medians(item, max(_WIDE, int(self.span / 2)))
+                    for item in spectrum.T)
+        places = np.rint(self.orders * (1.0 + best) * self.span).astype(int)
+        chance = gamma.sf(ratio[places], spectrum.shape[1])
+        if (score.max() - score[most] > _SLOPE_GAIN * self.declared
+                and abs(best) > 1.5 * step
+                and np.mean(chance < _FALSE / number.size) > _SLOPE_LINES):
             pulse = np.arange(self.times.size) - 0.5 * self.times.size
             self.slow = np.asarray(best * pulse * np.diff(self.times).mean())
             self.states[:, 0] = self.slow
@@ -528,9 +540,15 @@ class _States:
 
     def result(self) -> RecordFit:
         """Return the fit, pulse errors and bends as good as unshrunk."""
+        size = float(self.size[0])
+        variance = float(np.median(self._variances(0, _SAMPLED)))
+        kept = max(1.0 - variance / size**2, np.finfo(np.float64).eps)  # of an error
+        most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency) / size
+        weak = _WEAK * max(1.0, min(float(np.sqrt(variance / kept)) / size, most))
         self.step(weak=_WEAK)
-        self.step(weak=_WEAK, move=False)
-        errors = self.states[:, 0] - self.states[self.measured, 0].mean()
+        self.step(weak=weak, move=False)
+        errors = self.states[:, 0] + self.change
+        errors -= errors[self.measured].mean()
         bends, bend_errors = self.states[:-1, 1:3].copy(), np.full(2, np.inf)
         for i in range(2):
             variance = float(np.median(self._variances(1 + i, _SAMPLED)))

@@ -34,10 +34,11 @@ _APART = 1.5  # in what a stretch resolves: lines that it keeps apart
 _OUTLIER = 6.0
 # Lines of an average within which an order is one that the shafts are known to have; amplitude, in
 # parts of the channel's strongest declared order, and number of orders that leak.
-_ON_LINE, _STRONG, _MOST = 0.1, 2e-3, 40
-# A modulation that lines share: sidebands of so many orders; how much of their power may be no
-# part of it; factor by which images of an interpolator may be larger or smaller; multiples.
-_FEWEST_LINES, _UNLIKE, _OTHER_SIZE, _MULTIPLES = 2, 0.15, 1.3, 3
+_ON_LINE, _STRONG, _MOST = 0.1, 5e-3, 20
+# A modulation that lines share: so many sidebands, of more than one line; how much of their power
+# may be no part of it; factor by which images of an interpolator may be larger or smaller;
+# multiples.
+_FEWEST_SIDES, _UNLIKE, _OTHER_SIZE, _MULTIPLES = 3, 0.15, 1.3, 3
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,15 @@ class RecordRecovery:
         """Return the standard errors of the errors of the measured pulses (n,)."""
         return self.bridged_standard_errors[self.number]
 
+    @property
+    def size(self) -> float:
+        """Return the size of the errors (s): that of the fit, or what exceeds their noise."""
+        known = np.isfinite(self.standard_errors)
+        if not known.any():
+            return self.jitter_std
+        power = float(np.var(self.errors[known]) - np.mean(self.standard_errors[known] ** 2))
+        return max(self.jitter_std, float(np.sqrt(max(power, 0.0))))
+
 
 def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
                    model: DeclaredModel, *,
@@ -101,7 +111,7 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
     recovery = _joined(pulses, stretches, fits(known))
-    if known is None and sum(item.size for item in recovery.undeclared):
+    if known is None and any(item.size for item in recovery.undeclared):
         none = np.zeros(0), np.zeros(0)
         bare = _joined(pulses, stretches, fits(none))
         if _roughness(bare) < _roughness(recovery):
@@ -169,6 +179,9 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
     measured = np.zeros(count, np.bool_)
     measured[pulses.number] = True
     bends[~(measured[:-1] & measured[1:])] = np.nan
+    bend_errors = np.sqrt(np.mean([fit.bend_standard_errors**2 for fit in good], axis=0)
+                          ) if good else np.full(2, np.inf)
+    bends[:, ~np.isfinite(bend_errors)] = np.nan
     weights = [fit.errors.size for fit in good]
     lags = min((fit.noise_autocovariance.size for fit in good), default=0)
 
@@ -177,8 +190,6 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
 
     empty = np.zeros(0)
     longest = max(good, key=lambda fit: fit.errors.size, default=None)
-    bend_errors = np.sqrt(mean([fit.bend_standard_errors**2 for fit in good])
-                          ) if good else np.full(2, np.inf)
     return RecordRecovery(
         pulses.times, pulses.missing, pulses.number, errors, standard_errors, bends[:, 0],
         float(bend_errors[0]), bends[:, 1], float(bend_errors[1]),
@@ -253,7 +264,7 @@ def _modulating(fit: RecordFit, model: DeclaredModel) -> BoolArray:
                 side = fit.amplitudes[:, i] / fit.amplitudes[:, near[i]]
                 sides[int(offsets[i] < 0.0)][:, near[i]] = (
                     side if offsets[i] > 0.0 else side.conj())
-        if np.count_nonzero(np.any(sides != 0.0, axis=(0, 1))) < min(_FEWEST_LINES, fit.declared):
+        if np.count_nonzero(np.any(sides != 0.0, axis=1)) < _FEWEST_SIDES:
             continue
         if any(_follow(sides, shape[:, None], np.abs(fit.amplitudes[:, :fit.declared]), most)
                for shape, most in shapes):

@@ -29,6 +29,7 @@ Array = NDArray[Any]
 #: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3
 _DRAWS, _SEED = 4000, 17
+_NAN = float('nan')
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,15 @@ class Residual:
 
 def _one_of_three(*p_values: float) -> float:
     """Return the smallest p value, corrected for there being three tests."""
-    return float(min(1.0, 3.0 * min(p_values)))
+    return float(np.minimum(1.0, 3.0 * min(p_values)))
+
+
+#: The residual of no line.
+UNDEFINED = Residual(
+    mean=np.zeros(0), standard_error=np.zeros(0), rms=_NAN, rms_standard_error=_NAN,
+    rms_parameter_error=_NAN, chi2_per_dof=_NAN, ks=_NAN, cramer_von_mises=_NAN, coverage=_NAN,
+    p_mean=_NAN, p_scatter=_NAN, p_amplitude_scatter=_NAN, score=_NAN, amplitude_score=_NAN,
+    z=np.zeros((0, 0)))
 
 
 def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Array,

@@ -36,7 +36,7 @@ from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, line_evidence)
 from sa_jitter_ros.inference.observation import Observation, together
-from sa_jitter_ros.inference.residual import Residual
+from sa_jitter_ros.inference.residual import Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -58,7 +58,7 @@ class Trace:
     (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
     `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
     unexplained scatter of the amplitudes relative to their level, part of the scale of both
-    residuals.
+    residuals. `not_compared` says why there are no `lines`, '' where there are some.
     """
 
     observation: Observation
@@ -80,6 +80,7 @@ class Trace:
     evidence: Evidence | None
     verdict: str
     unsteadiness: float
+    not_compared: str = ''
 
 
 def trace(observations: Sequence[Observation], recordings: Sequence[Recording], *,
@@ -89,12 +90,47 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
 
     `declared` are the effects of the declared model.
 
-    Raises ModelError for fewer than 4 acquisitions and SignalError where nothing can be compared.
+    Where no line can be compared, nothing is found, and the trace says why.
     """
+    whole = together(observations)
+    try:
+        require_acquisitions(whole)
+    except ModelError as error:
+        return _nothing_compared(whole, declared, f'no line is compared: {error}')
+    if len(whole.compared) < _FEWEST:
+        return _nothing_compared(whole, declared, _unresolved(whole))
+    used = [(replace(item, acquisitions=tuple(item.acquisitions[a] for a in item.compared)), source
+             ) for item, source in zip(observations, recordings) if item.compared]
+    observations, recordings = [item for item, _ in used], [source for _, source in used]
     observation = together(observations)
-    require_acquisitions(observation)
+    if not choose_lines(observation).count:
+        orders = ', '.join(f'{g:g}' for g in observation.orders)
+        return _nothing_compared(observation, declared, (
+            f'no line is compared: no declared order ({orders}) is coherent from cycle to cycle '
+            'on any channel, so that no effect could have been seen; declare orders that the '
+            'vibration holds'))
     return trace_bench(make_bench(observation, observations, recordings, declared),
                        progress=progress)
+
+
+def _unresolved(observation: Observation) -> str:
+    """Return that and why the vibration does not show the pulse errors."""
+    reason = next(item.reason for item in observation.acquisitions if item.reason)
+    known = observation.stacked('standard_errors')
+    known = known[np.isfinite(known)]
+    unseen = f' of less than {np.sqrt(np.mean(known**2)):.3g} s' if known.size else ''
+    return (f'no line is compared: {reason}; pulse errors{unseen} could not have been seen; '
+            'declare stronger orders, use a quieter channel or give reference_pulse_times')
+
+
+def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str) -> Trace:
+    """Return the trace of a recording whose lines cannot be compared."""
+    count = len(observation.acquisitions)
+    none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
+    return Trace(
+        observation, tuple(declared), Lines(none, none), np.zeros(0), tuple(range(0, count, 2)),
+        tuple(range(1, count, 2)), (), (), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)),
+        np.zeros((count, 0)), nothing, nothing, None, 'none', float('nan'), reason)
 
 
 def require_acquisitions(observation: Observation) -> None:

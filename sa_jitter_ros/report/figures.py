@@ -52,7 +52,9 @@ class Illustration:
 
 
 def illustrate(trace: Trace) -> tuple[Illustration, ...]:
-    """Draw the figures of a trace; those of the evidence only where there is some."""
+    """Draw the figures of a trace, none without lines; of the evidence where there is some."""
+    if not trace.lines.count:
+        return ()
     held_out = f'{len(trace.held_out)} held-out acquisitions'
     found = [
         Illustration(

@@ -87,6 +87,9 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
              f'{number_text(before["chi2_per_dof"])} to {number_text(after["chi2_per_dof"])}')
     added = ' and '.join(f'{item["name"]} ({parameters_text(item)})'
                          for item in content['missing_effects'])
+    if not content['lines']:
+        return ('Nothing was found, and nothing could have been seen: no line of the vibration '
+                'can be compared with its prediction.')
     if content['verdict'] == 'none':
         return (f'The declared model suffices: no significant residual (p = '
                 f'{number_text(before["p_value"])}), held-out error {rms_before} (RMS of observed '

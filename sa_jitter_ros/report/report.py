@@ -65,7 +65,8 @@ def errors(item: Residual) -> Mapping[str, Json]:
     return {
         'rms': item.rms, 'chi2_per_dof': item.chi2_per_dof, 'ks': item.ks,
         'cramer_von_mises': item.cramer_von_mises, 'coverage_95': item.coverage,
-        'mean': item.mean.mean(), 'rms_standard_error': item.rms_standard_error,
+        'mean': item.mean.mean() if item.mean.size else None,
+        'rms_standard_error': item.rms_standard_error,
         'rms_parameter_error': item.rms_parameter_error, 'p_value': item.p_value}
 
 
@@ -79,10 +80,11 @@ def summary(content: Mapping[str, Json]) -> str:
         if effect['indistinguishable_from']:
             text.append(f'  these data do not distinguish it from: '
                         f'{", ".join(effect["indistinguishable_from"])}')
-    text.append(f'held-out error (RMS of observed minus predicted attenuation): '
-                f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
-    text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
-                f'{after["chi2_per_dof"]:.3g} after')
+    if content['lines']:
+        text.append(f'held-out error (RMS of observed minus predicted attenuation): '
+                    f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
+        text.append(f'chi2 per degree of freedom: {before["chi2_per_dof"]:.3g} before, '
+                    f'{after["chi2_per_dof"]:.3g} after')
     if content['remains']:
         text.append(content['remains'])
     if content['unsteadiness']:
@@ -92,7 +94,9 @@ def summary(content: Mapping[str, Json]) -> str:
 
 
 def _not_compared(trace: Trace) -> Sequence[str]:
-    """Return a remark for each declared order that has no line to compare."""
+    """Return a remark for each declared order that has no line to compare, one if none has."""
+    if trace.not_compared:
+        return [trace.not_compared]
     orders = trace.observation.orders
     return [f'order {orders[g]:g} is declared but not compared: on no channel is its phase as '
             'constant from cycle to cycle as that of the other lines'
