@@ -34,7 +34,7 @@ from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.cycle_reader import CycleReader
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
-    leaking_orders, recover_record, RecordRecovery, RESOLVED)
+    leaking_orders, RecordRecovery, recover_record, RESOLVED)
 from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW

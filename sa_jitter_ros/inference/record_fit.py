@@ -410,8 +410,8 @@ class _States:
         if self.all_free:
             least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
             for i, limit in enumerate(least, 1):
-                told = 1.0 - np.median(self._variances(i, _SAMPLED)) / self.size[i] ** 2
-                power = np.mean(self.states[2:-2, i] ** 2) / max(told, _LEAST_KEPT)
+                power = np.mean(self.states[2:-2, i] ** 2) + np.median(
+                    self._variances(i, _SAMPLED))
                 self.size[i] = max(np.sqrt(power), limit)
 
     def free_all(self) -> None:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.inference.beat import METHODS
 from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.inference.beat import METHODS
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.resampling import gain
 
