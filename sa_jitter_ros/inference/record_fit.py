@@ -34,7 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import (
+    cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solveh_banded)
 from scipy.stats import gamma
 
 Array = NDArray[np.float64]
@@ -76,6 +77,7 @@ _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noi
 # errors, are, so that they are hardly shrunk; up to so many turns of the highest declared order.
 _WEAK, _MOST_TURNS = 3.0, 0.25
 _SAMPLED = 60  # variances of which the median stands for all
+_NEARBY = 12  # cycles on either side that determine a variance
 _LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
 _LEAST_KEPT = 1e-6  # of a bend by its prior, below which the vibration tells nothing of it
 _RIDGE = 1e-9
@@ -348,7 +350,7 @@ class _States:
         schur = cho_factor(corner - border.T @ inner)
         amplitudes = cho_solve(schur, below - inner.T @ down)
         change = cho_solve_banded(factor, down - border @ amplitudes) * scale
-        self.solved = factor, inner, schur, scale
+        self.solved, self.band = (factor, inner, schur, scale), band
         cos, sin = np.split(amplitudes.reshape(channels, -1), 2, axis=1)
         return change.reshape(pulses, width), cos + 1j * sin
 
@@ -384,18 +386,32 @@ class _States:
         chosen = np.arange(pulses)
         if most:
             chosen = np.unique(np.linspace(2, pulses - 3, most).astype(int))
-        row, column = width * chosen + state, np.arange(chosen.size)
-        unit = np.zeros((width * pulses, chosen.size + 1))
-        unit[row, column] = 1.0
-        unit[state::width, -1] = scale[state::width] * self.measured / self.measured.sum()
-        solved = cho_solve_banded(factor, unit)
+        row = width * chosen + state
         through = cho_solve(schur, inner[row].T)
-        variance = (solved[row, column] + np.sum(inner[row] * through.T, axis=1)) * scale[row]**2
+        variance = (self._local(row) + np.sum(inner[row] * through.T, axis=1)) * scale[row]**2
         if state:
             return np.asarray(variance)
-        mean = unit[:, -1]
-        shared = solved[:, -1] + inner @ cho_solve(schur, inner.T @ mean)
+        mean = np.zeros(width * pulses)
+        mean[::width] = scale[::width] * self.measured / self.measured.sum()
+        shared = cho_solve_banded(factor, mean) + inner @ cho_solve(schur, inner.T @ mean)
         return np.asarray(variance - 2.0 * shared[row] * scale[row] + mean @ shared)
+
+    def _local(self, rows: NDArray[np.intp]) -> Array:
+        """
+        Return diagonal elements of the inverse of the banded matrix.
+
+        The inverse decays by a factor of about four from cycle to cycle, so that the cycles nearby
+        determine them.
+        """
+        band, found = self.band, np.empty(rows.size)
+        width = len(band) - 1
+        for i, row in enumerate(rows.tolist()):
+            start = max(row - _NEARBY * width, 0)
+            part = band[:, start:row + _NEARBY * width]
+            unit = np.zeros(part.shape[1])
+            unit[row - start] = 1.0
+            found[i] = solveh_banded(part, unit, check_finite=False)[row - start]
+        return found
 
     def _estimate_sizes(self) -> None:
         """Estimate how large the states are from their values and variances."""

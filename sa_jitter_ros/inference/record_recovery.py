@@ -32,6 +32,8 @@ RESOLVED = 0.7
 _APART = 1.5  # in what a stretch resolves: lines that it keeps apart
 # Second differences that are larger than this many of their median are no motion.
 _OUTLIER = 6.0
+# RMS of second differences, in that of what the errors are wrong by, that needs no other fit.
+_SMOOTH = 1.5
 # Lines of an average within which an order is one that the shafts are known to have; amplitude, in
 # parts of the channel's strongest declared order, and number of orders that leak.
 _ON_LINE, _STRONG, _MOST = 0.1, 5e-3, 20
@@ -112,9 +114,12 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
     recovery = _joined(pulses, stretches, fits(known))
     if known is None and any(item.size for item in recovery.undeclared):
+        roughness, lags = _roughness(recovery), recovery.noise_autocovariance[:3]
+        if roughness**2 < _SMOOTH**2 * lags @ (6.0, -8.0, 2.0):
+            return recovery
         none = np.zeros(0), np.zeros(0)
         bare = _joined(pulses, stretches, fits(none))
-        if _roughness(bare) < _roughness(recovery):
+        if _roughness(bare) < roughness:
             return replace(bare, fits=recovery.fits)
     return recovery
 
