@@ -33,6 +33,7 @@ _APART = (2.0 + _COSINE) / 90.0 - (1.0 + _COSINE) / 72.0
 _SHARED = float(np.mean((1.0 - _COSINE**2) / (12.0 * _APART))
                 / np.mean((2.0 + _COSINE) / (3.0 * _APART)))
 _FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(128)  # enough for the memory of slow motions
+_MOST_KEPT = 500  # covariances at the same places
 
 
 @dataclass(frozen=True)
@@ -60,10 +61,16 @@ class SpeedFluctuation(Effect):
                       'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
         covariance = _error_covariance(model.weights, variance)
+        known: dict[tuple[object, ...], Array] = {}  # all orders ask for the same places
 
         def faded(u: Array, v: Array, lag: int) -> Array:
-            return covariance(u, v, lag) * fading(
-                lag + v - u, model.trigger_cycles, ACCELERATION_BAND)
+            key = u.shape, u.tobytes(), v.shape, v.tobytes(), lag
+            if key not in known:
+                if len(known) >= _MOST_KEPT:
+                    known.clear()
+                known[key] = covariance(u, v, lag) * fading(
+                    lag + v - u, model.trigger_cycles, ACCELERATION_BAND)
+            return known[key]
 
         return (GaussianAngleError(
             faded, slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
