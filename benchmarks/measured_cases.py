@@ -43,6 +43,7 @@ FITTED = 3300.0
 GEAR0 = {'trigger_speed': 33.33, 'trigger_cycles': 40, 'orders': [23.0, 46.0, 69.0, 92.0, 115.0]}
 _FIRST_HALF, _SECOND_HALF = (0, 1, 2), (3, 4, 5)
 _FEW, _SHOWN = 10, 120
+_TURBINE = (20130316, 20130326, 20130331, 20130405, 20130415)  # days
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,11 @@ def other_cases() -> list[Case]:
               'trigger_cycles': 10}),
         Case('small rotor', [stored('rotorbalancer_weight_5.npz', k) for k in range(10)],
              {'keyphasor_rate': 952.0, 'orders': [1.0], 'trigger_speed': 32.0,
-              'trigger_cycles': 10})]
+              'trigger_cycles': 10}),
+        *(Case(f'turbine, {day}', [stored(f'turbine_{day}.npz')],
+               {'keyphasor_rate': 3.125e6, 'pulses_per_revolution': 2,
+                'orders': [20.0, 40.0, 60.0], 'trigger_speed': 30.0, 'trigger_cycles': 10})
+          for day in _TURBINE)]
 
 
 def transferred(clock: float, period_std: float) -> tuple[Case, Case]:

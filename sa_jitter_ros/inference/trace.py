@@ -115,12 +115,16 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
 
 def _unresolved(observation: Observation) -> str:
     """Return that and why the vibration does not show the pulse errors."""
-    reason = next(item.reason for item in observation.acquisitions if item.reason)
     known = observation.stacked('standard_errors')
     known = known[np.isfinite(known)]
-    unseen = f' of less than {np.sqrt(np.mean(known**2)):.3g} s' if known.size else ''
-    return (f'no line is compared: {reason}; pulse errors{unseen} could not have been seen; '
-            'declare stronger orders, use a quieter channel or give reference_pulse_times')
+    if known.size:
+        size = float(np.sqrt(np.mean(known**2)))
+        reason = (f'the vibration shows an error of a single pulse to {size:.2g} s only; smaller '
+                  'errors could not have been seen')
+    else:
+        reason = next(item.reason for item in observation.acquisitions if item.reason)
+    return (f'no line is compared: {reason}; declare stronger orders, use a quieter channel or '
+            'give reference_pulse_times')
 
 
 def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str) -> Trace:

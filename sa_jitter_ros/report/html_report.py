@@ -108,19 +108,20 @@ def html(content: Mapping[str, Json], figures: Sequence[Illustration],
          pictures: Mapping[str, bytes]) -> str:
     """Return the page; `pictures` are the PNGs of the figures by file name."""
     verdict = content['verdict']
-    parts = [
-        '<h1>Measured against predicted attenuation</h1>',
-        f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
-        *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
+    compared = [
         *_effects(content['missing_effects']),
         '<h2>Error of held-out acquisitions</h2>', _error_table(content),
         '<h2>Dependence of the residual on other quantities</h2>',
         _dependence_table(content['dependence']),
         *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
         '<h2>Candidates</h2>', _candidate_table(content['candidates']),
-        '<h2>Lines</h2>', _line_table(content['lines']),
-        '<h2>Declared model and data</h2>', _declared_table(content)]
-    return _page(verdict, parts)
+        '<h2>Lines</h2>', _line_table(content['lines'])]
+    return _page(verdict, [
+        '<h1>Measured against predicted attenuation</h1>',
+        f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
+        *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
+        *(compared if content['lines'] else ()),
+        '<h2>Declared model and data</h2>', _declared_table(content)])
 
 
 def _json(content: Mapping[str, Json]) -> bytes:
