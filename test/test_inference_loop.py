@@ -317,10 +317,26 @@ def noise_alone(rng):
                      pulse_times=machine.pulse_times)
 
 
+def silent(recording, *channels):
+    """Return a recording some channels of which are constant."""
+    samples = recording.read().copy()
+    samples[list(channels)] = 0.3
+    return replace(recording, vibration=ArraySource(samples))
+
+
+@pytest.mark.machines
+def test_a_dead_channel_changes_nothing():
+    recording = silent(simulated(acquisitions=8), 1)
+    found = trace([observe(recording, MODEL)], [recording])
+    assert found.verdict == 'none'
+    assert set(found.lines.channel.tolist()) == {0}
+
+
 @pytest.mark.parametrize(('made', 'model', 'reason'), [
     (lambda rng: simulated(acquisitions=2), MODEL, '2 acquisitions of 20 trigger cycles'),
     (lambda rng: simulated(acquisitions=8), changed(orders=(11.3, 17.7)),
      'no declared order (11.3, 17.7) is coherent'),
+    (lambda rng: silent(simulated(acquisitions=5), 0, 1), MODEL, 'holds no declared order'),
     (noise_alone, MODEL, 'smaller errors could not have been seen')])
 def test_where_nothing_can_be_compared_the_report_says_why(made, model, reason, rng, tmp_path):
     recording = made(rng)

@@ -69,8 +69,8 @@ def channel_groups(observation: Observation) -> Array:
     """
     corrected = np.abs(observation.stacked('corrected'))
     with np.errstate(divide='ignore', invalid='ignore'):
-        told = np.nanmean(observation.sources * corrected / observation.stacked('noise'), axis=0)
-    information = np.nansum(told**2, axis=1)
+        told = observation.sources * corrected / observation.stacked('noise')
+    information = np.sum(np.where(np.isfinite(told), told, 0.0).mean(axis=0) ** 2, axis=1)
     rank = np.argsort(np.argsort(-information))
     return np.asarray(rank % min(_GROUPS, rank.size))
 

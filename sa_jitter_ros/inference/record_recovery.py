@@ -26,6 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
+_DEAD = 1e-9  # range of a channel, in its largest value, that is rounding
 _LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
@@ -141,7 +142,7 @@ def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> l
 def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
             stretch: slice, model: DeclaredModel,
             known: tuple[FloatArray, FloatArray] | None) -> RecordFit | None:
-    """Return the fit of a stretch; None where its equations have no solution."""
+    """Return the fit of a stretch by its live channels; None where none tells anything."""
     times = pulses.bridged[stretch]
     measured = np.zeros(pulses.bridged.size, np.bool_)
     measured[pulses.number[~pulses.doubtful]] = True
@@ -151,9 +152,13 @@ def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
                  _apart(known[1], (), _APART / float(np.ptp(times))))
     first = max(int((times[0] - start_time) * rate) - _EDGE, 0)
     last = int((times[-1] - start_time) * rate) + _EDGE
+    part = samples[first:last + 1]
+    part = part[:, np.ptp(part, axis=0) > _DEAD * np.abs(part).max(axis=0)]
+    if not part.size:
+        return None
     try:
         return fit_record(
-            samples[first:last + 1], rate, start_time + first / rate, times,
+            part, rate, start_time + first / rate, times,
             measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
             jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER),
             known=known)
