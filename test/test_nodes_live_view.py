@@ -22,6 +22,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from urllib.parse import unquote
 
 from bench import NodeBench, SteadyClock
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -175,7 +176,8 @@ def test_snapshot_holds_what_was_published(bench):
     assert set(parts) == {
         'settings', 'shaft/synchronous_average', 'shaft/standard_error',
         'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
-        'shaft/condition_indicator', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
+        'shaft/condition_indicator', 'shaft/indicator_trend', 'shaft/raw_trend',
+        'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
         '/diagnostics'}
     assert parts['settings'] == {'shafts': ['shaft'], 'vibration_unit': 'g',
                                  'channel_names': ['casing', 'shaft end']}
@@ -183,6 +185,13 @@ def test_snapshot_holds_what_was_published(bench):
     for kind, factor in (('synchronous_average', 1.0), ('corrected_average', 1.1)):
         np.testing.assert_allclose(parts[f'shaft/{kind}']['channels'], factor * raw, atol=2e-5)
         assert parts[f'shaft/{kind}']['points'] == 512
+        found = np.array(parts[f'shaft/{kind}']['amplitude'])
+        assert found.shape == (2, 255)
+        np.testing.assert_allclose(found[[0, 1], [18, 37]], [factor, 0.5 * factor], rtol=1e-3)
+        assert np.delete(found[0], 18).max() < 1e-12
+        np.testing.assert_allclose(
+            parts[f'shaft/{kind}']['phase'][0][18], -np.pi / 2.0, atol=1e-3)
+    assert 'amplitude' not in parts['shaft/standard_error']
     assert parts['shaft/standard_error']['channels'] == [[0.05] * 512] * 2
     assert parts['shaft/condition_indicator'] == {
         'header': vars(header()), 'names': ['rms', 'fm0'],
@@ -201,6 +210,46 @@ def test_snapshot_holds_what_was_published(bench):
     assert (node['level'], node['message']) == (1, 'pulses_dropped increased')
     assert node['values'] == {'pulses_dropped': '321'}
     assert news['silence'] >= 0.0
+
+
+def test_trends_grow_and_begin_anew_where_time_runs_back(bench):
+    b, table = bench(), amplitudes()
+    for number in range(3):
+        b.send('shaft/order_amplitude', average(
+            'order_amplitude', table * [1.0, *[1.0 + number] * 7], messages.AMPLITUDE_FIELDS,
+            sequence=number))
+    b.settle()
+    trend = b.part('shaft/corrected_trend')
+    assert trend['time'] == [2.0, 12.0, 22.0]
+    assert (trend['averages'], trend['names']) == (3, ['19', '38', '57'])
+    first = dict(zip(messages.AMPLITUDE_FIELDS, np.moveaxis(table, -1, 0)))
+    np.testing.assert_allclose(trend['value'], np.multiply.outer(
+        [1.0, 2.0, 3.0], first['corrected_amplitude']), rtol=1e-4)
+    np.testing.assert_allclose(trend['error'][2], 3.0 * first['noise_standard_deviation'],
+                               rtol=1e-2)
+    b.send('shaft/order_amplitude', average(
+        'order_amplitude', table, messages.AMPLITUDE_FIELDS, sequence=0))
+    b.settle()
+    assert len(b.part('shaft/raw_trend')['time']) == 1
+
+
+def test_a_long_trend_is_bounded_in_memory_and_on_the_line():
+    trend, values = board.Trend(), np.ones((4, 50))
+    for number in range(board.TREND_AVERAGES):
+        content = trend.add(float(number), ('a',) * 50, values, values)
+    assert content()['averages'] == board.TREND_NUMBERS // (2 * values.size)
+    shown = content()
+    assert len(shown['value']) * 2 * values.size <= board.TREND_SENT
+    assert shown['time'][-1] == board.TREND_AVERAGES - 1.0
+
+
+def test_each_shaft_has_its_prediction_and_residual(bench):
+    b = bench(shafts=['input', 'output'])
+    b.graph.publisher('output/prediction', Float64MultiArray, qos=LATCHED_QOS)
+    b.graph.publish('output/prediction', prediction())
+    b.settle()
+    assert b.part('output/prediction')['ratio'] == 2.4
+    assert 'prediction' not in b.snapshot()['parts']
 
 
 def test_only_changes_since_a_version_are_served(bench):
@@ -467,20 +516,27 @@ BROWSER = next(filter(None, map(shutil.which, (
 FLAGS = (
     '--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run',
     '--disable-background-networking', '--disable-component-update', '--disable-sync',
-    '--window-size=1300,2000', '--virtual-time-budget=2500')
+    '--window-size=1300,2000')
+DUMP = ('--dump-dom', '--virtual-time-budget=2500')
 
 
-def shown(b, *flags):
-    """Return the page's document after two seconds in a browser; the node is served meanwhile."""
+def shown(b, *flags, page='', until=None):
+    """
+    Return the page's document after two seconds in a browser; the node is served meanwhile.
+
+    With `until` the browser stays open until that is true, and there is no document.
+    """
     if BROWSER is None:
         pytest.skip('no chromium: apt install chromium')
-    with tempfile.TemporaryDirectory() as profile, tempfile.TemporaryFile() as output:
+    mode = [*DUMP, *flags] if until is None else ['--remote-debugging-port=0']
+    with (tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile,
+          tempfile.TemporaryFile() as output):
         process = subprocess.Popen(
-            [BROWSER, *FLAGS, f'--user-data-dir={profile}', '--dump-dom', *flags,
-             f'http://127.0.0.1:{b.port}/'], stdout=output, stderr=subprocess.DEVNULL,
+            [BROWSER, *FLAGS, f'--user-data-dir={profile}', *mode,
+             f'http://127.0.0.1:{b.port}/{page}'], stdout=output, stderr=subprocess.DEVNULL,
             env={**os.environ, 'DBUS_SESSION_BUS_ADDRESS': 'disabled:'})
         try:
-            assert b.spin(lambda: process.poll() is not None, timeout=600.0)
+            assert b.spin(until or (lambda: process.poll() is not None), timeout=600.0)
         finally:
             process.kill()
             process.wait()
@@ -513,19 +569,96 @@ def test_the_browser_shows_the_numbers(bench):
     assert ' '.join(row) in ' '.join(rows)
     assert 'raw [g]' in text_of(page, 'orders')
     assert text_of(page, 'indicators').split() == [
-        'channel', 'rms', 'fm0', 'casing', '0.7071', '–', '&lt;b&gt;end&lt;/b&gt;', '0.3536',
-        '1.523']
+        'channel', 'rms', '[g]', 'fm0', 'casing', '0.7071', '–', '&lt;b&gt;end&lt;/b&gt;',
+        '0.3536', '1.523']
     assert page.count('class="spread" d="M') == 2
     assert 'excess_jitter (std = 19.3 ± 0.4 µs)' in text_of(page, 'effects')
     assert 'not distinguishable from phase_wander' in text_of(page, 'effects')
     assert re.search(r'rig/averager\s+WARN\s+pulses_dropped increased\s+pulses_dropped 321',
                      text_of(page, 'nodes'))
-    assert page.count('class="curve raw"') == page.count('class="curve corrected"') - 1 == 2
+    # waveforms of two channels, spectrum, average over the circle; the speed has a curve, too
+    assert page.count('class="curve raw"') == page.count('class="curve corrected"') - 1 == 4
+    assert text_of(page, 'spectrum-note') == 'point at an order, or click to keep it'
+    assert text_of(page, 'attention').strip() == 'rig/averager: pulses_dropped increased'
+    assert 'order 19, casing' in page  # the trend
     assert page.count('class="mark measured"') == 6  # attenuations and residuals of 3 orders
-    assert page.count('class="mark corrected"') == 3 + 31 + 1
+    assert page.count('class="mark corrected"') == 3 + 31 + 1 + 1
     assert page.count('<rect class="band"') == 3 + 1
     assert '&lt;b&gt;end' in page
     assert '<b>end' not in page
+
+
+# Keeps a cursor, saves what a chart shows, and tells the server what it found.
+TEST_PAGE = """<!DOCTYPE html><html><head><link rel="stylesheet" href="style.css">
+<script type="module" src="test.js"></script></head><body><section><div id="box"></div></section>
+</body></html>"""
+TEST_SCRIPT = """
+import {Chart, linear} from './charts.js';
+import {addButtons, csv} from './export.js';
+const found = {csv: csv({columns: ['a', 'b "c", d'], rows: [[1.5, null], [2, 'x']]}), seen: []};
+const make = URL.createObjectURL;
+let saved;
+const blob = type => new Promise(done => { saved = blob => blob.type === type && done(blob); });
+URL.createObjectURL = blob => { saved(blob); return make(blob); };
+HTMLAnchorElement.prototype.click = function() { found.name = this.download; };
+const box = document.getElementById('box');
+const chart = new Chart(box, 200, () => {
+  chart.axes({x: linear([0, 10]), y: linear([0, 1]), xLabel: 'x', yLabel: 'y'});
+  chart.curve('raw', i => i, [0, 1, 0, 1]);
+  chart.follow(position => { found.seen.push(position); });
+});
+addButtons(box, () => ({columns: ['x'], rows: [[1]]}), () => 'file');
+const wait = time => new Promise(done => setTimeout(done, time));
+await wait(200);
+const place = chart.svg.getBoundingClientRect();
+const event = (kind, x) => new MouseEvent(kind, {clientX: place.left + 62 + x * chart.inner});
+chart.svg.onclick(event('click', 0.5));
+chart.render();  // new data
+chart.svg.onpointermove(event('pointermove', 0.75));
+found.kept = chart.svg.querySelector('.cursor.kept')?.getAttribute('visibility');
+const [first, second] = document.querySelectorAll('.save button');
+const text = blob('text/csv');
+first.onclick();
+found.text = await (await text).text();
+const image = blob('image/png');
+second.onclick();
+const picture = await createImageBitmap(await image);
+found.size = [picture.width, picture.height, 2 * chart.svg.clientWidth];
+const canvas = document.createElement('canvas').getContext('2d');
+canvas.canvas.width = picture.width;
+canvas.canvas.height = picture.height;
+canvas.drawImage(picture, 0, 0);
+const pixels = canvas.getImageData(0, 0, picture.width, picture.height).data;
+found.red = false;
+for (let i = 0; i < pixels.length; i += 4) {
+  if (pixels[i] > 180 && pixels[i + 1] < 100 && pixels[i + 2] < 80) found.red = true;
+}
+fetch(`found?${encodeURIComponent(JSON.stringify(found))}`);
+"""
+
+
+def test_charts_keep_a_cursor_and_are_saved_as_csv_and_png(bench, monkeypatch, tmp_path):
+    pages = tmp_path / 'live_view_page'
+    shutil.copytree(server.files('sa_jitter_ros.nodes').joinpath('live_view_page'), pages)
+    (pages / 'test.html').write_text(TEST_PAGE)
+    (pages / 'test.js').write_text(TEST_SCRIPT)
+    monkeypatch.setattr(server, 'files', lambda package: tmp_path)
+    told, get = [], server._Handler.do_GET
+
+    def listen(handler):
+        told.extend(re.findall(r'^/found[?](.*)', handler.path))
+        get(handler)
+
+    monkeypatch.setattr(server._Handler, 'do_GET', listen)
+    shown(bench(), page='test.html', until=lambda: told)
+    found = json.loads(unquote(told[0]))
+    assert found['csv'] == 'a,"b ""c"", d"\n1.5,\n2,x\n'
+    assert found['kept'] == 'visible'
+    # clicked, drawn again, pointed elsewhere
+    np.testing.assert_allclose(found['seen'][-3:], 0.5, atol=2e-3)
+    assert (found['name'], found['text']) == ('file.png', 'x\n1\n')
+    assert found['size'][:2] == [found['size'][2], 400]
+    assert found['red']
 
 
 def test_malformed_report_does_not_disturb_the_page(bench):

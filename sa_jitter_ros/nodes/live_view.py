@@ -23,8 +23,8 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.live_view_board import (
-    Attenuations, Board, CHANNELS, indicators_content, ORDERS, orders_content, PulseErrors,
-    pulses_content, SPEEDS, table_content, waveform_content)
+    amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, ORDERS,
+    orders_content, PulseErrors, pulses_content, SPEEDS, table_content, Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
@@ -72,9 +72,13 @@ class LiveView(MonitoringNode):
             'average', f'{values["shafts"][0]}/order_amplitude',
             'has it vibration and pulses? (see its status)')
         self._prediction_flow = self.health.add(Flow('prediction', 'prediction', judged=False))
-        self.create_input(Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS)
-        self.create_input(Float64MultiArray, 'residual', self._on_residual, RESULT_QOS)
-        self.create_input(String, 'missing_effect', self._on_missing_effect, LATCHED_QOS)
+        # Several shafts have a prediction each, and an analyser each if their topics are remapped.
+        for prefix in ('', *(f'{shaft}/' for shaft in values['shafts'])):
+            for kind, topic, callback, qos in (
+                    (Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS),
+                    (Float64MultiArray, 'residual', self._on_residual, RESULT_QOS),
+                    (String, 'missing_effect', self._on_missing_effect, LATCHED_QOS)):
+                self.create_input(kind, prefix + topic, partial(callback, prefix + topic), qos)
         self.create_input(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
         self.create_input(DiagnosticArray, '/diagnostics', self._on_diagnostics, RESULT_QOS,
                           most_publishers=0)
@@ -99,15 +103,22 @@ class LiveView(MonitoringNode):
 
     def _watch_shaft(self, shaft: str) -> None:
         """Subscribe to the results of one shaft."""
-        errors, attenuations = PulseErrors(), Attenuations()
+        errors, attenuations, indicators = PulseErrors(), Attenuations(), Trend()
+        amplitudes = {'raw': Trend(), 'corrected': Trend()}
 
         def on_waveform(kind: str, message: Float64MultiArray) -> None:
             average = decode_average(kind, message)
-            self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
+            self._board.put(f'{shaft}/{kind}', partial(
+                waveform_content, average, with_spectrum=kind != 'standard_error'))
 
         def on_indicators(message: Float64MultiArray) -> None:
             average = decode_average('condition_indicator', message)
             self._board.put(f'{shaft}/condition_indicator', partial(indicators_content, average))
+            values = average.values[:CHANNELS, :INDICATORS]
+            if average.names:
+                self._board.put(f'{shaft}/indicator_trend', indicators.add(
+                    average.header.end_time, average.names[:INDICATORS], values,
+                    values * math.nan))
 
         def on_orders(message: Float64MultiArray) -> None:
             average = decode_average('order_amplitude', message)
@@ -117,6 +128,10 @@ class LiveView(MonitoringNode):
             shown = average.values[:CHANNELS, :ORDERS]
             history = attenuations.add(shown[..., 0], shown[..., 5])
             self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))
+            for kind, trend in amplitudes.items() if len(shown) else ():
+                self._board.put(f'{shaft}/{kind}_trend', trend.add(
+                    average.header.end_time, tuple(f'{order:.6g}' for order in shown[0, :, 0]),
+                    *amplitude_rows(shown, average.names, kind)))
 
         def on_pulses(message: Float64MultiArray) -> None:
             average = decode_average('pulse_error', message)
@@ -131,19 +146,18 @@ class LiveView(MonitoringNode):
         for kind, callback in callbacks.items():
             self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
 
-    def _on_prediction(self, message: Float64MultiArray) -> None:
+    def _on_prediction(self, topic: str, message: Float64MultiArray) -> None:
         prediction = decode_prediction(message)
         self._prediction_flow.came()
         if not self._average_flow.allowance and prediction.trigger_speed > 0.0:
             self._average_flow.allowance = prediction.trigger_cycles / prediction.trigger_speed
-        self._board.put('prediction', partial(table_content, prediction, PREDICTION_FIELDS),
-                        data=False)
+        self._board.put(topic, partial(table_content, prediction, PREDICTION_FIELDS), data=False)
 
-    def _on_residual(self, message: Float64MultiArray) -> None:
+    def _on_residual(self, topic: str, message: Float64MultiArray) -> None:
         residual = decode_residual(message)
-        self._board.put('residual', partial(table_content, residual, RESIDUAL_FIELDS))
+        self._board.put(topic, partial(table_content, residual, RESIDUAL_FIELDS))
 
-    def _on_missing_effect(self, message: String) -> None:
+    def _on_missing_effect(self, topic: str, message: String) -> None:
         if len(message.data) > LARGEST_REPORT:
             raise MessageError(f'{len(message.data)} characters: send at most {LARGEST_REPORT}')
         try:
@@ -153,7 +167,7 @@ class LiveView(MonitoringNode):
             raise MessageError(f'the text is no JSON: {error}') from None
         if not isinstance(report, dict):
             raise MessageError(f'the text is a JSON {type(report).__name__}: send an object')
-        self._board.put('missing_effect', lambda: report, data=False)
+        self._board.put(topic, lambda: report, data=False)
 
     def _on_speed(self, message: Float64) -> None:
         if not math.isfinite(message.data):

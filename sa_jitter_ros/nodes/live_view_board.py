@@ -38,6 +38,9 @@ CURVE_POINTS, ALL_POINTS = 1200, 16000  # points of one waveform, and of all cha
 HISTORY, HISTORY_NUMBERS = 30, 20000  # earlier averages, and attenuations in all of them
 PULSES = 1000
 SPEEDS = 200
+SPECTRUM_ORDERS, ALL_SPECTRUM = 2000, 32000  # orders of one spectrum, and of all channels
+TREND_NUMBERS, TREND_AVERAGES = 400_000, 2000  # numbers that are kept, and averages
+TREND_SENT = 12_000  # numbers of one trend that are sent: of every n-th average
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,54 @@ class Attenuations:
         return list(self._values)
 
 
+class Trend:
+    """
+    What the latest averages of one shaft found: rows (channel, name) with standard errors.
+
+    Other names or channels, and times that run back, start a new trend.
+    """
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._shape: tuple[int, ...] = ()
+        self._rows: deque[tuple[float, FloatArray, FloatArray]] = deque()
+
+    def add(self, time: float, names: tuple[str, ...], values: FloatArray, errors: FloatArray
+            ) -> Callable[[], Json]:
+        """Add values and errors (channel, name) of an average that ended at `time` (s)."""
+        back = bool(self._rows) and time < self._rows[-1][0]
+        if back or (names, values.shape) != (self._names, self._shape):
+            self._names, self._shape = names, values.shape
+            self._rows = deque(maxlen=int(np.clip(
+                TREND_NUMBERS // max(2 * values.size, 1), 1, TREND_AVERAGES)))
+        self._rows.append((time, values, errors))
+        rows = list(self._rows)  # a thread may be sending while the next average comes
+        return lambda: trend_content(names, rows)
+
+
+def trend_content(names: tuple[str, ...], rows: list[tuple[float, FloatArray, FloatArray]]
+                  ) -> Json:
+    """Return a trend: names, times, values and errors (average, channel, name)."""
+    step = -(-2 * rows[0][1].size * len(rows) // TREND_SENT)
+    shown = rows[::-1][::step][::-1]
+    return {'names': names, 'averages': len(rows), 'time': json_values(
+                np.array([time for time, _, _ in shown])),
+            'value': [json_values(significant(values)) for _, values, _ in shown],
+            'error': [json_values(significant(errors, 3)) for _, _, errors in shown]}
+
+
+def significant(values: FloatArray, digits: int = 5) -> FloatArray:
+    """
+    Return each value rounded to significant digits, for short texts.
+
+    >>> significant(np.array([123456.0, 0.00123456, 0.0, np.nan]), 3).tolist()
+    [123000.0, 0.00123, 0.0, nan]
+    """
+    size = np.where(np.isfinite(values) & (np.abs(values) > 1e-300), np.abs(values), 1.0)
+    scale = 10.0 ** (digits - 1 - np.floor(np.log10(size)))
+    return np.asarray(np.round(values * scale) / scale)
+
+
 def header_content(message: Any) -> dict[str, Json]:
     """Return the numbers of a dataclass by name."""
     return {name: json_values(value) for name, value in asdict(message).items()
@@ -142,12 +193,35 @@ def rounded(values: FloatArray) -> FloatArray:
     return np.round(values, min(5 - math.floor(math.log10(peak)), 300)) if peak > 0.0 else values
 
 
-def waveform_content(average: AverageMessage) -> Json:
-    """Return a waveform: header, points per revolution, curves by channel."""
+def waveform_content(average: AverageMessage, *, with_spectrum: bool = True) -> Json:
+    """Return a waveform: header, points per revolution, curves and spectra by channel."""
     shown = average.values[:CHANNELS]
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
-    return {'header': header_content(average.header), 'points': average.values.shape[1],
-            'channels': json_values(rounded(envelope(shown, points)))}
+    content = {'header': header_content(average.header), 'points': average.values.shape[1],
+               'channels': json_values(rounded(envelope(shown, points)))}
+    if with_spectrum:
+        amplitudes, phases = spectrum(shown)
+        content.update(amplitude=json_values(significant(amplitudes, 4)),
+                       phase=json_values(np.round(phases, 3)))
+    return content
+
+
+def spectrum(waveforms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """
+    Return peak amplitudes and phases (rad) of orders 1, 2, ... of waveforms (channel, angle).
+
+    A cosine of amplitude a has amplitude a and phase 0. The highest order is below half the number
+    of angles.
+
+    >>> angle = np.arange(16) / 16
+    >>> amplitudes, phases = spectrum(3.0 * np.cos(2.0 * np.pi * (2.0 * angle + 0.125))[None])
+    >>> amplitudes.round(6)[0, :3].tolist(), float(np.round(phases[0, 1] / np.pi, 6))
+    ([0.0, 3.0, 0.0], 0.25)
+    """
+    points = waveforms.shape[1]
+    most = min((points - 1) // 2, SPECTRUM_ORDERS, ALL_SPECTRUM // max(len(waveforms), 1))
+    lines = 2.0 / max(points, 1) * np.fft.rfft(waveforms, axis=1)[:, 1:most + 1]
+    return np.abs(lines), np.angle(lines)
 
 
 def indicators_content(average: AverageMessage) -> Json:
@@ -164,6 +238,15 @@ def orders_content(average: AverageMessage, history: list[FloatArray]) -> Json:
     return {'header': header_content(average.header),
             'history': [json_values(item) for item in history],
             **{name: json_values(shown[..., i]) for i, name in enumerate(average.names)}}
+
+
+def amplitude_rows(shown: FloatArray, names: tuple[str, ...], kind: str
+                   ) -> tuple[FloatArray, FloatArray]:
+    """Return `raw` or `corrected` amplitudes (channel, order) and the errors that are known."""
+    fields = dict(zip(names, np.moveaxis(shown, -1, 0)))
+    values = fields[f'{kind}_amplitude']
+    noise = fields['noise_standard_deviation'] if kind == 'corrected' else values * np.nan
+    return values, fields.get(f'{kind}_standard_error', noise)
 
 
 def pulses_content(average: AverageMessage, values: FloatArray) -> Json:

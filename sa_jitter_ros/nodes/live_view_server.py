@@ -40,7 +40,8 @@ ANSWER_SECONDS = 60.0  # for the answer to leave, which a slow line carries
 KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
 HEADERS = {
     'Cache-Control': 'no-store',
-    'Content-Security-Policy': "default-src 'self'; frame-ancestors 'none'",
+    'Content-Security-Policy': "default-src 'self'; frame-ancestors 'none'; "
+                               "img-src 'self' blob: data:",  # charts become pictures
     'Cross-Origin-Resource-Policy': 'same-origin',
     'Referrer-Policy': 'no-referrer',
     'X-Content-Type-Options': 'nosniff',

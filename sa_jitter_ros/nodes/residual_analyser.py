@@ -296,9 +296,10 @@ class ResidualAnalyser(MonitoringNode):
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the number of averages in the batch and the last verdict."""
         count, size = len(self._batch.averages), self._batch.size
-        values = {'averages': str(count), 'batches': str(self._batches), 'verdict': self._verdict,
-                  'uncorrected': str(self._uncorrected), 'effects_set': ', '.join(sorted(
-                      self._added))}
+        values = {'shaft': self._values['shaft'], 'averages': str(count),
+                  'batches': str(self._batches), 'verdict': self._verdict,
+                  'uncorrected': str(self._uncorrected),
+                  'effects_set': ', '.join(sorted(self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
         if not (count or self._batches or self._uncorrected):

@@ -62,7 +62,8 @@ export function logarithmic(values) {
       if (place >= low && place <= high) ticks.push([value, format(value, 1)]);
     }
   }
-  return {at: value => value > 0 ? (Math.log10(value) - low) / (high - low) : -1, ticks};
+  return {at: value => value > 0 ? (Math.log10(value) - low) / (high - low) : -1,
+          ticks: ticks.length > 2 ? ticks : linear([10 ** low, 10 ** high], 4).ticks};
 }
 
 // Places 0, 1, ... with labels, thinned out where they would touch.
@@ -96,7 +97,8 @@ export class Chart {
     this.svg = make('svg', {viewBox: `0 0 ${this.width} ${this.height}`, height: this.height,
                             role: 'img', 'aria-label': `${title} ${yLabel} over ${xLabel}`});
     this.x = value => left + x.at(value) * this.inner;
-    this.y = value => bottom - Math.min(Math.max(y.at(value), -0.02), 1.02) * (bottom - top);
+    this.y = value => bottom - Math.min(Math.max(y.at(value), known(value) && value > -Infinity
+      ? -0.02 : 0), 1.02) * (bottom - top);
     for (const [value, label] of y.ticks) {
       const place = this.y(value);
       this.add('line', {class: 'grid', x1: left, x2: left + this.inner, y1: place, y2: place});
@@ -109,8 +111,10 @@ export class Chart {
     }
     this.add('text', {x: left + this.inner / 2, y: this.height - 6, 'text-anchor': 'middle'},
              xLabel);
-    this.add('text', {transform: `translate(12 ${(top + bottom) / 2}) rotate(-90)`,
-                      'text-anchor': 'middle'}, yLabel);
+    if (yLabel) {
+      this.add('text', {transform: `translate(12 ${(top + bottom) / 2}) rotate(-90)`,
+                        'text-anchor': 'middle'}, yLabel);
+    }
     if (title) this.add('text', {class: 'title', x: left, y: top - 9}, title);
     this.container.replaceChildren(this.svg);
   }
@@ -129,6 +133,42 @@ export class Chart {
       pen = 'L';
     });
     this.add('path', {class: `curve ${style}`, d: path});
+  }
+
+  // Vertical lines from the axis to the values.
+  stems(style, xs, ys) {
+    const foot = this.y(-Infinity);
+    this.add('path', {class: `curve ${style}`, d: ys.map((value, i) => known(value) && value > 0
+      ? `M${this.x(xs(i)).toFixed(1)} ${foot.toFixed(1)}V${this.y(value).toFixed(1)}` : '').join('')});
+  }
+
+  // The circles of a polar chart: zero, and `peak` outside.
+  circle({peak, label, title}) {
+    const size = Math.min(this.width, this.height) / 2 - 22;
+    this.svg = make('svg', {viewBox: `0 0 ${this.width} ${this.height}`, height: this.height,
+                            role: 'img', 'aria-label': `${title} over the circle`});
+    this.polar = (part, value) => {
+      const radius = size * (0.6 + 0.4 * value / peak), angle = 2 * Math.PI * part;
+      return `${(this.width / 2 + radius * Math.sin(angle)).toFixed(1)} `
+        + `${(this.height / 2 + 6 - radius * Math.cos(angle)).toFixed(1)}`;
+    };
+    for (const [style, part] of [['grid', 0.2], ['zero', 0.6], ['grid', 1]]) {
+      this.add('circle', {class: `ring ${style}`, cx: this.width / 2, cy: this.height / 2 + 6,
+                          r: size * part});
+    }
+    for (const [part, text] of [[0, '0°'], [0.25, '90°'], [0.5, '180°'], [0.75, '270°']]) {
+      const [x, y] = this.polar(part, 1.22 * peak).split(' ').map(Number);
+      this.add('text', {x, y: y + 4, 'text-anchor': 'middle'}, text);
+    }
+    this.add('text', {class: 'title', x: 4, y: 14}, title);
+    this.add('text', {x: 4, y: this.height - 4}, `zero and ± ${label}`);
+    this.container.replaceChildren(this.svg);
+  }
+
+  around(style, values, peak) {
+    const points = values.flatMap((value, i) => known(value)
+      ? [this.polar(i / values.length, value)] : []);
+    this.add('path', {class: `curve ${style}`, d: `M${points.join('L')}Z`});
   }
 
   // Area between two curves over the same places; nothing where one is unknown.
@@ -176,24 +216,30 @@ export class Chart {
     }
   }
 
-  // Calls `changed(position from 0 to 1, or null)` as the pointer moves, and shows where it is.
+  // Calls `changed(position from 0 to 1, or null)` as the pointer moves, and shows where it is: at
+  // the position that `changed` returns, if it returns one. A click keeps the cursor, also while
+  // new data come; the next click releases it.
   follow(changed) {
     const cursor = make('line', {class: 'cursor', y1: MARGIN.top,
                                  y2: this.height - MARGIN.bottom});
     const show = () => {
-      const position = known(this.pointer) ? (this.pointer - MARGIN.left) / this.inner : -1;
-      const inside = position >= 0 && position <= 1;
+      const wanted = this.kept ?? this.pointer ?? -1;
+      const inside = wanted >= 0 && wanted <= 1;
+      const place = MARGIN.left + this.inner * (changed(inside ? wanted : null) ?? wanted);
       cursor.setAttribute('visibility', inside ? 'visible' : 'hidden');
-      cursor.setAttribute('x1', inside ? this.pointer : 0);
-      cursor.setAttribute('x2', inside ? this.pointer : 0);
-      changed(inside ? position : null);
+      cursor.setAttribute('class', `cursor ${known(this.kept) ? 'kept' : ''}`);
+      cursor.setAttribute('x1', inside ? place : 0);
+      cursor.setAttribute('x2', inside ? place : 0);
     };
+    const position = event => (event.clientX - this.svg.getBoundingClientRect().left
+                               - MARGIN.left) / this.inner;
     this.svg.append(cursor);
-    this.svg.onpointermove = event => {
-      this.pointer = event.clientX - this.svg.getBoundingClientRect().left;
+    this.svg.onpointermove = event => { this.pointer = position(event); show(); };
+    this.svg.onpointerleave = () => { this.pointer = null; show(); };
+    this.svg.onclick = event => {
+      this.kept = known(this.kept) ? null : position(event);
       show();
     };
-    this.svg.onpointerleave = () => { this.pointer = null; show(); };
     show();
   }
 }

@@ -1,56 +1,72 @@
 // The charts of the page.
 
 import {Chart, format, known, linear, logarithmic, places, range} from './charts.js';
-import {channel, channelName, find, finite, ofShaft, orderRows, part, predicted, timeUnit, unit,
-        withTimeUnit} from './model.js';
+import {analysed, channel, channelName, find, finite, ofShaft, orderRows, part, predicted,
+        prediction, refusal, timeUnit, unit, withTimeUnit} from './model.js';
 
-const CURVES = 6;  // channels whose waveform is shown at once
+const FEW = 6;  // channels that have the full width and height
 
 const waveformCharts = [];
 
 export function drawWaveforms() {
   const raw = ofShaft('synchronous_average'), box = find('waveforms');
-  const count = raw ? Math.min(CURVES, raw.channels.length) : 1;
+  const count = raw ? raw.channels.length : 1;
+  box.className = count > FEW ? 'many' : '';
   while (waveformCharts.length > count) { waveformCharts.pop(); box.lastChild.remove(); }
   while (waveformCharts.length < count) {
     const place = waveformCharts.length;
     const div = box.appendChild(document.createElement('div'));
-    waveformCharts.push(new Chart(div, 190, chart => drawWaveform(chart, place)));
+    waveformCharts.push(new Chart(div, 0, chart => drawWaveform(chart, place)));
   }
-  waveformCharts.forEach(chart => chart.render());
+  for (const chart of waveformCharts) {
+    chart.height = count > FEW ? 130 : 170;
+    chart.render();
+  }
+  find('waveform-axes').textContent = raw ? `vibration [${unit()}] over the angle of `
+    + `${find('shaft').value} [degrees]` : '';
 }
 
 function drawWaveform(chart, place) {
   const raw = ofShaft('synchronous_average'), corrected = ofShaft('corrected_average');
   if (!raw) { chart.empty('no synchronous average received yet'); return; }
-  const first = Math.max(0, Math.min(channel(), raw.channels.length - CURVES));
-  const shown = raw.channels.length > CURVES ? first + place : place;
   // The corrected average arrives after the raw one: until then the one before is shown.
   const fresh = corrected && Math.abs(raw.header.sequence - corrected.header.sequence) < 2;
-  const spread = standardError(raw)?.channels[shown];
-  const limits = [-2, 2].map(factor => raw.channels[shown].map((value, i) =>
+  const spread = standardError(raw)?.channels[place];
+  const limits = [-2, 2].map(factor => raw.channels[place].map((value, i) =>
     known(value) && known(spread?.[i]) ? value + factor * spread[i] : null));
-  const curves = [['raw', raw.channels[shown]],
-                  ['corrected', fresh ? corrected.channels[shown] : null]]
+  const curves = [['raw', raw.channels[place]],
+                  ['corrected', fresh ? corrected.channels[place] : null]]
     .filter(([, values]) => values);
-  const x = linear([0, 360]);
-  x.ticks = [0, 45, 90, 135, 180, 225, 270, 315, 360].map(value => [value, `${value}`]);
+  const x = linear([0, 360]), step = chart.inner > 500 ? 45 : 90;
+  x.ticks = Array.from({length: 360 / step + 1}, (_, i) => [i * step, `${i * step}`]);
   chart.axes({
     x, y: linear(range([...limits.flat(), ...curves.flatMap(([, values]) => values)]), 4),
-    title: channelName(shown), xLabel: `angle of ${find('shaft').value} [degrees]`,
-    yLabel: `[${unit()}]`});
+    title: channelName(place), xLabel: '', yLabel: ''});
   chart.between('spread', i => 360 * i / limits[0].length, ...limits);
   for (const [style, values] of curves) {
     chart.curve(style, i => 360 * i / values.length, values);
   }
-  const note = waveformNote(raw, fresh);
+  const note = fresh ? '' : `no corrected average${refusal() ? `: ${refusal()}` : ''}`;
   chart.follow(position => {
     find('waveform-note').textContent = position === null ? note
-      : `${channelName(shown)} at ${(360 * position).toFixed(1)}°: ` + [
+      : `${channelName(place)} at ${(360 * position).toFixed(1)}°: ` + [
         ...curves, ...(spread ? [['standard error', spread]] : [])].map(
         ([style, values]) => `${style} ` + format(
-          values[Math.min(Math.round(position * values.length), values.length - 1)])).join(', ');
+          values[Math.min(Math.round(position * values.length), values.length - 1)])).join(', ')
+        + ` ${unit()}`;
   });
+}
+
+export function waveformTable() {
+  const raw = ofShaft('synchronous_average'), corrected = ofShaft('corrected_average');
+  if (!raw) return null;
+  const curves = raw.channels.flatMap((values, i) => [
+    [`raw ${channelName(i)} [${unit()}]`, values],
+    ...(corrected?.channels[i] ? [[`corrected ${channelName(i)} [${unit()}]`,
+                                   corrected.channels[i]]] : [])]);
+  return {columns: [`angle of ${find('shaft').value} [degrees]`, ...curves.map(([name]) => name)],
+          rows: raw.channels[0].map((_, i) => [360 * i / raw.channels[0].length,
+                                               ...curves.map(([, values]) => values[i])])};
 }
 
 // The standard error of this average, null where it is not published.
@@ -58,12 +74,6 @@ function standardError(raw) {
   const error = ofShaft('standard_error');
   return error?.header.sequence === raw.header.sequence && error.points === raw.points
     ? error : null;
-}
-
-function waveformNote(raw, fresh) {
-  const all = raw.channels.length;
-  return (fresh ? '' : 'no corrected average ') + (all > CURVES
-    ? `${CURVES} of ${all} channels, from the chosen one on` : '');
 }
 
 function orderAxis(chart, rows) {
@@ -91,14 +101,15 @@ export function drawAttenuation(chart) {
   const rows = orderRows(), {note} = predicted();
   const measured = rows.some(row => known(row.attenuation));
   if (!measured && !rows.some(row => row.predicted)) {
-    chart.empty(rows.length ? `no attenuation measured; ${note}` : 'nothing received yet');
+    chart.empty(rows.length ? `no attenuation measured; ${refusal() || note}`
+      : 'nothing received yet');
     return;
   }
   const values = rows.flatMap(row => [row.attenuation, ...row.past, row.predicted?.low,
                                       row.predicted?.high]);
   chart.axes({
     x: orderAxis(chart, rows), xLabel: `order of ${find('shaft').value}`,
-    y: linear(range(values, {include: [1]})), yLabel: 'attenuation (1: no loss)',
+    y: linear(range(values, {include: [1]})), yLabel: 'attenuation [1]',
     title: note || channelName(channel())});
   chart.level('zero', 1);
   rows.forEach((row, i) => {
@@ -120,8 +131,11 @@ export function drawAttenuation(chart) {
 
 export function drawErrors(chart) {
   const pulses = ofShaft('pulse_error');
-  if (!pulses) { chart.empty('no pulse errors recovered yet (correct_jitter)'); return; }
-  const declared = part('prediction')?.pulse_error_standard_deviation;
+  if (!pulses) {
+    chart.empty(refusal() || 'no pulse errors recovered yet (correct_jitter)');
+    return;
+  }
+  const declared = prediction()?.pulse_error_standard_deviation;
   const bars = pulses.error.flatMap((error, i) => known(error)
     ? [error - (pulses.standard_error[i] ?? 0), error + (pulses.standard_error[i] ?? 0)] : []);
   const limits = known(declared) ? [-declared, declared] : [];
@@ -146,9 +160,10 @@ export function drawErrors(chart) {
 }
 
 export function drawResidual(chart) {
-  const residual = part('residual'), lines = part('missing_effect')?.lines ?? [];
+  const {content: residual, note} = analysed('residual');
+  const lines = analysed('missing_effect').content?.lines ?? [];
   if (!residual && !lines.length) {
-    chart.empty('no residual received (residual_analyser)');
+    chart.empty(note || 'no residual received (residual_analyser)');
     return;
   }
   const orders = [...new Set([...(residual?.order ?? []), ...lines.map(line => line.order)])]
@@ -159,9 +174,9 @@ export function drawResidual(chart) {
     ? [value - 2 * (residual.standard_error[i] ?? 0), value + 2 * (residual.standard_error[i] ?? 0)]
     : []);
   chart.axes({
-    x: places(orders.map(order => format(order, 6)), chart.inner), xLabel: 'order',
+    x: places(orders.map(order => format(order, 6)), chart.inner), xLabel: `order of ${find('shaft').value}`,
     y: linear(range([...before, ...after, ...bars], {include: [0]})),
-    yLabel: 'observed − predicted'});
+    yLabel: 'observed − predicted [1]'});
   chart.level('zero', 0);
   const at = order => orders.indexOf(order);
   lines.forEach((line, i) => {
@@ -189,4 +204,33 @@ export function drawSpeedLine() {
   svg.setAttribute('preserveAspectRatio', 'none');
   svg.setAttribute('height', 20);
   box.replaceChildren(svg);
+}
+
+// --- tables of what the charts show --------------------------------------------------------------
+
+export function ordersTable() {
+  const rows = orderRows();
+  return rows.length && {
+    columns: ['order', `raw amplitude [${unit()}]`, `corrected amplitude [${unit()}]`,
+              `noise [${unit()}]`, 'attenuation', 'standard error of the attenuation',
+              'predicted attenuation', 'predicted 5 %', 'predicted 95 %'],
+    rows: rows.map(row => [row.order, row.raw_amplitude, row.corrected_amplitude,
+                           row.noise_standard_deviation, row.attenuation,
+                           row.attenuation_standard_error, row.predicted?.mean,
+                           row.predicted?.low, row.predicted?.high])};
+}
+
+export function errorsTable() {
+  const pulses = ofShaft('pulse_error');
+  return pulses && {
+    columns: ['time [s]', 'pulse error [s]', 'standard error [s]'],
+    rows: pulses.time.map((time, i) => [time, pulses.error[i], pulses.standard_error[i]])};
+}
+
+export function residualTable() {
+  const residual = analysed('residual').content;
+  return residual && {
+    columns: ['order', 'observed', 'predicted', 'residual', 'standard error', 'z'],
+    rows: residual.order.map((order, i) => [order, ...[
+      'observed', 'predicted', 'residual', 'standard_error', 'z'].map(name => residual[name][i])])};
 }

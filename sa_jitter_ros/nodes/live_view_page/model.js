@@ -14,6 +14,29 @@ export const settings = () => part('settings')
 export const unit = () => settings().vibration_unit || 'unit of the vibration';
 export const channelName = i => settings().channel_names[i] ?? `channel ${i}`;
 export const finite = values => values.filter(known);
+// Of a condition indicator: those that are no ratios have the unit of the vibration.
+export const unitOf = indicator => ['rms', 'peak'].includes(indicator) ? unit() : '';
+// Several shafts have a prediction each.
+export const prediction = () => ofShaft('prediction') ?? part('prediction');
+// Values by the name of the node, of nodes that show a value `key` in their diagnostics.
+const nodesWith = key => Object.values(part('/diagnostics') ?? {}).map(node => node.values)
+  .filter(values => values[key]);
+
+// What an analyser of the shown shaft published, and a note if there is one of another shaft only.
+export function analysed(kind) {
+  const own = ofShaft(kind), others = nodesWith('batches').map(values => values.shaft);
+  if (own || !others.length || others.includes(find('shaft').value)) {
+    return {content: own ?? part(kind), note: ''};
+  }
+  return {content: undefined, note: `residual_analyser compares shaft ${others.join(', ')}`};
+}
+
+// Why the correction of the shown shaft was refused last, '' if the last average was corrected.
+export function refusal() {
+  const attenuation = ofShaft('order_amplitude')?.attenuation ?? [];
+  const key = `${find('shaft').value}.refusal`;
+  return attenuation.flat().some(known) ? '' : nodesWith(key).map(values => values[key])[0] ?? '';
+}
 
 // The unit of time that suits a value.
 export function timeUnit(value) {
@@ -28,21 +51,21 @@ export function withTimeUnit(value, digits = 3) {
 
 // The prediction for the shown shaft: {rows by order, note}; no rows if it is for another one.
 export function predicted() {
-  const prediction = part('prediction'), header = ofShaft('order_amplitude')?.header;
-  if (!prediction) return {rows: new Map(), note: 'no prediction received'};
+  const found = prediction(), header = ofShaft('order_amplitude')?.header;
+  if (!found) return {rows: new Map(), note: 'no prediction received'};
   if (header) {
     const turns = (header.end_time - header.start_time) * header.mean_trigger_speed;
-    const excess = turns * prediction.ratio - header.fundamental_cycles;  // of whole cycles
+    const excess = turns * found.ratio - header.fundamental_cycles;  // of whole cycles
     if (excess >= 2 || excess < -1e-3 * header.fundamental_cycles) {
-      return {rows: new Map(), note: `prediction is for ratio ${format(prediction.ratio, 6)}, `
+      return {rows: new Map(), note: `prediction is for ratio ${format(found.ratio, 6)}, `
         + 'another shaft'};
     }
   }
-  const rows = new Map(prediction.order.map((order, i) => [order, {
-    mean: prediction.mean_attenuation[i], low: prediction.quantile_05[i],
-    high: prediction.quantile_95[i]}]));
-  const note = header && header.trigger_cycles !== prediction.trigger_cycles
-    ? `predicted for ${prediction.trigger_cycles} trigger cycles, the average has `
+  const rows = new Map(found.order.map((order, i) => [order, {
+    mean: found.mean_attenuation[i], low: found.quantile_05[i],
+    high: found.quantile_95[i]}]));
+  const note = header && header.trigger_cycles !== found.trigger_cycles
+    ? `predicted for ${found.trigger_cycles} trigger cycles, the average has `
       + `${header.trigger_cycles}` : '';
   return {rows, note};
 }

@@ -1,10 +1,14 @@
 // The page: gets new data twice a second and draws it.
 
 import {Chart} from './charts.js';
-import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms}
-  from './drawings.js';
-import {channelName, find, ofShaft, settings, state} from './model.js';
-import {drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles} from './words.js';
+import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms, errorsTable,
+        ordersTable, residualTable, waveformTable} from './drawings.js';
+import {addButtons} from './export.js';
+import {channel, channelName, find, ofShaft, settings, state} from './model.js';
+import {drawPolar, drawSpectrum, drawTrend, spectrumTable, trendChoices, trendTable}
+  from './panels.js';
+import {drawAttention, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles}
+  from './words.js';
 
 const PERIOD = 500;  // ms between requests
 
@@ -35,11 +39,35 @@ const charts = {
   attenuation: new Chart(find('attenuation'), 300, drawAttenuation),
   errors: new Chart(find('errors'), 280, drawErrors),
   residual: new Chart(find('residual'), 280, drawResidual),
+  spectrum: new Chart(find('spectrum'), 280, drawSpectrum),
+  trend: new Chart(find('trend'), 280, drawTrend),
+  polar: new Chart(find('polar'), 280, drawPolar),
 };
+const TABLES = {waveforms: waveformTable, polar: waveformTable, spectrum: spectrumTable,
+                amplitudes: ordersTable, attenuation: ordersTable, trend: trendTable,
+                errors: errorsTable, residual: residualTable};
+for (const [name, table] of Object.entries(TABLES)) {
+  const average = () => ofShaft('synchronous_average')?.header.sequence ?? 0;
+  addButtons(find(name), table, () => [find('shaft').value, name, channelName(channel()),
+                                       average()].join('-').replaceAll(/[^\w.-]+/g, '_'));
+}
+
+function drawTrendAndChoices() {
+  const choices = trendChoices(), select = find('trend-of'), before = select.value;
+  if (choices.map(([, text]) => text).join() !== [...select.options].map(item => item.text).join()) {
+    select.replaceChildren(...choices.map(([value, text]) => new Option(text, value)));
+    if (choices.some(([value]) => value === before)) select.value = before;
+  }
+  charts.trend.render();
+}
+
 // What to draw when a part changes whose name matches.
 const DRAWN = [
   [drawTiles, /speed|order_amplitude|pulse_error|prediction|residual|missing_effect/],
   [drawWaveforms, /average$|standard_error/],
+  [charts.polar.render, /average$/],
+  [charts.spectrum.render, /average$/],
+  [drawTrendAndChoices, /_trend$/],
   [charts.amplitudes.render, /order_amplitude/],
   [charts.attenuation.render, /order_amplitude|prediction/],
   [drawOrders, /order_amplitude|prediction/],
@@ -48,6 +76,7 @@ const DRAWN = [
   [charts.residual.render, /residual|missing_effect/],
   [drawEffects, /missing_effect/],
   [drawNodes, /diagnostics/],
+  [drawAttention, /diagnostics/],
 ];
 
 function draw(changed) {
@@ -80,6 +109,9 @@ async function ask() {
     Object.assign(state, {run: news.run, version: news.version, now: news.now,
                           silence: news.silence, parts: {...state.parts, ...news.parts}});
     draw(Object.keys(news.parts));
+    drawTiles();  // and the states of nodes, which change while nothing comes
+    drawNodes();
+    drawAttention();
     drawState();
   } catch (error) {
     drawState(error.message);
@@ -91,6 +123,7 @@ async function go() {
   setTimeout(go, PERIOD);
 }
 
+find('trend-of').onchange = charts.trend.render;
 find('shaft').onchange = drawAll;
 find('channel').onchange = drawAll;
 find('pause').onclick = () => {

@@ -2,8 +2,8 @@
 
 import {format, known} from './charts.js';
 import {drawSpeedLine} from './drawings.js';
-import {channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, state, timeUnit, unit,
-        withTimeUnit} from './model.js';
+import {analysed, channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, prediction,
+        state, timeUnit, unit, unitOf, withTimeUnit} from './model.js';
 
 const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
 const LOSSES = /dropped|gaps|restarts|clock_deviation|rejected|refused/;
@@ -11,18 +11,26 @@ const LOSSES = /dropped|gaps|restarts|clock_deviation|rejected|refused/;
 const rms = values => Math.sqrt(values.reduce((sum, x) => sum + x * x, 0) / values.length);
 function show(id, text) { find(id).textContent = text; }
 
+// How long ago the last average of the shown shaft came, '' while they come as often as before.
+function silence() {
+  const last = state.parts[`${find('shaft').value}/order_amplitude`];
+  const header = last?.content.header, age = last ? state.now - last.received : 0;
+  return header && age > 5 + 2 * (header.end_time - header.start_time)
+    ? `; none for ${age.toFixed(0)} s` : '';
+}
+
 export function drawTiles() {
   const orders = ofShaft('order_amplitude'), pulses = ofShaft('pulse_error');
   const header = orders?.header ?? ofShaft('synchronous_average')?.header;
-  const speed = part('shaft_speed')?.value, prediction = part('prediction');
+  const speed = part('shaft_speed')?.value;
   show('speed', known(speed) ? `${format(speed, 5)} Hz` : '–');
   drawSpeedLine();
   show('average', header ? `No. ${header.sequence}` : '–');
   show('average-note', header ? `${header.trigger_cycles} trigger cycles, `
-    + `${header.fundamental_cycles} revolutions of ${find('shaft').value}` : '');
+    + `${header.fundamental_cycles} revolutions of ${find('shaft').value}${silence()}` : '');
   const errors = finite(pulses?.error ?? []);
   show('pulses', errors.length ? `${withTimeUnit(rms(errors))} RMS` : '–');
-  const declared = prediction?.pulse_error_standard_deviation;
+  const declared = prediction()?.pulse_error_standard_deviation;
   show('pulses-note', (errors.length ? `${errors.length} pulses; ` : '')
     + (known(declared) ? `declared ${withTimeUnit(declared)}` : ''));
   const comparisons = orderRows().flatMap(({attenuation, past, predicted: row}) =>
@@ -32,7 +40,7 @@ export function drawTiles() {
     ? `${(100 * comparisons.filter(Boolean).length / comparisons.length).toFixed(0)} %` : '–');
   show('band-note', predicted().note || (comparisons.length
     ? `90 % expected; ${orders.history.length} averages` : ''));
-  const report = part('missing_effect'), residual = part('residual');
+  const report = analysed('missing_effect').content, residual = analysed('residual').content;
   const [before, after] = [report?.error_before?.rms, report?.error_after?.rms];
   show('error', known(before) ? `${format(before, 2)} → ${format(after, 2)}`
     : known(residual?.rms) ? format(residual.rms, 2) : '–');
@@ -58,8 +66,8 @@ function fill(table, headings, rows) {
 export function drawOrders() {
   const right = text => [text, 'number'];
   fill(find('orders'), [
-    'order', `raw [${unit()}]`, 'corrected', 'noise', 'attenuation', 'predicted',
-    '5 % to 95 %', 'in band'].map(right), orderRows().map(row => {
+    'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation [1]',
+    'predicted [1]', '5 % to 95 % [1]', 'in band'].map(right), orderRows().map(row => {
     const inside = inBand(row), band = row.predicted;
     return [...[format(row.order, 6), format(row.raw_amplitude), format(row.corrected_amplitude),
                 format(row.noise_standard_deviation, 2),
@@ -78,14 +86,14 @@ export function drawIndicators() {
     return;
   }
   fill(find('indicators'), [['channel'], ...indicators.names.map(
-    name => [name.replaceAll('_', ' '), 'number'])],
+    name => [name.replaceAll('_', ' ') + (unitOf(name) && ` [${unitOf(name)}]`), 'number'])],
        indicators.values.map((row, i) => [[channelName(i)], ...row.map(
          value => [format(value), 'number'])]));
 }
 
 export function drawEffects() {
   const list = document.createElement('dl');
-  for (const effect of part('missing_effect')?.missing_effects ?? []) {
+  for (const effect of analysed('missing_effect').content?.missing_effects ?? []) {
     const parameters = Object.entries(effect.parameters ?? {}).map(
       ([name, {value, standard_error: error, unit: given}]) => {
         const values = [value].flat(), numbers = values.filter(item => typeof item === 'number');
@@ -103,6 +111,21 @@ export function drawEffects() {
         ? `; not distinguishable from ${effect.indistinguishable_from.join(', ')}` : '');
   }
   find('effects').replaceChildren(list);
+}
+
+// Above everything: which nodes lack something, with their own words.
+export function drawAttention() {
+  const bad = Object.entries(part('/diagnostics') ?? {}).map(([name, node]) => {
+    const age = state.now - node.received;
+    return [age > 5 ? 3 : node.level, name, age > 5 ? `no status for ${age.toFixed(0)} s`
+      : node.message];
+  }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
+  find('attention').replaceChildren(...bad.map(([level, name, text]) => {
+    const line = document.createElement('p');
+    line.className = (LEVELS[level] ?? LEVELS[3])[0];
+    line.textContent = `${name}: ${text}`;
+    return line;
+  }));
 }
 
 export function drawNodes() {
