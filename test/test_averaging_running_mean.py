@@ -20,9 +20,10 @@ VALUES = st.lists(st.complex_numbers(max_magnitude=1e6), min_size=1, max_size=40
 
 
 def filled(mean, values):
-    """Return the mean after it took these values, each in an array."""
-    for value in values:
-        mean.update(np.array([value]))
+    """Return the mean after it took these values, each in an array, one or some at a time."""
+    size = len(values) % 4 + 1
+    for first in range(0, len(values), size):
+        mean.update(np.array(values[first:first + size])[:, None])
     return mean
 
 
@@ -54,7 +55,7 @@ def test_merging_with_nothing_changes_nothing():
     mean.merge(BlockMean())
     empty = BlockMean()
     empty.merge(mean)
-    mean.update(np.array([100.0]))  # and what was merged is a copy
+    mean.update(np.array([[100.0]]))  # and what was merged is a copy
     assert (empty.count, empty.mean[0]) == (2, 2.0)
     assert np.isnan(BlockMean().mean)
 
@@ -85,7 +86,7 @@ def test_sliding_mean_is_that_of_its_window_whatever_came_and_went(steps):
             mean.forget(step)
             del window[:step]
         else:
-            mean.update(np.array([step]))
+            mean.update(np.array([[step]]))
             window.append(step)
             largest = max(largest, abs(step))
         assert mean.count == len(window)
@@ -108,9 +109,9 @@ def test_exponential_mean_has_the_noise_of_as_many_equal_weights(rng):
     cycles, mean = 9.0, ExponentialMean(9.0)
     means_, errors = [], []
     for _ in range(60):
-        mean.update(rng.standard_normal(2000))
+        mean.update(rng.standard_normal((1, 2000)))
     for _ in range(40):
-        mean.update(rng.standard_normal(2000))
+        mean.update(rng.standard_normal((1, 2000)))
         means_.append(mean.mean)
         errors.append(mean.standard_error)
     # 2000 independent columns, in time about 40 / 9 independent ones
@@ -128,11 +129,11 @@ def test_exponential_mean_begins_as_the_ordinary_mean():
 def test_exponential_mean_recovers_where_it_was_undefined():
     mean = ExponentialMean(4.0)
     for row in ([1.0, 1.0], [np.nan, 1.0]):
-        mean.update(np.array(row))
+        mean.update(np.array([row]))
     np.testing.assert_array_equal(np.isnan(mean.mean), [True, False])
-    mean.update(np.array([5.0, 1.0]))
+    mean.update(np.array([[5.0, 1.0]]))
     np.testing.assert_allclose(mean.mean, [5.0, 1.0])
-    mean.update(np.array([7.0, 1.0]))
+    mean.update(np.array([[7.0, 1.0]]))
     np.testing.assert_allclose(mean.mean, [5.8, 1.0])
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
 from sa_jitter_ros.averaging.cycle import CycleSamples
-from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -828,3 +828,53 @@ def test_an_average_holds_the_amplitudes_of_its_cycles(averaging):
             assert cycles.mean(axis=0) == pytest.approx(average.amplitudes, abs=1e-12)
         frequency = average.orders * 2.4 * average.trigger_speed / 25.0
         assert frequency == pytest.approx(2.4 * average.orders, rel=1e-9)
+
+
+def encoder(speed=50.0, marks=1024, rate=100e3, seconds=0.3):
+    """Return samples with orders 3 and 20 of a shaft, and the pulses of its encoder."""
+    pulses = 0.005 + np.arange(int((seconds - 0.01) * speed * marks)) / (speed * marks)
+    angle = speed * (np.arange(int(seconds * rate)) / rate - 0.005)
+    return (0.3 * np.cos(2.0 * np.pi * 3.0 * angle + 1.0)
+            + np.cos(2.0 * np.pi * 20.0 * angle))[None], pulses
+
+
+def test_encoder_whose_pulses_are_trigger_cycles_gives_the_amplitudes_of_the_shaft():
+    """Trigger cycles are two samples long; thousands of them are averaged together."""
+    samples, pulses = encoder()
+    target = StreamingAverager({'shaft': AverageSettings(
+        cycle_length=1 / 1024, trigger_cycles=4096, orders=(3.0, 20.0))},
+        validator=PulseValidator(pulses_per_revolution=1024, pulses_per_trigger=1),
+        timeline=VibrationTimeline())
+    found = []
+    for first in range(0, samples.shape[1], 3000):
+        found += target.add_samples(
+            SampleBlock(samples[:, first:first + 3000], first / 100e3, 100e3, first))
+        passed = (pulses >= first / 100e3) & (pulses < (first + 3000) / 100e3)
+        found += target.add_pulses(pulses[passed])
+    assert [average.sequence for _, average in found] == [0, 1, 2]
+    for _, average in found:
+        expected = np.array([0.3 * np.exp(1j), 1.0])
+        # a cycle is the integral over two samples by the trapezoidal rule in eight steps
+        np.testing.assert_allclose(average.amplitudes[0], expected, rtol=1e-6)
+        assert average.fundamental_cycles in (3, 4)
+        lines = 2.0 * np.fft.rfft(average.waveform[0])[[3, 20]] / average.waveform.shape[1]
+        np.testing.assert_allclose(lines, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
+def test_cycles_averaged_together_are_those_averaged_alone(law, rng):
+    """Pulses stand on samples, where a kernel of polynomials has steps of 1e-8."""
+    samples, pulses = rng.standard_normal((6000, 2)), np.arange(100.0, 5900.0, 100.0) / 1e3
+    settings = AverageSettings(trigger_cycles=40, orders=(3.0,), angle_law=law)
+    cut = {'start_time': 0.0, 'rate': 1e3, 'pulses': pulses, 'margin': 20}
+    together = ShaftAverager(settings).update(
+        CycleSamples.cut(samples, first=8, count=40, **cut))
+    alone = average_cycles((CycleSamples(samples, 0.0, 1e3, pulses, 8 + k) for k in range(40)),
+                           settings)
+    shaft = ShaftAverager(settings)
+    parts = [shaft.update(CycleSamples.cut(samples, first=8 + first, count=count, **cut))
+             for first, count in ((0, 1), (1, 25), (26, 14))][-1]
+    for other in (alone, parts):
+        np.testing.assert_allclose(other.waveform, together.waveform, atol=1e-14)
+        np.testing.assert_allclose(other.standard_error, together.standard_error, atol=1e-14)
+        np.testing.assert_allclose(other.cycle_amplitudes, together.cycle_amplitudes, atol=1e-14)

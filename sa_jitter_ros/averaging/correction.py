@@ -57,12 +57,21 @@ class CorrectingAverager:
         reach = math.ceil(_REACH * period * rate) if self.settings.correct_jitter else 0
         return self._shaft.margin(period, rate) + reach
 
-    def update(self, cycle: CycleSamples) -> Average | None:
-        """Take the next trigger cycle; return the average and its correction when one is due."""
-        average = self._shaft.update(cycle)
+    @property
+    def room(self) -> int:
+        """Trigger cycles up to the next average."""
+        return self._shaft.room
+
+    def usable(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
+        """Return in which cycles of `periods` s the shaft turns slowly enough for `rate` Hz."""
+        return self._shaft.usable(periods, rate)
+
+    def update(self, cycles: CycleSamples) -> Average | None:
+        """Take cycles, not more than `room`; return the average and its correction when due."""
+        average = self._shaft.update(cycles)
         if not self.settings.correct_jitter:
             return average
-        self._cycles.append(cycle)
+        self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
         return self._corrected(average)
 
     def finish(self) -> Average | None:

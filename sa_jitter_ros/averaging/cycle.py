@@ -9,43 +9,47 @@
 # the License.
 
 """
-One trigger cycle in angle: its order amplitudes and its points of the waveform.
+Trigger cycles in angle: their order amplitudes and their points of the waveform.
 
-The cycle is `r` fundamental cycles long. Its order amplitudes are integrals over the whole trigger
+A cycle is `r` fundamental cycles long. Its order amplitudes are integrals over the whole trigger
 cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), on a grid that is never coarser than
 the samples. The points of the waveform are at k/n of a fundamental cycle and independent of the
-pulses, so that a fundamental cycle with a pulse inside it is exact, too.
+pulses, so that a fundamental cycle with a pulse inside it is exact, too. Consecutive cycles are
+resampled and projected together.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.pulses.angle_law import AngleLaw, cycle_times, LINEAR_LAW
-from sa_jitter_ros.pulses.resampling import interpolate, margin
+from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
+from sa_jitter_ros.pulses.resampling import interpolate_between, margin
 from scipy.fft import next_fast_len
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
 
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
+_SMALL_GRID = 64  # points of a cycle up to which its amplitudes are one plain product
+_LARGE = 1 << 61  # of what integers of 64 bits hold
 
 
 @dataclass(frozen=True)
 class CycleSamples:
     """
-    The samples of one trigger cycle, and those on either side that interpolation needs.
+    The samples of consecutive trigger cycles, and those on either side that interpolation needs.
 
     `samples` (sample, channel) at `rate` (Hz); the first is `lead` s after `start_time` (s). These
     are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
-    are those that the angle law uses; the cycle begins at `pulses[first]`. With a speed ripple
-    inside the cycle the shaft passes the fraction u by `ripple` u (1 - u) s earlier than the angle
-    law says.
+    are those that the angle law uses; the `count` cycles begin at `pulses[first]`. With a speed
+    ripple inside the cycles the shaft passes the fraction u of one by `ripple` u (1 - u) s earlier
+    than the angle law says.
     """
 
     samples: FloatArray
@@ -55,37 +59,109 @@ class CycleSamples:
     first: int
     lead: float = 0.0
     ripple: float = 0.0
+    count: int = 1
 
     @classmethod
     def cut(cls, samples: FloatArray, *, start_time: float, rate: float, pulses: FloatArray,
-            first: int, margin: int, offset: int = 0, ripple: float = 0.0) -> 'CycleSamples':
+            first: int, margin: int, offset: int = 0, ripple: float = 0.0, count: int = 1
+            ) -> 'CycleSamples':
         """
-        Cut the cycle that begins at `pulses[first]` out of `samples` (sample, channel).
+        Cut the cycles that begin at `pulses[first]` out of `samples` (sample, channel).
 
         The first sample is `offset` samples after `start_time` (s); `margin` samples are kept on
-        either side of the cycle.
+        either side of the cycles.
         """
-        low, high = ((float(pulse) - start_time) * rate - offset
-                     for pulse in pulses[first:first + 2])
+        low, high = ((float(pulses[i]) - start_time) * rate - offset
+                     for i in (first, first + count))
         begin = max(math.floor(low) - margin, 0)
         return cls(samples[begin:math.ceil(high) + margin + 1], start_time, rate, pulses, first,
-                   lead=(offset + begin) / rate, ripple=ripple)
+                   lead=(offset + begin) / rate, ripple=ripple, count=count)
 
     @property
-    def period(self) -> float:
-        """Length of the trigger cycle in s."""
-        return float(self.pulses[self.first + 1] - self.pulses[self.first])
+    def edges(self) -> FloatArray:
+        """Return the pulses (s) between which the cycles lie."""
+        return self.pulses[self.first:self.first + self.count + 1]
 
-    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
-        """Return values (len(u), channel) at fractions `u` of the cycle."""
-        pulses = (self.pulses - self.start_time) - self.lead
-        times = cycle_times(law, pulses, self.first, u)
+    @property
+    def periods(self) -> FloatArray:
+        """Return the lengths of the cycles in s."""
+        return np.diff(self.edges)
+
+    def part(self, first: int, end: int) -> 'CycleSamples':
+        """Return some of the cycles."""
+        return replace(self, first=self.first + first, count=end - first)
+
+    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
+           end: bool = False) -> FloatArray:
+        """
+        Return values (point, channel) at fractions `u` of every cycle, cycle after cycle.
+
+        `u` (u,) are the same in all cycles, or (cycle, u) those of each, of which NaN are left
+        out. With `end` the value at the last pulse follows.
+        """
+        pulses = (self.pulses - self.start_time) * self.rate
+        # Positions in a cycle count from the sample in front of it, so that they do not depend on
+        # the cycles that are resampled together.
+        origins = np.floor(pulses[self.first:self.first + self.count])
+        positions = run_times(law, pulses, self.first, origins, u)
         if self.ripple:
-            times = times - self.ripple * u * (1.0 - u)
-        positions = times * self.rate
+            positions = positions - self.rate * self.ripple * u * (1.0 - u)
+        before = origins - self.first_index
         # The position of a pulse on the first or last sample may round to just outside.
-        np.clip(positions, 0.0, len(self.samples) - 1, out=positions)
-        return interpolate(self.samples, positions, method=method, cutoff=cutoff)
+        lowest = -before[:, None]
+        positions = np.clip(positions, lowest, lowest + (len(self.samples) - 1))
+        whole = np.floor(positions)
+        index, fraction = whole - lowest, positions - whole
+        if u.ndim == 2:
+            index, fraction = index[~np.isnan(u)], fraction[~np.isnan(u)]
+        index, fraction = index.ravel(), fraction.ravel()
+        if end:
+            last = min(pulses[self.first + self.count] - self.first_index, len(self.samples) - 1.0)
+            index = np.append(index, np.floor(last))
+            fraction = np.append(fraction, last - np.floor(last))
+        return interpolate_between(self.samples, index.astype(np.int32), fraction, method=method,
+                                   cutoff=cutoff)
+
+    @property
+    def first_index(self) -> int:
+        """Return the samples from `start_time` to the first one."""
+        return round(self.lead * self.rate)
+
+
+def joined(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
+    """Return the same cycles with those together whose samples and pulses continue."""
+    groups: list[list[CycleSamples]] = []
+    for run in runs:
+        if groups and _continues(groups[-1][-1], run):
+            groups[-1].append(run)
+        else:
+            groups.append([run])
+    return [_join(group) for group in groups]
+
+
+def _continues(run: CycleSamples, following: CycleSamples) -> bool:
+    begin = run.first_index
+    return (run.start_time == following.start_time and run.rate == following.rate
+            and not run.ripple and not following.ripple
+            and run.samples.shape[1] == following.samples.shape[1]
+            and run.edges[-1] == following.edges[0]
+            and begin <= following.first_index <= begin + len(run.samples))
+
+
+def _join(runs: Sequence[CycleSamples]) -> CycleSamples:
+    first, last = runs[0], runs[-1]
+    if first is last:
+        return first
+    parts, end = [first.samples], first.first_index + len(first.samples)
+    for run in runs[1:]:
+        begin = run.first_index
+        parts.append(run.samples[end - begin:])
+        end = max(end, begin + len(run.samples))
+    pulses = np.concatenate([
+        first.pulses[:first.first + 1], *(run.edges[1:] for run in runs),
+        last.pulses[last.first + last.count + 1:]])
+    return replace(first, samples=np.concatenate(parts), pulses=pulses,
+                   count=sum(run.count for run in runs))
 
 
 def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = LINEAR_LAW,
@@ -95,23 +171,23 @@ def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = L
 
     There are as many points as a cycle of `period` (s) needs, the longest of the cycles if None.
     """
-    longest = max(cycle.period for cycle in cycles) if period is None else period
-    points = grid_points(longest, cycles[0].rate)
+    longest = max(cycle.periods.max() for cycle in cycles) if period is None else period
+    points = int(grid_points(longest, cycles[0].rate))
     u = np.arange(points) / points
     return np.stack([cycle.at(law, u, method=method) for cycle in cycles])
 
 
-def grid_points(period: float, rate: float) -> int:
+def grid_points(periods: FloatArray | float, rate: float) -> IntArray:
     """
-    Return the points per trigger cycle of `period` s, at least one per sample at `rate` Hz.
+    Return the points per trigger cycle of `periods` s, at least one per sample at `rate` Hz.
 
     Numbers of points are in steps of about 6 %, so that cycles of similar length have one grid.
 
-    >>> grid_points(0.04, 5000.0), grid_points(0.041, 5000.0), grid_points(0.043, 5000.0)
-    (204, 216, 216)
+    >>> grid_points(np.array([0.04, 0.041, 0.043]), 5000.0)
+    array([204, 216, 216])
     """
-    needed = max(period * rate, 8.0)
-    return math.ceil(math.pow(2.0, math.ceil(12.0 * math.log2(needed)) / 12.0))
+    needed = np.maximum(np.asarray(periods) * rate, 8.0)
+    return np.ceil(np.exp2(np.ceil(12.0 * np.log2(needed)) / 12.0)).astype(np.int64)
 
 
 @lru_cache(maxsize=64)
@@ -146,12 +222,11 @@ def choose_samples_per_revolution(cycles: float, period: float, rate: float) -> 
     return min(step * int(next_fast_len(multiple, real=True)), _MAX_POINTS)
 
 
-def waveform_cutoff(points: int, cycles: float, period: float, rate: float) -> float:
+def waveform_cutoff(points: int, cycles: float, periods: FloatArray | float, rate: float
+                    ) -> FloatArray:
     """Return the band of a waveform of so many `points`, as a fraction of that of the samples."""
-    cutoff = points * cycles / (period * rate)
-    if cutoff >= 1.0:
-        return 1.0
-    return float(2.0 ** (math.floor(16.0 * math.log2(cutoff)) / 16.0))
+    cutoff = points * cycles / (np.asarray(periods) * rate)
+    return np.where(cutoff < 1.0, np.exp2(np.floor(16.0 * np.log2(cutoff)) / 16.0), 1.0)
 
 
 def needed_margin(method: str, cutoff: float) -> int:
@@ -161,52 +236,93 @@ def needed_margin(method: str, cutoff: float) -> int:
 
 @lru_cache(maxsize=16)
 def _order_basis(points: int, cycles: float, orders: tuple[float, ...]
-                 ) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+                 ) -> tuple[ComplexArray, FloatArray]:
     """
     Return exp(-j 2 pi g theta) on a grid of `points` steps as products of two short tables.
 
     The value at point k is `fine` (order, width) at k % width times `coarse` (2 orders, rows + 1)
-    at k // width, whose halves are real and imaginary parts. The third value is that at the end.
+    at k // width, whose halves are real and imaginary parts. For few points `fine` has all.
     """
-    width = math.isqrt(points)
+    width = points if points <= _SMALL_GRID else math.isqrt(points)
     step = -2j * np.pi * cycles / points * np.array(orders)[:, None]
     coarse = np.exp(step * width * np.arange(points // width + 1))
-    return (np.exp(step * np.arange(width)), np.concatenate((coarse.real, coarse.imag)),
-            np.exp(step * points))
+    return np.exp(step * np.arange(width)), np.concatenate((coarse.real, coarse.imag))
 
 
-def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], angle: Fraction | float
-            ) -> ComplexArray:
+def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first_cycle: int = 0,
+            count: int = 1) -> ComplexArray:
     """
-    Return the complex peak amplitudes (channel, order) of one trigger cycle.
+    Return the complex peak amplitudes (cycle, channel, order) of consecutive trigger cycles.
 
-    `grid` (points + 1, channel) are its values at equal steps of angle, both ends included. The
-    cycle begins at `angle` (fundamental cycles); phases refer to angle 0. An amplitude is twice
-    the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
+    `grid` (count x points + 1, channel) are the values of `count` cycles at equal steps of angle,
+    and the last end. The first is number `first_cycle` of those since angle 0, to which phases
+    refer. An amplitude is twice the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
 
     >>> theta = np.linspace(0.0, 1.0, 65)
     >>> wave = 3.0 * np.cos(2.0 * np.pi * 4.0 * theta)[:, None]
-    >>> abs(project(wave, 1.0, (4.0, 5.0), 0)).round(6)
-    array([[3., 0.]])
+    >>> abs(project(wave, 1.0, (4.0, 5.0))).round(6)
+    array([[[3., 0.]]])
     """
-    points, channels, count = len(grid) - 1, grid.shape[1], len(orders)
-    fine, coarse, end = _order_basis(points, cycles, orders)
-    width, rows = fine.shape[1], coarse.shape[1] - 1
-    parts = coarse[:, :rows] @ grid[:rows * width].reshape(rows, width * channels)
-    rest = grid[rows * width:points]
-    sums = (parts[:count] + 1j * parts[count:]).reshape(count, width, channels)
-    total = np.matmul(fine[:, None], sums)[:, 0] + (grid[-1] * end - grid[0]) / 2.0
-    if len(rest):
-        last = coarse[:count, rows:] + 1j * coarse[count:, rows:]
-        total += last * (fine[:, :len(rest)] @ rest)
-    whole = math.floor(angle)  # in which integer orders make whole turns
-    turns = np.mod(orders, 1.0) * whole + np.array(orders) * float(angle - whole)
-    return np.asarray(total.T * (2.0 / points * np.exp(-2j * np.pi * turns)))
+    points, channels = (len(grid) - 1) // count, grid.shape[1]
+    values = grid[:-1].reshape(count, points, channels)
+    total = _sums(values, cycles, orders)
+    ends = grid[::points]
+    turn = np.exp(-2j * np.pi * cycles * np.array(orders))
+    total += (ends[1:, :, None] * turn - ends[:-1, :, None]) / 2.0
+    whole, rest = multiples(exact_cycles(cycles), first_cycle, count)
+    # In whole fundamental cycles integer orders make whole turns.
+    turns = np.multiply.outer(whole[:-1], np.mod(orders, 1.0)) + np.multiply.outer(
+        rest[:-1], orders)
+    return np.asarray(total * (2.0 / points * np.exp(-2j * np.pi * turns))[:, None])
 
 
-def first_point(angle: Fraction, points: int) -> int:
-    """Return the index of the first waveform point at or after an angle (fundamental cycles)."""
-    return math.ceil(angle * points)
+def _sums(values: FloatArray, cycles: float, orders: tuple[float, ...]) -> ComplexArray:
+    """Return the sums (cycle, channel, order) of values (cycle, point, channel) x exp(-j ...)."""
+    count, points, channels = values.shape
+    fine, coarse = _order_basis(points, cycles, orders)
+    lines, width = fine.shape
+    if width == points:
+        flat = np.moveaxis(values, 1, 2).reshape(count * channels, points)
+        parts = flat @ np.concatenate((fine.real, fine.imag)).T
+        return np.asarray(parts[:, :lines] + 1j * parts[:, lines:]).reshape(count, channels, lines)
+    rows = coarse.shape[1] - 1
+    parts = coarse[:, :rows] @ values[:, :rows * width].reshape(count, rows, width * channels)
+    sums = (parts[:, :lines] + 1j * parts[:, lines:]).reshape(count, lines, width, channels)
+    total = np.matmul(fine[:, None], sums)[:, :, 0]
+    if rows * width < points:
+        last = coarse[:lines, rows:] + 1j * coarse[lines:, rows:]
+        total += last * (fine[:, :points - rows * width] @ values[:, rows * width:])
+    return np.moveaxis(total, 1, 2)
+
+
+def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatArray]:
+    """
+    Return the whole and the rest of `first` to `first + count` times `step`, exact.
+
+    >>> multiples(Fraction(5, 2), 3, 2)
+    (array([ 7, 10, 12]), array([0.5, 0. , 0.5]))
+    """
+    number, divisor = step.numerator, step.denominator
+    whole, rest = divmod(number * first, divisor)
+    if rest + number * count >= _LARGE:
+        pairs = [divmod(rest + number * i, divisor) for i in range(count + 1)]
+        return (whole + np.array([pair[0] for pair in pairs]),
+                np.array([pair[1] / divisor for pair in pairs]))
+    total = rest + number * np.arange(count + 1)
+    return whole + total // divisor, (total % divisor) / divisor
+
+
+def first_points(cycles: float, points: int, first_cycle: int, count: int
+                 ) -> tuple[IntArray, FloatArray]:
+    """
+    Return the first waveform point at or after the begin of each of consecutive cycles, and its u.
+
+    The second array are the fractions of the trigger cycle from its begin to the point. Both have
+    a last element more, for the cycle behind.
+    """
+    whole, rest = multiples(exact_cycles(cycles) * points, first_cycle, count)
+    behind = rest > 0.0
+    return whole + behind, np.where(behind, 1.0 - rest, 0.0) / (points * cycles)
 
 
 def on_grid(points: int, cycles: float) -> bool:

@@ -55,9 +55,8 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
 
     >>> from sa_jitter_ros.averaging.cycle import project
     >>> angles = 0.4 * np.arange(50)
-    >>> theta = angles[:, None] + np.linspace(0.0, 0.4, 101)
-    >>> cycles = np.array([project(np.cos(4.0 * np.pi * row)[:, None], 0.4, (2.0, 3.0), row[0])
-    ...                    for row in theta])
+    >>> wave = np.cos(4.0 * np.pi * np.linspace(0.0, 20.0, 5001))
+    >>> cycles = project(wave[:, None], 0.4, (2.0, 3.0), count=50)
     >>> float(abs(cycles[:, 0, 1]).max().round(2))
     0.76
     >>> float(abs(without_leakage(cycles, (2.0, 3.0), 0.4, angles)[:, 0, 1]).max().round(2))

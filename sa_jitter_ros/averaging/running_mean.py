@@ -11,12 +11,13 @@
 """
 Running means of arrays: block, sliding and exponential.
 
-Each takes one array per cycle with `update` and returns `mean` and `standard_error`. Memory does
-not grow with the number of cycles (a sliding mean keeps its window). Undefined values are NaN.
+Each takes one array per cycle, of some cycles at once with `update`, and returns `mean` and
+`standard_error`. Memory does not grow with the number of cycles (a sliding mean keeps its window).
+Undefined values are NaN.
 
 >>> mean = BlockMean()
->>> for value in (1.0, 2.0, 6.0):
-...     mean.update(np.array([value]))
+>>> mean.update(np.array([[1.0], [2.0]]))
+>>> mean.update(np.array([[6.0]]))
 >>> mean.mean, mean.standard_error.round(3), mean.count
 (array([3.]), array([1.528]), 3)
 """
@@ -37,6 +38,12 @@ def _power(values: Array) -> FloatArray:
     return np.asarray(np.square(values))
 
 
+def _sum_of_powers(values: Array) -> FloatArray:
+    """Return the sum of the squared magnitudes over the first axis."""
+    parts = (values.real, values.imag) if np.iscomplexobj(values) else (values,)
+    return np.asarray(sum(np.einsum('k...,k...->...', part, part) for part in parts))
+
+
 class RunningMean(Protocol):
     """The interface of the three means."""
 
@@ -45,7 +52,7 @@ class RunningMean(Protocol):
         """Return the number of arrays that make the mean."""
 
     def update(self, values: Array) -> None:
-        """Take the array of one more cycle."""
+        """Take the arrays of one or more cycles (cycle, ...), at least one."""
 
     @property
     def mean(self) -> Array:
@@ -65,15 +72,19 @@ class BlockMean:
         self._squares: FloatArray = np.array(np.nan)
 
     def update(self, values: Array) -> None:
-        """Take one more array."""
-        self.count += 1
-        if self.count == 1:
-            self._mean = values.copy()
-            self._squares = np.zeros(values.shape)
-            return
-        step = values - self._mean
-        self._mean += step / self.count
-        self._squares += _power(step) * (1.0 - 1.0 / self.count)
+        """Take one or more arrays (cycle, ...), at least one."""
+        if not self.count:
+            self._mean = values[0].copy()
+            self._squares = np.zeros(values.shape[1:])
+            self.count, values = 1, values[1:]
+            if not len(values):
+                return
+        steps = values - self._mean
+        self.count += len(steps)
+        moved = steps.sum(axis=0) if len(steps) > 1 else steps[0]
+        self._squares += _sum_of_powers(steps)
+        self._squares -= _power(moved) / self.count
+        self._mean += moved / self.count
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""
@@ -112,8 +123,7 @@ class SlidingMean:
     for any length of the window, and nothing is subtracted, so that rounding errors do not add up.
 
     >>> mean = SlidingMean()
-    >>> for value in (1.0, 2.0, 6.0):
-    ...     mean.update(np.array([value]))
+    >>> mean.update(np.array([[1.0], [2.0], [6.0]]))
     >>> mean.forget(1)
     >>> mean.mean, mean.count
     (array([4.]), 2)
@@ -130,8 +140,8 @@ class SlidingMean:
         return len(self._latest) + len(self._older)
 
     def update(self, values: Array) -> None:
-        """Take one more array, which must not be changed later."""
-        self._latest.append(values)
+        """Take one or more arrays (cycle, ...), which must not be changed later."""
+        self._latest.extend(values)
         self._sum.update(values)
 
     def forget(self, count: int) -> None:
@@ -145,7 +155,7 @@ class SlidingMean:
         """Compute the means of the latest arrays, backwards from the newest."""
         while self._latest:
             block = BlockMean()
-            block.update(self._latest.pop())
+            block.update(self._latest.pop()[None])
             if self._older:
                 block.merge(self._older[-1])
             self._older.append(block)
@@ -178,8 +188,7 @@ class ExponentialMean:
     starts again at the next defined value.
 
     >>> mean = ExponentialMean(3.0)
-    >>> for value in (1.0, 3.0, 6.0):
-    ...     mean.update(np.array([value]))
+    >>> mean.update(np.array([[1.0], [3.0], [6.0]]))
     >>> mean.mean  # (1 + 3) / 2, then half of the difference to 6 more
     array([4.])
     """
@@ -192,7 +201,11 @@ class ExponentialMean:
         self._squared_weights = 0.0
 
     def update(self, values: Array) -> None:
-        """Take one more array."""
+        """Take one or more arrays (cycle, ...)."""
+        for item in values:
+            self._take(item)
+
+    def _take(self, values: Array) -> None:
         self.count += 1
         weight = max(self._weight, 1.0 / self.count)
         if self.count == 1:

@@ -9,23 +9,25 @@
 # the License.
 
 """
-The synchronous average of one shaft, cycle by cycle.
+The synchronous average of one shaft.
 
-It takes the samples of consecutive trigger cycles and returns an average whenever one is due. The
-settings limit its memory.
+It takes the samples of consecutive trigger cycles and returns an average whenever one is due.
+Cycles wait until there are enough to be resampled, projected and accumulated together, which costs
+a fraction of the same for each of them. The settings limit its memory.
 """
 
 from collections import deque
 from collections.abc import Iterable
 from fractions import Fraction
+from itertools import pairwise
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
-from sa_jitter_ros.averaging.cycle import (choose_samples_per_revolution, CycleSamples,
-                                           exact_cycles, first_point, grid_points,
-                                           needed_margin, on_grid, project, waveform_cutoff)
+from sa_jitter_ros.averaging.cycle import (
+    choose_samples_per_revolution, CycleSamples, exact_cycles, first_points, grid_points, joined,
+    needed_margin, on_grid, project, waveform_cutoff)
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, RunningMean,
                                                   SlidingMean)
@@ -35,9 +37,12 @@ from sa_jitter_ros.pulses.angle_law import angle_law
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+#: Samples times channels that are averaged together.
+TOGETHER = 1 << 16
+
 
 class ShaftAverager:
-    """Averages trigger cycles of one shaft: `update` per cycle, `reset` after an interruption."""
+    """Averages trigger cycles of one shaft: `update` with some, `reset` after an interruption."""
 
     def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
         self.settings = settings
@@ -47,24 +52,40 @@ class ShaftAverager:
         self._points = settings.samples_per_revolution
         self._start()
 
+    @property
+    def room(self) -> int:
+        """Trigger cycles up to the next average."""
+        return max(self.settings.trigger_cycles - self._taken, 1)
+
+    @property
+    def _taken(self) -> int:
+        """Trigger cycles since the start, those that wait included."""
+        return self._counted + sum(item.count for item in self._waiting)
+
+    @property
+    def _unfinished(self) -> bool:
+        return self.settings.averaging == 'block' and self._taken > 0
+
     def reset(self) -> bool:
         """Begin again at angle 0; return whether an unfinished average was lost."""
-        lost = self.settings.averaging == 'block' and self._counted > 0
+        lost = self._unfinished
         self._cycle = 0
         self._start()
         return lost
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
-        if self.settings.averaging != 'block' or not self._counted:
+        if not self._unfinished:
             return None
+        self._average_waiting()
         average = self._result()
         self._start()
         return average
 
     def change(self, settings: AverageSettings) -> bool:
         """Continue at the same angle with other settings; return whether an average was lost."""
-        lost = self.settings.averaging == 'block' and self._counted > 0
+        lost = self._unfinished
+        self._cycle += self._taken - self._counted
         if settings.cycle_length != self.settings.cycle_length:
             self._cycle = 0
         self.settings, self._law = settings, angle_law(settings.angle_law)
@@ -75,87 +96,130 @@ class ShaftAverager:
     def margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s at `rate` Hz needs on either side."""
         points = self._points or self._chosen(period, rate)
-        return needed_margin(self.settings.interpolation,
-                             waveform_cutoff(points, self.settings.cycle_length, period, rate))
+        return needed_margin(self.settings.interpolation, float(
+            waveform_cutoff(points, self.settings.cycle_length, period, rate)))
 
-    def update(self, cycle: CycleSamples) -> Average | None:
+    def update(self, cycles: CycleSamples) -> Average | None:
         """
-        Take the next trigger cycle; return an average when one is due.
+        Take the next trigger cycles, not more than `room`; return an average when one is due.
 
-        Raises `SignalError` if the shaft frequency is not below half the sampling rate.
+        Raises `SignalError`, and takes nothing, if the shaft frequency is not below half the
+        sampling rate.
         """
-        settings = self.settings
-        if settings.cycle_length / cycle.period >= cycle.rate / 2.0:
-            raise SignalError(
-                f'shaft frequency {settings.cycle_length / cycle.period:.6g} Hz is not below half '
-                f'the sampling rate of {cycle.rate:.6g} Hz: check ratio and pulses_per_revolution')
-        if not self._counted:
-            self._choose_grid(cycle)
-        angle = self._angle(self._cycle)
-        grid, first, points = self._resample(cycle, angle)
-        amplitudes = project(grid, settings.cycle_length, settings.orders, angle)
-        amplitudes[:, self.beyond_nyquist(cycle.period, cycle.rate)] = np.nan
-        if not self._counted:
-            self._expect_from(angle)
-        self._add_points(first, points, self._angle(self._cycle + 1))
-        self._amplitude_mean.update(amplitudes)
-        self._remember(amplitudes)
-        self._pulses.append(float(cycle.pulses[cycle.first + 1]))
-        if not self._counted:
-            self._pulses.appendleft(float(cycle.pulses[cycle.first]))
-        self._counted += 1
-        self._cycle += 1
-        if self._counted < settings.trigger_cycles:
+        self._check(cycles)
+        if not self._taken:
+            self._choose_grid(float(cycles.periods[0]), cycles.rate)
+        self._waiting.append(cycles)
+        if self._taken < self.settings.trigger_cycles:
+            if sum(item.samples.size for item in self._waiting) >= TOGETHER:
+                self._average_waiting()
             return None
+        self._average_waiting()
         self._slide()
         average = self._result()
-        if settings.averaging == 'block':
+        if self.settings.averaging == 'block':
             self._start()
         return average
+
+    def usable(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
+        """Return in which cycles of `periods` s the shaft turns slowly enough for `rate` Hz."""
+        return np.asarray(self.settings.cycle_length / periods < rate / 2.0)
+
+    def _check(self, cycles: CycleSamples) -> None:
+        if not self.usable(cycles.periods, cycles.rate).all():
+            raise SignalError(
+                f'shaft frequency {self.settings.cycle_length / cycles.periods.min():.6g} Hz is '
+                f'not below half the sampling rate of {cycles.rate:.6g} Hz: check ratio and '
+                'pulses_per_revolution')
+
+    def _average_waiting(self) -> None:
+        """Average the cycles that wait."""
+        for run in joined(self._waiting):
+            for part in self._alike(run):
+                self._average(part)
+        self._waiting.clear()
+
+    def _average(self, cycles: CycleSamples) -> None:
+        """Average cycles that have grids of the same size."""
+        settings, count = self.settings, cycles.count
+        grid, first, points = self._resample(cycles)
+        amplitudes = project(grid, settings.cycle_length, settings.orders,
+                             first_cycle=self._cycle, count=count)
+        beyond = self.beyond_nyquist(cycles.periods, cycles.rate)
+        if beyond.any():
+            amplitudes = np.where(beyond[:, None], np.nan, amplitudes)
+        if not self._counted:
+            self._expect_from(self._angle(self._cycle))
+            self._pulses.append(float(cycles.edges[0]))
+        self._add_points(first, points, self._angle(self._cycle + count))
+        self._amplitude_mean.update(amplitudes)
+        self._remember(amplitudes)
+        self._pulses.extend(cycles.edges[1:].tolist())
+        self._counted += count
+        self._cycle += count
 
     def _angle(self, cycle: int) -> Fraction:
         """Return the angle (fundamental cycles) at which a trigger cycle begins."""
         return exact_cycles(self.settings.cycle_length) * cycle
 
-    def beyond_nyquist(self, period: float, rate: float) -> NDArray[np.bool_]:
-        """Return which orders are at or above half the sampling rate."""
-        return np.asarray(np.array(self.settings.orders) * self.settings.cycle_length / period
-                          >= rate / 2.0)
+    def beyond_nyquist(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
+        """Return (cycle, order), which orders are at or above half the sampling rate."""
+        frequency = np.multiply.outer(self.settings.cycle_length / periods, self.settings.orders)
+        return np.asarray(frequency >= rate / 2.0)
 
     # --- the grid ---
 
     def _chosen(self, period: float, rate: float) -> int:
         return choose_samples_per_revolution(self.settings.cycle_length, period, rate)
 
-    def _choose_grid(self, cycle: CycleSamples) -> None:
+    def _choose_grid(self, period: float, rate: float) -> None:
         if self.settings.samples_per_revolution:
             return
         # Subscribers need one shape: the waveform keeps its length while it is neither coarser
         # than the samples nor more than twice as fine.
-        needed = cycle.period * cycle.rate / self.settings.cycle_length
+        needed = period * rate / self.settings.cycle_length
         if not needed <= self._points <= 2.2 * needed:
-            self._points = self._chosen(cycle.period, cycle.rate)
+            self._points = self._chosen(period, rate)
 
-    def _resample(self, cycle: CycleSamples, angle: Fraction
-                  ) -> tuple[FloatArray, int, FloatArray]:
-        """Return the grid of a cycle with both ends, its first waveform point, and its points."""
+    def _alike(self, cycles: CycleSamples) -> list[CycleSamples]:
+        """Return parts whose cycles have grids of the same size and cut-off."""
+        sizes = np.stack((self._grid_points(cycles), self._cutoff(cycles)))
+        changes = np.flatnonzero(np.any(np.diff(sizes), axis=0)) + 1
+        return [cycles.part(first, end) for first, end in pairwise(
+            (0, *changes.tolist(), cycles.count))]
+
+    def _grid_points(self, cycles: CycleSamples) -> NDArray[np.int64]:
+        """Return the grid's points in each cycle, those of the waveform where these will do."""
+        r, n = self.settings.cycle_length, self._points
+        points = grid_points(cycles.periods, cycles.rate)
+        if on_grid(n, r):
+            points = np.where(self._cutoff(cycles) == 1.0, round(n * r), points)
+        return points
+
+    def _cutoff(self, cycles: CycleSamples) -> FloatArray:
+        return waveform_cutoff(self._points, self.settings.cycle_length, cycles.periods,
+                               cycles.rate)
+
+    def _resample(self, cycles: CycleSamples) -> tuple[FloatArray, int, FloatArray]:
+        """Return the grid with its last end, the first waveform point, and the points."""
         r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
-        cutoff = waveform_cutoff(n, r, cycle.period, cycle.rate)
+        cutoff, count = float(self._cutoff(cycles)[0]), int(self._grid_points(cycles)[0])
+        grid = cycles.at(self._law, np.arange(count) / count, method=method, end=True)
+        first, u = first_points(r, n, self._cycle, cycles.count)
         if on_grid(n, r) and cutoff == 1.0:
-            count = round(n * r)
-            grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
-            return grid, first_point(angle, n), grid[:-1]
-        count = grid_points(cycle.period, cycle.rate)
-        grid = cycle.at(self._law, np.arange(count + 1) / count, method=method)
-        first, end = first_point(angle, n), first_point(self._angle(self._cycle + 1), n)
-        u = (np.arange(end - first, dtype=np.float64) + float(first - angle * n)) / (n * r)
-        return grid, first, cycle.at(self._law, u, method=method, cutoff=cutoff)
+            return grid, int(first[0]), grid[:-1]
+        number = np.diff(first)
+        steps = np.arange(number.max())
+        u = u[:-1, None] + steps / (n * r)
+        u[steps >= number[:, None]] = np.nan
+        return grid, int(first[0]), cycles.at(self._law, u, method=method, cutoff=cutoff)
 
     # --- the average in progress ---
 
     def _start(self) -> None:
         settings = self.settings
         self._counted = self._noise_due = 0
+        self._waiting: list[CycleSamples] = []
         self._noise: FloatArray = np.empty((0, 0))
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))
@@ -168,15 +232,16 @@ class ShaftAverager:
         self._first_whole = 0
 
     def _remember(self, amplitudes: ComplexArray) -> None:
-        """Append the amplitudes of a cycle to those of the window, in memory never reused."""
-        if self._end == len(self._amplitudes):
+        """Append the amplitudes of cycles to those of the window, in memory never reused."""
+        count = len(amplitudes)
+        if self._end + count > len(self._amplitudes):
             kept = min(self._counted, self.settings.trigger_cycles - 1)
-            room = np.empty((max(2 * kept, 16), *amplitudes.shape), np.complex128)
+            room = np.empty((max(2 * (kept + count), 16), *amplitudes.shape[1:]), np.complex128)
             if kept:
                 room[:kept] = self._amplitudes[self._end - kept:self._end]
             self._amplitudes, self._end = room, kept
-        self._amplitudes[self._end] = amplitudes
-        self._end += 1
+        self._amplitudes[self._end:self._end + count] = amplitudes
+        self._end += count
 
     def _window(self) -> ComplexArray:
         """Return the amplitudes (cycle, channel, order) of the latest N_t cycles, read-only."""
@@ -197,30 +262,41 @@ class ShaftAverager:
         self._next_point = math.ceil(angle) * self._points
 
     def _add_points(self, first: int, points: FloatArray, end: Fraction) -> None:
-        """Put points into their fundamental cycle; add it to the mean if it is whole at `end`."""
-        if len(self._wave) != self._points:
-            self._wave = np.full((self._points, points.shape[1]), np.nan)
+        """Put points into their fundamental cycles; add those that are whole at `end`."""
+        n = self._points
+        if len(self._wave) != n:
+            self._wave = np.full((n, points.shape[1]), np.nan)
         if self._full:
             self._take_wave()
-        whole = math.floor(end) * self._points
+        whole = math.floor(end) * n
         points = points[max(self._next_point - first, 0):]
         while len(points):
-            at = self._next_point % self._points
-            count = min(len(points), self._points - at)
+            at = self._next_point % n
+            cycles = 0 if at else min(len(points), whole - self._next_point) // n
+            if cycles > 0:
+                waves, points = points[:cycles * n], points[cycles * n:]
+                self._next_point += cycles * n
+                self._add_waves(waves.reshape(cycles, n, -1))
+                continue
+            count = min(len(points), n - at)
             self._wave[at:at + count] = points[:count]
             points = points[count:]
             self._next_point += count
-            self._full = at + count == self._points
+            self._full = at + count == n
             if self._full and self._next_point <= whole:
                 self._take_wave()
 
     def _take_wave(self) -> None:
         self._full = False
-        if not self._wave_mean.count:
-            self._first_whole = self._next_point // self._points - 1
-        self._wave_mean.update(self._wave)
+        self._add_waves(self._wave[None])
         if self.settings.averaging == 'sliding':  # which keeps the array
             self._wave = np.empty_like(self._wave)
+
+    def _add_waves(self, waves: FloatArray) -> None:
+        """Add whole fundamental cycles (cycle, angle, channel) to the mean."""
+        if not self._wave_mean.count:
+            self._first_whole = self._next_point // self._points - len(waves)
+        self._wave_mean.update(waves)
 
     def _slide(self) -> None:
         """Drop the cycles that are no longer in a sliding window."""

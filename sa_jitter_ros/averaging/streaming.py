@@ -11,20 +11,21 @@
 """
 The on-line average: samples and pulses in, in blocks of any size, averages out.
 
-A trigger cycle is averaged as soon as its two pulses, the other pulses that the angle law uses and
-the samples around it are there. The result depends on the data only: not on the sizes of the
-blocks, and not on whether pulses arrive before or after their samples. A cycle without its samples
-is discarded and counted, and it ends the unfinished averages.
+A trigger cycle is taken as soon as its two pulses, the other pulses that the angle law uses and
+the samples around it are there; all that are there are taken together. The result depends on the
+data only: not on the sizes of the blocks, and not on whether pulses arrive before or after their
+samples. A cycle without its samples is discarded and counted, and it ends the unfinished averages.
 """
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.shaft import TOGETHER
 from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law
@@ -34,19 +35,41 @@ from sa_jitter_ros.samples import SampleBlock
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Trigger:
-    """
-    A trigger pulse at `time` (s).
+#: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here. `epoch` is how often
+#: time ran back before; `elapsed` the time (s) since the first pulse, without the steps back.
+TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.int64),
+                    ('starts_run', np.bool_)])
 
-    `starts_run`: no trigger cycle ends here. `epoch` is how often time ran back before; `elapsed`
-    the time (s) since the first pulse, without the steps back.
-    """
 
-    time: float
-    starts_run: bool
-    epoch: int
-    elapsed: float
+class TriggerQueue:
+    """Trigger pulses in an array (`items`), added at the end and removed at the start."""
+
+    def __init__(self) -> None:
+        self._data = np.empty(64, TRIGGER)
+        self._begin = self._end = 0
+
+    def __len__(self) -> int:
+        """Return the number of pulses."""
+        return self._end - self._begin
+
+    @property
+    def items(self) -> NDArray[Any]:
+        """Return the pulses, without a copy."""
+        return self._data[self._begin:self._end]
+
+    def append(self, items: NDArray[Any]) -> None:
+        """Add pulses behind the last one."""
+        if self._end + len(items) > len(self._data):
+            kept = self.items
+            self._data = np.empty(2 * (len(kept) + len(items)), TRIGGER)
+            self._data[:len(kept)] = kept
+            self._begin, self._end = 0, len(kept)
+        self._data[self._end:self._end + len(items)] = items
+        self._end += len(items)
+
+    def drop(self, count: int) -> None:
+        """Remove the first `count` pulses."""
+        self._begin += count
 
 
 @dataclass
@@ -95,7 +118,7 @@ class StreamingAverager:
         self._pulse_counts = PulseCounts()  # of earlier validators
         self.shafts = {name: CorrectingAverager(settings) for name, settings in shafts.items()}
         self._law = angle_law(next(iter(shafts.values())).angle_law)
-        self._triggers: list[Trigger] = []  # of which the next cycle begins at _next
+        self._triggers = TriggerQueue()  # of which the next cycle begins at _next
         self._next = 0
         self._run = 0  # where the run of the next cycle begins
         self._pulse_epoch = 0
@@ -151,11 +174,11 @@ class StreamingAverager:
         self._ended = True
         self.timeline.close()
         averages = self._process()
-        waiting = self._triggers[self._next:]
-        count = sum(not item.starts_run for item in waiting[1:])
+        waiting = self._triggers.items[self._next:]
+        count = int(np.count_nonzero(~waiting['starts_run'][1:]))
         if count:
-            self._discard(count, f'no vibration from {waiting[0].time:.6f} s on')
-        self._triggers.clear()
+            self._discard(count, f'no vibration from {waiting["time"][0]:.6f} s on')
+        self._triggers = TriggerQueue()
         self._next = 0
         self._begin_run()
         due, self._due = self._due, []
@@ -172,7 +195,7 @@ class StreamingAverager:
         self._pulse_counts += self.validator.finish()
         self.validator = validator
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
-        self._triggers.clear()
+        self._triggers = TriggerQueue()
         self._next = 0
         self._begin_run()
 
@@ -185,32 +208,49 @@ class StreamingAverager:
     # --- pulses ---
 
     def _queue(self, triggers: TriggerPulses) -> None:
-        for number, (time, starts, restarted) in enumerate(zip(
-                triggers.times.tolist(), triggers.starts_run.tolist(),
-                triggers.restarted.tolist())):
+        if not triggers.times.size:
+            return
+        items = np.empty(triggers.times.size, TRIGGER)
+        epochs = self._epochs(triggers)
+        items['time'], items['epoch'] = triggers.times, epochs
+        items['starts_run'] = triggers.starts_run | (
+            np.diff(epochs, prepend=self._pulse_epoch) != 0)
+        self._pulse_epoch = int(epochs[-1])
+        before = self._triggers.items[-1:]
+        if not len(before):
+            items['starts_run'][0] = True
+            before = items[:1].copy()
+            before['elapsed'] = 0.0
+        steps = np.diff(triggers.times, prepend=before['time'][0])
+        items['elapsed'] = before['elapsed'][0] + np.cumsum(np.maximum(steps, 0.0))
+        self._triggers.append(items)
+
+    def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
+        """Return the epoch of each pulse."""
+        # If the pulse times ran back, those of the vibration did so, too, or will.
+        earliest = self._pulse_epoch + np.cumsum(triggers.restarted)
+        if {item.epoch for item in self.timeline.segments} <= {self.timeline.epoch}:
+            reached = max(int(earliest[0]), self.timeline.epoch)
+            return np.asarray(reached + earliest - earliest[0])
+        epochs, epoch, times = [], self._pulse_epoch, triggers.times.tolist()
+        for number, restarted in enumerate(triggers.restarted.tolist()):
             # The first pulses may lie before the vibration: the third one decides the epoch.
-            reach = time if self._triggers else triggers.times[number:number + 3][-1]
-            # If the pulse times ran back, those of the vibration did so, too, or will.
-            epoch = self.timeline.epoch_near(reach, self._pulse_epoch + restarted)
-            starts = starts or epoch != self._pulse_epoch
-            self._pulse_epoch = epoch
-            last = self._triggers[-1] if self._triggers else Trigger(time, True, 0, 0.0)
-            self._triggers.append(Trigger(time, starts or not self._triggers, self._pulse_epoch,
-                                          last.elapsed + max(time - last.time, 0.0)))
+            reach = times[number] if self._triggers or number else times[:3][-1]
+            epoch = self.timeline.epoch_near(reach, epoch + restarted)
+            epochs.append(epoch)
+        return np.array(epochs)
 
     def _bound_pulses(self) -> None:
         """Drop and count pulses that wait for their vibration longer than `buffer_seconds`."""
         limit = self.timeline.buffer_seconds
-        waiting = self._triggers[self._next:]
-        if not waiting or waiting[-1].elapsed - waiting[0].elapsed <= limit:
+        waiting = self._triggers.items[self._next:]
+        if not len(waiting) or waiting['elapsed'][-1] - waiting['elapsed'][0] <= limit:
             return
-        if waiting[0].epoch > self.timeline.epoch:
+        if waiting['epoch'][0] > self.timeline.epoch:
             # The times of the vibration do not run back: the pulses belong to its present epoch.
             self._pulse_epoch = self.timeline.epoch
-            self._triggers[self._next:] = [
-                replace(item, epoch=self._pulse_epoch) for item in waiting]
-        keep = next(i for i, item in enumerate(waiting)
-                    if waiting[-1].elapsed - item.elapsed <= limit)
+            waiting['epoch'] = self._pulse_epoch
+        keep = int(np.argmax(waiting['elapsed'][-1] - waiting['elapsed'] <= limit))
         if keep:
             self.counts.pulses_dropped += keep * self.validator.pulses_per_trigger
             self._discard(keep, f'{keep} trigger pulses waited longer than buffer_seconds = '
@@ -222,101 +262,132 @@ class StreamingAverager:
 
     def _process(self) -> list[tuple[str, Average]]:
         while len(self._triggers) - self._next >= 2:
-            start, end = self._triggers[self._next:self._next + 2]
-            if end.starts_run or end.epoch != start.epoch:
+            items = self._triggers.items
+            times = items['time']
+            stop = self._run_end()
+            if stop == self._next + 1:
                 self._break_run()
                 continue
-            after, closed = self._pulses_after()
-            first = self._next == self._run
-            if not closed and after < (self._law.after_first if first else self._law.after):
+            ready = self._ready(stop)
+            if ready < 1:
                 break
-            segment = self._locate(start, end)
+            start, end = float(times[self._next]), float(times[self._next + 1])
+            segment = self._locate(int(items['epoch'][self._next]), start, end)
             if segment is None:
                 break
             if isinstance(segment, str):
-                count = self._uncovered()
-                end = self._triggers[self._next + count]
-                self._discard(count, f'no vibration without a gap from {start.time:.6f} s to '
-                              f'{end.time:.6f} s{segment}')
+                count = self._uncovered(stop)
+                end = float(times[self._next + count])
+                self._discard(count, f'no vibration without a gap from {start:.6f} s to '
+                              f'{end:.6f} s{segment}')
                 continue
-            self._hand_over(segment)
-            self._next += 1
+            count = self._together(segment, times[self._next:self._next + ready + 1])
+            self._hand_over(segment, count, stop)
+            self._next += count
         self._forget_used()
         due, self._due = self._due, []
         return due
 
-    def _uncovered(self) -> int:
+    def _run_end(self) -> int:
+        """Return the number of the pulse behind the last one of the next cycle's run."""
+        items = self._triggers.items
+        begins = items['starts_run'][self._next + 1:]
+        number = int(np.argmax(begins)) if len(begins) else 0
+        return self._next + 1 + number if len(begins) and begins[number] else len(items)
+
+    def _ready(self, stop: int) -> int:
+        """Return how many cycles, from the next one on, have the pulses that the law may use."""
+        count = stop - self._next - 1
+        if stop < len(self._triggers) or self._ended:
+            return count
+        if self._next == self._run and count - 1 < self._law.after_first:
+            return 0
+        return count - self._law.after
+
+    def _together(self, segment: Segment, times: FloatArray) -> int:
+        """Return how many of the cycles between `times` can be handed over together."""
+        rate = segment.clock.rate
+        positions = (times[1:] - segment.clock.time) * rate + (segment.clock.index - segment.index)
+        last = len(segment.samples) - 1
+        if segment.closed:
+            inside = int(np.searchsorted(positions, last + 1e-6, 'right'))
+        else:
+            inside = int(np.searchsorted(positions, last, 'right'))
+            if inside > 1:
+                longest = float(np.diff(times[:inside + 1]).max())
+                inside = int(np.searchsorted(positions, last - self._margin(longest, rate),
+                                             'right'))
+        room = min(item.room for item in self.shafts.values())
+        size = max(int(TOGETHER / segment.samples.shape[1]), 1)
+        reach = int(np.searchsorted(positions, segment.position(float(times[0])) + size, 'right'))
+        count = max(min(inside, room, reach), 1)
+        usable = np.ones(count, np.bool_)
+        for shaft in self.shafts.values():
+            usable &= shaft.usable(np.diff(times[:count + 1]), rate)
+        return count if usable.all() else max(int(np.argmin(usable)), 1)
+
+    def _margin(self, period: float, rate: float) -> int:
+        """Return the samples that a cycle of `period` s needs on either side, for any shaft."""
+        return max(item.margin(period, rate) for item in self.shafts.values())
+
+    def _uncovered(self, stop: int) -> int:
         """Return the number of cycles, from the next one on, whose vibration will not come."""
+        items = self._triggers.items
+        epoch, times = int(items['epoch'][self._next]), items['time'][self._next:stop].tolist()
         count = 1
-        for start, end in pairwise(self._triggers[self._next + 1:]):
-            if (end.starts_run or end.epoch != start.epoch
-                    or not isinstance(self._locate(start, end), str)):
-                break
+        while count < len(times) - 1 and isinstance(
+                self._locate(epoch, times[count], times[count + 1]), str):
             count += 1
         return count
 
-    def _pulses_after(self) -> tuple[int, bool]:
-        """Return the pulses behind the next cycle that the law may use, and if the run ended."""
-        count = 0
-        for item in self._triggers[self._next + 2:self._next + 2 + self._law.after_first]:
-            if item.starts_run:
-                return count, True
-            count += 1
-        return count, self._ended
-
-    def _locate(self, start: Trigger, end: Trigger) -> Segment | str | None:
+    def _locate(self, epoch: int, start: float, end: float) -> Segment | str | None:
         """Return the segment of a cycle, None if it may come, else a remedy (text)."""
         timeline = self.timeline
-        if start.epoch > timeline.epoch:
+        if epoch > timeline.epoch:
             return None
         ahead = True
         for segment in timeline.segments:
-            if segment.epoch != start.epoch or not len(segment.samples):
+            if segment.epoch != epoch or not len(segment.samples):
                 continue
-            low, high = segment.position(start.time), segment.position(end.time)
+            low, high = segment.position(start), segment.position(end)
             last = len(segment.samples) - 1
             ahead = low > last
             if low < -1e-6 or ahead:
                 continue
-            margin = max(item.margin(end.time - start.time, segment.clock.rate)
-                         for item in self.shafts.values())
+            margin = self._margin(end - start, segment.clock.rate)
             if last >= high + margin or (segment.closed and last >= high - 1e-6):
                 return segment
             if not segment.closed:
                 return None
             break
-        if ahead and start.epoch == timeline.epoch:
+        if ahead and epoch == timeline.epoch:
             return None
         if timeline.layout is not None:
             rate = timeline.layout[1]
-            margin = max(item.margin(end.time - start.time, rate) for item in self.shafts.values())
-            if end.time - start.time + 2 * margin / rate > timeline.buffer_seconds:
+            margin = self._margin(end - start, rate)
+            if end - start + 2 * margin / rate > timeline.buffer_seconds:
                 return (' (the cycle is longer than buffer_seconds = '
                         f'{timeline.buffer_seconds:g} s: raise it)')
         return ''
 
-    def _hand_over(self, segment: Segment) -> None:
-        """Average the next cycle for every shaft."""
+    def _hand_over(self, segment: Segment, count: int, stop: int) -> None:
+        """Average the next `count` cycles, of a run that ends before pulse `stop`."""
         begin = max(self._run, self._next - self._law.before, 0)
-        stop = self._next + 2
-        for item in self._triggers[stop:stop + self._law.after_first]:
-            if item.starts_run:
-                break
-            stop += 1
-        pulses = np.array([item.time for item in self._triggers[begin:stop]])
+        stop = min(stop, self._next + count + 1 + self._law.after_first)
+        pulses = self._triggers.items['time'][begin:stop].copy()
         first = self._next - begin
-        low, high = (segment.position(float(pulse)) for pulse in pulses[first:first + 2])
+        low, high = (segment.position(float(pulses[i])) for i in (first, first + count))
         self.timeline.counts.samples_dropped += segment.use(low, high)
         failed, clock = '', segment.clock
-        self._lead = 0.0
+        longest = float(np.diff(pulses[first:first + count + 1]).max())
+        margin = self._margin(longest, clock.rate)
+        self._lead = 1.5 * margin / clock.rate
+        cycles = CycleSamples.cut(
+            segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses, first=first,
+            margin=margin, offset=segment.index - clock.index, count=count)
         for name, shaft in self.shafts.items():
-            margin = shaft.margin(float(pulses[first + 1] - pulses[first]), clock.rate)
-            self._lead = max(self._lead, 1.5 * margin / clock.rate)
-            cycle = CycleSamples.cut(
-                segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses,
-                first=first, margin=margin, offset=segment.index - clock.index)
             try:
-                average = shaft.update(cycle)
+                average = shaft.update(cycles)
             except SignalError as error:  # the other shafts continue
                 self.counts.averages_dropped += shaft.reset()
                 failed = f'{name}: {error}'
@@ -326,17 +397,16 @@ class StreamingAverager:
         if failed:
             self.counts.cycles_dropped += 1
             self._messages.append(f'{failed}: trigger cycle discarded')
-        self.counts.cycles += 1
-        self._speed = (self._speed[0] + 1,
-                       self._speed[1] + float(pulses[first + 1] - pulses[first]))
+        self.counts.cycles += count
+        self._speed = (self._speed[0] + count,
+                       self._speed[1] + float(pulses[first + count] - pulses[first]))
 
     def _discard(self, count: int, why: str) -> None:
         """Discard the next `count` cycles; the angle begins at 0 behind them."""
         self.counts.cycles_dropped += count
         self._messages.append(f'{why}: {count} trigger cycle{"s" if count > 1 else ""} discarded')
         self._next += count
-        if self._next < len(self._triggers):
-            self._triggers[self._next] = replace(self._triggers[self._next], starts_run=True)
+        self._triggers.items['starts_run'][self._next:self._next + 1] = True
         self._begin_run()
 
     def _break_run(self) -> None:
@@ -356,9 +426,9 @@ class StreamingAverager:
         """Drop the samples before the next cycle, and the pulses that the law needs no more."""
         if not self._triggers:
             return
-        head = self._triggers[min(self._next, len(self._triggers) - 1)]
-        self.timeline.release(head.epoch, head.time - self._lead)
+        head = self._triggers.items[min(self._next, len(self._triggers) - 1)]
+        self.timeline.release(int(head['epoch']), float(head['time']) - self._lead)
         keep = max(self._run, self._next - self._law.before, 0)
-        del self._triggers[:keep]
+        self._triggers.drop(keep)
         self._next -= keep
         self._run -= keep

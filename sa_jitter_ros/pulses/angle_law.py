@@ -220,3 +220,22 @@ def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) ->
         raise SignalError(f'pulse times {near.tolist()} s do not increase: remove repeated and '
                           'misplaced pulses first, as PulseValidator does')
     return law.fraction_times(near, cycle - first, u)
+
+
+def run_times(law: AngleLaw, pulses: FloatArray, first: int, origins: FloatArray, u: FloatArray
+              ) -> FloatArray:
+    """
+    Return the times (cycle, u) of consecutive cycles, as `cycle_times` does for one.
+
+    The first begins at `pulses[first]`. Each has a number in `origins` (cycle,), from which its
+    times count; they are as accurate as these are near. The fractions `u` are the same in all
+    cycles, (u,), or those of each, (cycle, u). Raises `SignalError` unless the pulse times
+    increase.
+    """
+    if law is LINEAR_LAW:
+        near = pulses[first:first + len(origins) + 1]
+        periods = near[1:] - near[:-1]
+        if np.all(periods > 0.0):
+            return np.asarray((near[:-1] - origins)[:, None] + periods[:, None] * u)
+    return np.stack([cycle_times(law, pulses - origin, first + k, u[k] if u.ndim == 2 else u)
+                     for k, origin in enumerate(origins)])

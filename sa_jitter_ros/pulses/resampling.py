@@ -40,6 +40,7 @@ _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
 _DEGREE = {'band_limited': 7, 'linear': 1, 'cubic': 3, 'spline': 3}
 METHODS = tuple(_HALF_WIDTH)
 _KAISER_BETA = 9.0
+_PIECE = 1 << 14  # positions whose weights are in memory at once
 
 
 def _kernel(method: str, x: FloatArray, half: int) -> FloatArray:
@@ -146,30 +147,52 @@ def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'ba
     if samples.ndim != 2 or positions.ndim != 1:
         raise SignalError(f'samples have {samples.ndim} dimensions, positions {positions.ndim}: '
                           'give (sample, channel) and (position,)')
-    polynomials = _polynomials(_known(method), cutoff)
-    half = polynomials.shape[1] // 2
-    if positions.size == 0:
-        return np.empty((0, samples.shape[1]))
-    low, high = float(positions.min()), float(positions.max())
-    if not (low >= 0.0 and high <= len(samples) - 1):
-        raise SignalError(f'positions {low:.6g} to {high:.6g} are not within samples 0 to '
-                          f'{len(samples) - 1}: give positions within the samples')
-    base = np.floor(positions)
-    powers = np.ones((len(polynomials), len(positions)))
-    np.subtract(2.0 * (positions - base), 1.0, out=powers[1])
-    for k in range(2, len(powers)):
-        np.multiply(powers[k - 1], powers[1], out=powers[k])
-    weights = powers.T @ polynomials
+    if positions.size and not (positions.min() >= 0.0 and positions.max() <= len(samples) - 1):
+        raise SignalError(f'positions {positions.min():.6g} to {positions.max():.6g} are not '
+                          f'within samples 0 to {len(samples) - 1}: give positions within the '
+                          'samples')
+    index = np.floor(positions)
+    return interpolate_between(samples, index.astype(np.int32), positions - index, method=method,
+                               cutoff=cutoff)
 
-    first, last = int(low) - half + 1, int(high) + half
+
+def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction: FloatArray, *,
+                        method: str, cutoff: float = 1.0) -> FloatArray:
+    """
+    Return `samples` (n, channels) a `fraction` (m,) of a sample behind samples `index` (m,).
+
+    As `interpolate`, for positions whose whole part is known, which must lie within the samples.
+    """
+    polynomials = _polynomials(_known(method), cutoff)
+    taps = polynomials.shape[1]
+    values = np.empty((index.size, samples.shape[1]))
+    if not index.size:
+        return values
+    half = taps // 2
+    first, last = int(index.min()) - half + 1, int(index.max()) + half
     window = samples[max(first, 0):last + 1]
     if first < 0 or last >= len(samples):
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
                         mode='reflect', reflect_type='odd')
-    taps = 2 * half
-    columns = np.repeat(base.astype(np.int32) - (half - 1 + first), taps).reshape(-1, taps)
-    columns += np.arange(taps, dtype=np.int32)
-    rows = np.arange(0, taps * len(positions) + 1, taps, dtype=np.int32)
-    operator = sparse.csr_matrix((weights.ravel(), columns.ravel(), rows),
-                                 shape=(len(positions), len(window)))
-    return np.asarray(operator @ window)
+    begin = index - np.int32(first + half - 1)
+    for start in range(0, index.size, _PIECE):
+        piece = slice(start, start + _PIECE)
+        values[piece] = _operator(polynomials, begin[piece], fraction[piece], len(window)) @ window
+    return values
+
+
+def _operator(polynomials: FloatArray, begin: NDArray[np.int32], fraction: FloatArray,
+              samples: int) -> sparse.csr_matrix:
+    """Return the matrix of the weights of `samples`; those of a position begin at `begin`."""
+    taps = polynomials.shape[1]
+    powers = np.empty((len(polynomials), begin.size))
+    powers[0] = 1.0
+    np.multiply(fraction, 2.0, out=powers[1])
+    powers[1] -= 1.0
+    for k in range(2, len(powers)):
+        np.multiply(powers[k - 1], powers[1], out=powers[k])
+    weights = powers.T @ polynomials
+    columns = begin[:, None] + np.arange(taps, dtype=np.int32)
+    rows = np.arange(0, taps * begin.size + 1, taps, dtype=np.int32)
+    return sparse.csr_matrix((weights.ravel(), columns.ravel(), rows),
+                             shape=(begin.size, samples))
