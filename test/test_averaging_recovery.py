@@ -12,6 +12,8 @@
 
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.pulse_error_fit import (
+    _CHANCES, _SIZES, estimated_size, Tridiagonal)
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.signal import lfilter
@@ -167,13 +169,67 @@ def test_noise_that_rings_at_an_order_is_mostly_refused(quality, most):
     assert accepted <= most
 
 
+def test_expected_errors_are_as_small_as_noise_demands(rng):
+    """They come closer than no errors at all, as much as their variance says."""
+    left, stated, size = [], [], []
+    for _ in range(6):
+        errors = jitter(rng, 0.1)
+        cycles, pulses = simulate(rng, errors, MESH, noise=4.0)
+        found = recover(cycles, pulses, declared=declared(0.1))
+        assert found.accepted
+        assert np.std(found.expected) < 0.9 * np.std(found.errors)
+        left.append((found.expected - (errors - errors.mean())) ** 2)
+        stated.append(found.covariance[0] / SPEED**2)
+        size.append(errors**2)
+    assert np.mean(left) < 0.7 * np.mean(size)
+    assert np.mean(left) == pytest.approx(np.mean(stated), rel=4.0 * np.sqrt(2.0 * 1.3 / 606.0))
+
+
 def test_noise_that_leaves_errors_unknown_is_refused(rng):
-    errors = jitter(rng, 0.1)
-    cycles, pulses = simulate(rng, errors, MESH, noise=4.0)
-    found = recover(cycles, pulses, declared=declared(0.1))
+    errors = jitter(rng, 0.02)
+    cycles, pulses = simulate(rng, errors, MESH, noise=3.0)
+    found = recover(cycles, pulses, declared=declared(0.02))
     assert not found.accepted
     assert not found.errors.any()
-    assert 'add more error than it removes' in found.reason
+    assert not found.expected.any()
+    assert 'of the variance of the pulse errors, not more than 5%' in found.reason
+
+
+@pytest.mark.parametrize('scale', [0.2, 1.0, 5.0])
+def test_the_size_of_the_errors_is_estimated(rng, scale):
+    width, sizes = 0.1, []
+    for _ in range(4):
+        errors = jitter(rng, width)
+        cycles, pulses = simulate(rng, errors, MESH, noise=0.3)
+        found = recover(cycles, pulses, declared=declared(width) / scale)
+        assert found.accepted
+        assert found.shown > 0.9
+        assert found.evidence > 20.0
+        sizes.append(found.std / np.std(errors))
+    # grid of sizes 1.16 apart, of which the declared one is likeliest
+    assert np.mean(sizes) == pytest.approx(1.0, abs=0.05)
+
+
+def test_restricted_likelihood_leaves_out_the_delay_of_all_pulses(rng):
+    """Against the likelihood with all errors integrated numerically: a wide prior of the delay."""
+    information = Tridiagonal(rng.uniform(2.0, 4.0, 12), rng.uniform(-0.9, 0.9, 11))
+    dense = (np.diag(information.diagonal) + np.diag(information.off_diagonal, 1)
+             + np.diag(information.off_diagonal, -1))
+    right = rng.normal(0.0, 2.0, 12)
+    found = []
+    for size in 0.7 * _SIZES:
+        covariance = size**2 * np.eye(12) + 1e8
+        shrunk = np.linalg.inv(np.linalg.inv(covariance) + dense)
+        found.append(0.5 * (right @ shrunk @ right - np.linalg.slogdet(
+            np.eye(12) + covariance @ dense)[1]))
+    chance = np.exp(np.array(found) - np.max(found)) * _CHANCES
+    mean = np.exp(np.log(0.7 * _SIZES) @ chance / chance.sum())
+    assert estimated_size(information, right, 0.7) == pytest.approx(mean, rel=1e-4)
+    variance = information.covariance()
+    centred = np.eye(12) - 1.0 / 12.0
+    exact = centred @ np.linalg.inv(dense) @ centred
+    np.testing.assert_allclose(variance[0], np.diag(exact))
+    np.testing.assert_allclose(variance[1, :-1], np.diag(exact, 1))
 
 
 def test_noise_channels_and_constant_channels_add_nothing(rng):

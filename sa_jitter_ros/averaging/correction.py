@@ -15,19 +15,30 @@ from dataclasses import replace
 import math
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.noise import attenuation
-from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.averaging.pulse_error_fit import variance_within
+from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 
 FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 
-_REACH = 0.02  # largest correction of a pulse, a fraction of a trigger cycle
-# Largest uncertainty of the phase (rad) of an order by that of the recovered errors. Beyond it the
-# noise of the order determines the errors, and the correction would raise the amplitude of noise.
-_UNCERTAIN = 0.3
+_REACH = 0.06  # largest correction of a pulse, a fraction of a trigger cycle
+# Largest uncertainty of the phase (rad) of an order by that of the expected errors.
+_UNCERTAIN = 1.0
+# Noise over amplitude, both squared, up to which the whole correction counts (19.3 dB), and from
+# which on it counts as far as it is worth so many times that, and as pulse errors are evident.
+_CLEAR, _WEAK, _CAUTION = 0.0118, 0.015, 3.0
+# Loss of an order by what is uncertain of the errors: the same for them.
+_SURE, _AMBIGUOUS = 0.05, 0.3
+# Evidence that noise has by chance, how fast more of it is rarer, and what noise never has.
+_DOUBT, _DECAY, _EVIDENT = 2.0, 3.0, 10.0
+_TINY = float(np.finfo(np.float64).tiny)
+_U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(6), (1.0, 0.0)))
 
 
 class CorrectingAverager:
@@ -103,25 +114,80 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         grid, periods=np.diff(raw.pulses), cycle_length=settings.cycle_length,
         first_angle=raw.first_angle, additional_orders=settings.orders,
         declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
-    corrected = raw
-    largest, reach = np.abs(recovery.errors).max(), _REACH * np.diff(raw.pulses).min()
+    corrected, unsure = raw, np.zeros(raw.amplitudes.shape)
+    largest, reach = np.abs(recovery.expected).max(), _REACH * np.diff(raw.pulses).min()
     if largest > reach:
-        recovery = replace(recovery, accepted=False, errors=np.zeros_like(recovery.errors),
+        none = np.zeros_like(recovery.errors)
+        recovery = replace(recovery, accepted=False, errors=none, expected=none,
                            reason=f'a pulse error of {largest:.3g} s is above {reach:.3g} s, '
                                   f'{_REACH:.0%} of a trigger cycle: check the pulses')
     elif recovery.accepted:
-        corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.errors)
-    phase = np.zeros(len(raw.orders))
-    if recovery.accepted:
-        frequency = raw.orders * settings.cycle_length / np.diff(raw.pulses).mean()
-        phase = 2.0 * np.pi * frequency * math.sqrt(np.mean(recovery.standard_errors**2))
-        corrected = replace(corrected, amplitudes=np.where(
-            phase <= _UNCERTAIN, corrected.amplitudes, np.nan))
-    ratio, error = attenuation(raw.amplitudes, corrected.amplitudes, corrected.noise)
+        corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
+        amplitudes, unsure = _amplitudes(raw, corrected, recovery)
+        corrected = replace(corrected, amplitudes=amplitudes)
+    turned = _mean_phasor(raw.orders, recovery.expected * settings.cycle_length / np.mean(
+        np.diff(raw.pulses)))
+    ratio, error = attenuation(raw.amplitudes, corrected.amplitudes, corrected.noise, turned)
     return Correction(
-        corrected.waveform, corrected.amplitudes, corrected.noise, recovery.errors,
+        corrected.waveform, corrected.amplitudes, corrected.noise,
+        np.where(recovery.resolved | (not recovery.accepted), recovery.errors, np.nan),
         recovery.standard_errors, recovery.accepted, recovery.reason, ratio,
-        np.hypot(error, ratio * phase**2 / 2.0), corrected.cycle_amplitudes)
+        np.hypot(error, ratio * unsure), corrected.cycle_amplitudes)
+
+
+def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
+                ) -> tuple[ComplexArray, FloatArray]:
+    """
+    Return the amplitudes (channel, order) that raw and `aligned` average show together.
+
+    `aligned` is that between the expected pulses. What is uncertain of their errors makes an order
+    smaller there; in an order that has told the errors the noise has aligned itself, too, and it
+    is larger (`PulseErrorRecovery.aligned`). The factor that makes up for either is uncertain
+    itself. Where noise leaves more of that than the attenuation is worth, the amplitude stays
+    nearer to what it is without the factor or, of an order that has told the errors, to the raw
+    one. An order whose phase is uncertain by more than `_UNCERTAIN` has none.
+
+    The second result (channel, order) is the relative standard error that the factors add.
+    """
+    variance = variance_within(recovery.covariance, _U)
+    left = (np.exp(-2.0 * (np.pi * raw.orders[:, None, None]) ** 2 * variance) @ _U_WEIGHT
+            ).mean(axis=1)
+    lost = 1.0 / left - 1.0
+    size = np.maximum(np.abs(raw.amplitudes), _TINY)
+    noise = np.nan_to_num(2.0 * aligned.noise**2, nan=np.inf)
+    told, factor = np.zeros(size.shape, np.bool_), np.ones(size.shape)
+    for order, of_one, ratio in zip(recovery.orders, recovery.noise.T, recovery.aligned.T):
+        same = np.isclose(raw.orders, order, rtol=1e-9, atol=0.0) & np.isfinite(ratio)[:, None]
+        told |= same
+        factor = np.where(same, 1.0 / ratio[:, None], factor)
+        noise = np.where(same, of_one[:, None] ** 2 / raw.trigger_cycles, noise)
+    whole = aligned.amplitudes * np.where(told, factor, 1.0 + lost)
+    start = np.where(told, raw.amplitudes, aligned.amplitudes)
+    # Noise that has aligned itself makes an order clear by chance: without evidence it is as clear
+    # as the raw one.
+    evident = recovery.evidence > _EVIDENT
+    noise = noise / (np.fmax(size, np.abs(whole)) if evident else size) ** 2
+    unsure = np.clip((noise - _CLEAR) / (_WEAK - _CLEAR), 0.0, 1.0)
+    doubt = _CAUTION * np.where(unsure > 0.0, unsure * noise, 0.0)
+    gained = np.where(told, np.abs(whole) / size - 1.0, lost)
+    share = np.maximum(gained - doubt, 0.0) / np.maximum(gained + doubt, _TINY)
+    ambiguous = np.clip((1.0 - left - _SURE) / (_AMBIGUOUS - _SURE), 0.0, 1.0)
+    chance = math.exp(-max(recovery.evidence - _DOUBT, 0.0) / _DECAY)
+    share = share * np.where(told, 1.0 - np.maximum(unsure, ambiguous) * chance, 1.0)
+    amplitudes = start + share * (whole - start)
+    withheld = np.abs(whole) / np.maximum(np.abs(amplitudes), _TINY) - 1.0
+    # The factor is as uncertain as the size of the errors, to which N_t cycles contribute what
+    # the vibration shows of each.
+    unsure_factor = lost / recovery.shown * math.sqrt(2.0 / raw.trigger_cycles)
+    known = left > math.exp(-0.5 * _UNCERTAIN**2)
+    return np.where(known, amplitudes, np.nan), np.hypot(withheld, unsure_factor)
+
+
+def _mean_phasor(orders: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return the length (order,) of the mean phasor that pulse `errors` (cycles) make."""
+    path = errors[:-1, None] * (1.0 - _U) + errors[1:, None] * _U
+    phasors = np.exp(2j * np.pi * orders[:, None, None] * path) @ _U_WEIGHT
+    return np.asarray(np.abs(phasors.mean(axis=1)))
 
 
 def _uncorrected(raw: Average, reason: str) -> Correction:

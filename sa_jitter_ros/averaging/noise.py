@@ -72,22 +72,24 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
     return np.asarray(clean)
 
 
-def attenuation(raw: ComplexArray, corrected: ComplexArray, noise: FloatArray
-                ) -> tuple[FloatArray, FloatArray]:
+def attenuation(raw: ComplexArray, corrected: ComplexArray, noise: FloatArray,
+                correlation: FloatArray | float) -> tuple[FloatArray, FloatArray]:
     """
     Return the attenuation, raw over corrected amplitude, and its standard error due to `noise`.
 
-    The noise of the two amplitudes is the same except for the attenuation, which is therefore its
-    correlation. Both are NaN or infinite where the corrected amplitude is 0 or NaN.
+    The two amplitudes hold the same noise but for the turns of the correction: `correlation` is
+    the length of their mean phasor. Both results are NaN or infinite where the corrected amplitude
+    is 0 or NaN.
 
-    >>> ratio, error = attenuation(np.array([0.8j]), np.array([1.0 + 0.0j]), np.array([0.01]))
+    >>> ratio, error = attenuation(np.array([0.8j]), np.array([1.0 + 0.0j]), np.array([0.01]), 0.8)
     >>> ratio.round(3), error.round(3)
     (array([0.8]), array([0.006]))
     """
     with np.errstate(divide='ignore', invalid='ignore'):
         amplitude = np.abs(corrected)
         ratio = np.abs(raw) / amplitude
-        error = noise / amplitude * np.sqrt(np.maximum(1.0 - ratio**2, 0.0))
+        apart = 1.0 + ratio**2 - 2.0 * ratio * correlation
+        error = noise / amplitude * np.sqrt(np.maximum(apart, 0.0))
     return np.asarray(ratio), np.asarray(error)
 
 

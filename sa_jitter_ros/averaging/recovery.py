@@ -17,17 +17,19 @@ of the pulse errors (`pulse_error_fit`). All channels and orders make one least-
 with a tridiagonal normal matrix, so that the time of a Gauss-Newton step is proportional to the
 number of pulses.
 
-Three rules prevent wrong corrections. Only orders above the noise are used, each channel and order
-with the weight of its noise. An order whose phase the errors may turn by half a cycle is used only
-after lower orders have limited the errors. A recovery whose standard error is not below the
-declared jitter is refused, because it would align the noise of the cycles and raise amplitudes. A
-delay common to all pulses cannot be recovered: the errors have mean zero.
+Only orders above the noise are used, each channel and order with the weight of its noise. An order
+whose phase the errors may turn by half a cycle is used only after lower orders have limited the
+errors. The size of the errors is estimated with them. Where the vibration tells less of a pulse,
+its expected error is smaller, so that noise is not aligned to itself. A delay common to all pulses
+cannot be recovered: the errors have mean zero.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
 from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
@@ -39,10 +41,17 @@ _UNIFORM_WIDTH = float(np.sqrt(12.0))
 _SAFE_TURNS, _MOST_TURNS = 0.5, 1.1
 # Width of the interval that a fitted error is expected in, in its standard errors.
 _CERTAIN = 5.0
-# Prior of the last fit, in declared standard deviations: wide, for a negligible bias.
-_WEAK_PRIOR = 3.0
-#: Largest standard error of an accepted recovery, in declared standard deviations.
+#: Largest standard error of an error that single pulses resolve, over the size of the errors.
 LARGEST_ERROR = 0.7
+# Least share of the variance of the errors that the vibration must show.
+_LEAST_SHOWN = 0.05
+# Errors that are so many times as large as declared may have been fitted a turn of an order aside,
+# and those with less evidence than this may be noise that has been aligned to itself: they are
+# fitted again from so many times more, or less, than the declared jitter on. The result counts if
+# it has that much more evidence, because the declared size is likely.
+_SUSPICIOUS, _CONVINCING, _WIDER, _UNLIKELY = 1.8, 3.0, 4.0, 2.0
+# Phase in rad beyond which the likelihood of a pulse has several maxima.
+_AMBIGUOUS = 1.0
 # Amplitudes below this fraction of the RMS of a channel are rounding errors.
 _ROUNDING = 1e-9
 _STAGES = 8
@@ -59,20 +68,34 @@ class PulseErrorRecovery:
     """
     Errors of the pulses of one average, recovered from its vibration.
 
-    `errors` (pulse,) are measured minus true times (s) with mean zero. If they are not `accepted`
-    they are all zero, and `reason` says why. `standard_errors` (pulse,) are theirs (s, NaN if
-    nothing could be fitted). `orders` are those used; `amplitudes` (channel, order) their complex
-    peak amplitudes without the errors, at angle 0; `noise` (channel, order) the standard deviation
-    of the complex amplitude of one cycle. `ripple` (cycle,) is the factor of u (1 - u) in the
-    error inside a cycle (s), zero unless `with_ripple`.
+    `errors` (pulse,) are measured minus true times (s) with mean zero, by the vibration alone, and
+    `standard_errors` (pulse,) are theirs (s, NaN if nothing could be fitted). `expected` (pulse,)
+    are the likeliest errors (s) if jitter of the estimated standard deviation `std` (s) is taken
+    into account: those to correct pulses by. If they are not `accepted`, both are all zero, and
+    `reason` says why. `resolved` (pulse,) says where the vibration determines an error without
+    ambiguity, `shown` is the share of the variance of all errors that it shows; `evidence` is the
+    logarithm of the likelihood of errors over that of none.
+    `covariance` (2, pulse) of the expected errors, with the next one in the second row, is in
+    fundamental cycles squared. `orders` are those used; `amplitudes` (channel, order) their
+    complex peak amplitudes without the errors, at angle 0; between the expected pulses they are
+    `aligned` (channel, order) times as large, NaN where a channel does not show the order; `noise`
+    (channel, order) is the standard deviation of the complex amplitude of one cycle. `ripple`
+    (cycle,) is the factor of u (1 - u) in the error inside a cycle (s), zero unless `with_ripple`.
     """
 
     errors: FloatArray
     standard_errors: FloatArray
     accepted: bool
     reason: str
+    expected: FloatArray
+    covariance: FloatArray
+    resolved: NDArray[np.bool_]
+    std: float
+    shown: float
+    evidence: float
     orders: FloatArray
     amplitudes: ComplexArray
+    aligned: FloatArray
     noise: FloatArray
     ripple: FloatArray
 
@@ -111,27 +134,42 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
     """
     cycles, periods = _validated(cycles, periods, cycle_length, declared_standard_deviation)
     declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
-    fit, gain, reason = _staged_fit(
-        cycles, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
-        additional_orders=additional_orders,
-        most_orders=most_orders, declared=declared, with_ripple=with_ripple)
+    attempt = partial(
+        _staged_fit, cycles, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
+        additional_orders=additional_orders, most_orders=most_orders, declared=declared,
+        with_ripple=with_ripple)
+    fit, gain, reason = attempt(expected=declared)
+    if fit is not None and (fit.std > _SUSPICIOUS * declared or fit.evidence < _CONVINCING):
+        other = attempt(expected=declared * (_WIDER if fit.std > declared else 1.0 / _WIDER))
+        if other[0] is not None and other[0].evidence > fit.evidence + _UNLIKELY:
+            fit, gain, reason = other
     if fit is None:
         count, _, channels = cycles.shape
         return PulseErrorRecovery(
-            np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.empty(0),
-            np.empty((channels, 0), np.complex128), np.empty((channels, 0)), np.zeros(count))
+            np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.zeros(count + 1),
+            np.zeros((2, count + 1)), np.zeros(count + 1, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
+            np.empty((channels, 0), np.complex128), np.empty((channels, 0)),
+            np.empty((channels, 0)), np.zeros(count))
 
-    errors = fit.errors * float(np.mean(periods)) / cycle_length
+    expected = fit.expected * float(np.mean(periods)) / cycle_length
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
-        seconds = np.convolve(periods - np.diff(errors), (0.5, 0.5)) / cycle_length
+        seconds = np.convolve(periods - np.diff(expected), (0.5, 0.5)) / cycle_length
         seconds[[0, -1]] *= 2.0
-        errors = fit.errors * seconds
+        expected = fit.expected * seconds
+    expected -= expected.mean()
+    errors = fit.errors * seconds
     errors -= errors.mean()
-    standard_errors = fit.standard_errors * seconds
-    reason = _refusal(errors, standard_errors, periods, declared_standard_deviation, gain)
+    reason = _refusal(fit, expected, periods, declared_standard_deviation, gain)
+    if reason:
+        errors, expected = np.zeros_like(errors), np.zeros_like(errors)
+    # of the orders that determine the errors, each with its weight
+    power = np.sum(np.abs(fit.amplitudes / fit.noise) ** 2, axis=1)
+    order = np.sqrt(np.sum(fit.orders**4 * power) / np.sum(fit.orders**2 * power))
     return PulseErrorRecovery(
-        np.zeros_like(errors) if reason else errors, standard_errors, not reason, reason,
-        fit.orders, fit.amplitudes.T, fit.noise.T, fit.ripple * periods / cycle_length)
+        errors, fit.standard_errors * seconds, not reason, reason, expected, fit.covariance,
+        2.0 * np.pi * order * fit.standard_errors < _AMBIGUOUS, fit.std * float(seconds.mean()),
+        fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, fit.aligned.T, fit.noise.T,
+        fit.ripple * periods / cycle_length)
 
 
 def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, declared: float
@@ -149,14 +187,12 @@ def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, dec
     return cycles, periods
 
 
-def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArray,
-             declared: float, gain: float) -> str:
-    """Return why the errors must not be used for a correction, '' if they can be used."""
-    typical = float(np.sqrt(np.mean(standard_errors**2)))
-    if not typical < LARGEST_ERROR * declared:
-        return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
-                f'{LARGEST_ERROR:g} of the declared jitter, {declared:.3g} s: the correction '
-                'would add more error than it removes; use stronger orders or a quieter channel')
+def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declared: float,
+             gain: float) -> str:
+    """Return why expected errors must not be used for a correction, '' if they can be used."""
+    if not fit.shown > _LEAST_SHOWN:
+        return (f'the vibration shows {fit.shown:.1%} of the variance of the pulse errors, not '
+                f'more than {_LEAST_SHOWN:.0%}: use stronger orders or a quieter channel')
     largest = float(np.max(np.abs(errors)))
     if len(periods) < _FEW_CYCLES and largest > _FAR * declared:
         return (f'a recovered error of {largest:.3g} s is more than {_FAR:g} times the declared '
@@ -174,9 +210,13 @@ def _refusal(errors: FloatArray, standard_errors: FloatArray, periods: FloatArra
 
 def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
-                declared: float, with_ripple: bool) -> tuple[PulseErrorFit | None, float, str]:
+                declared: float, expected: float, with_ripple: bool
+                ) -> tuple[PulseErrorFit | None, float, str]:
     """
     Fit low orders first, then higher ones as the errors become better known.
+
+    `declared` is the standard deviation of the errors that is likeliest beforehand, `expected`
+    the one whose turns of the orders decide which are safe to use.
 
     Returns the fit, the power of the orders without the errors over that with them, and why
     nothing can be fitted.
@@ -187,7 +227,7 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
     most = most_orders + sum(g != round(g) for g in set(additional_orders))
     rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
     known = given if search is None else search.orders
-    width = _UNIFORM_WIDTH * declared  # of the interval that an error is still expected in
+    width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
     errors, used, clear = np.zeros(len(cycles) + 1), np.empty(0), np.empty(0)
     problem = None
@@ -217,10 +257,10 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
         problem = PulseErrorProblem(model, chosen, significant[chosen], with_ripple)
         if first and used[-1] * width > _SAFE_TURNS:
             errors = problem.scan(width)
-        fit = problem.solve(errors, expected=declared)
-        errors = fit.errors
+        fit = problem.solve(errors, declared=declared)
+        errors = fit.expected
         complete = known[-1] * width <= _SAFE_TURNS
-        width = min(width, _CERTAIN * float(np.max(fit.standard_errors)))
+        width = min(width, _CERTAIN * float(np.sqrt(np.max(fit.covariance[0]))))
         spread = max(1.2 * float(np.max(np.abs(np.diff(errors)))), width)
         if complete:
             break
@@ -229,5 +269,4 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
             f'no synchronous order up to {_MOST_TURNS / width:.4g} stands above the noise, and '
             'above it the declared jitter makes phases ambiguous: declare the orders of a gear '
             'mesh, or use a quieter channel')
-    fit = problem.solve(errors, expected=_WEAK_PRIOR * declared)
-    return fit, 1.0 if search is None else search.gain(fit.errors, clear), ''
+    return fit, 1.0 if search is None else search.gain(fit.expected, clear), ''

@@ -44,6 +44,8 @@ _SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
 _CLEAR = 100.0  # times the power of the orders around
+# Candidates, over those wanted, whose lines are separated, and how far apart they must be.
+_TOGETHER, _APART = 2, 0.02
 
 
 @dataclass(frozen=True)
@@ -82,19 +84,44 @@ class LineSearch:
     def strongest(self, errors: FloatArray, most: int, *, below: float
                   ) -> tuple[FloatArray, FloatArray]:
         """
-        Return the `most` strongest orders up to `below`, strongest first, and the clear ones.
+        Return the `most` strongest orders up to `below`, and the clear ones among them.
+
+        Clear orders come first, and of those the ones that tell most of pulse errors.
 
         `errors` (pulse,) of the average, in fundamental cycles, are removed from the phases.
         """
         g = self.orders[self.orders <= below]
         if not len(g):
             return g, g
-        power = self.power(errors, g)
+        lines = self._lines(errors, g)
+        power = np.abs(lines) ** 2
         # With repeated values at the border order 1 could not exceed its background.
-        background = median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='reflect')
-        contrast = np.max(power / np.maximum(background, np.finfo(float).tiny), axis=1)
-        best = np.argsort(-contrast)[:most]
-        return g[best], g[best[contrast[best] > _CLEAR]]
+        background = np.maximum(median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='reflect'),
+                                np.finfo(float).tiny)
+        level = np.median(background, axis=0)
+        contrast = np.max(power / background, axis=1)
+        telling = np.max((g**2)[:, None] * power / level, axis=1)
+        best = np.lexsort((-contrast, -np.where(contrast > _CLEAR, telling, 0.0)))
+        best = best[:_TOGETHER * most]
+        # What a strong order shows at its neighbours must not take the room of weaker orders.
+        own = np.abs(np.linalg.lstsq(self._shown(errors, g[best]), lines[best], rcond=_APART)[0])
+        share = np.minimum(1.0, np.max(
+            own**2 / np.maximum(power[best], np.finfo(float).tiny), axis=1))
+        contrast, telling = contrast[best] * share, telling[best] * share
+        order = np.lexsort((-contrast, -np.where(contrast > _CLEAR, telling, 0.0)))[:most]
+        return g[best[order]], g[best[order[contrast[order] > _CLEAR]]]
+
+    def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
+        """Return what (row) orders show of unit lines at each order (column)."""
+        count = self.spectra.shape[1]
+        start = self.cycle_length * (self.first + np.arange(count)) + errors[
+            self.first:self.first + count]
+        apart = g - g[:, None]
+        turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ _taper(count)
+        x = apart * self.cycle_length
+        lobe = sum(share * (np.sinc(x - shift) + np.sinc(x + shift))
+                   for shift, share in enumerate((0.5, 2.0 / 3.0, 1.0 / 6.0)))
+        return np.asarray(turns / _taper(count).sum() * np.exp(1j * pi * x) * lobe)
 
     def gain(self, errors: FloatArray, orders: FloatArray) -> float:
         """
@@ -111,6 +138,9 @@ class LineSearch:
 
     def power(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> FloatArray:
         """Return an array (order, channel), the power of orders `g` without `errors` (pulse,)."""
+        return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
+
+    def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
         count = self.spectra.shape[1]
         errors = errors[self.first:self.first + count + 1]
         angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
@@ -125,7 +155,7 @@ class LineSearch:
             weight = phase * lobe * np.exp(-1j * pi * x)
             weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
             line += np.einsum('gk,gkc->gc', weight, self.spectra.take(bins, axis=0, mode='clip'))
-        return np.asarray(np.abs(line) ** 2)
+        return line
 
 
 def _taper(count: int) -> FloatArray:

@@ -105,12 +105,13 @@ class Acquisition:
     @property
     def attenuation(self) -> FloatArray:
         """Return raw over corrected amplitude (channel, order)."""
-        return attenuation(self.raw, self.corrected, self.noise)[0]
+        return np.asarray(np.abs(self.raw) / np.abs(self.corrected))
 
     @property
     def attenuation_standard_error(self) -> FloatArray:
         """Return the standard error of the attenuation (channel, order)."""
-        return attenuation(self.raw, self.corrected, self.noise)[1]
+        ratio = self.attenuation
+        return attenuation(self.raw, self.corrected, self.noise, np.minimum(ratio, 1.0 / ratio))[1]
 
 
 @dataclass(frozen=True)
