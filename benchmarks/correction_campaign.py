@@ -9,7 +9,7 @@
 # the License.
 
 """
-Does a corrected amplitude come closer to the truth than the raw one, at every size of noise?
+Errors of corrected amplitudes over those of raw ones, at every size of noise.
 
 `python benchmarks/correction_campaign.py` prints tables for docs/theory.md. Every trial is one
 average of a machine whose true pulses are known: the raw amplitudes, the corrected ones, and those
@@ -131,7 +131,8 @@ def trials(case: Case, count: int, seed: int) -> Outcome:
         accepted += average.correction.accepted
         raw, corrected = average.amplitudes[0], average.correction.amplitudes[0]
         corrected = np.where(np.isfinite(corrected), corrected, raw)
-        for name, values in (('raw', raw), ('corrected', corrected), ('true', exact.amplitudes[0])):
+        shown = {'raw': raw, 'corrected': corrected, 'true': exact.amplitudes[0]}
+        for name, values in shown.items():
             found[name].append(values / (size * phase))
     above = case.snr + 20.0 * np.log10(size) + 10.0 * np.log10(case.cycles)
     return Outcome(**{name: np.array(rows) for name, rows in found.items()}, above=above,
@@ -157,7 +158,8 @@ def all_cases() -> Sequence[tuple[str, Case]]:
     """Return the jitters of the usual machine, and then what differs from it, one by one."""
     usual = Case(0.0)
     return (*((f'jitter {jitter:g} rad', replace(usual, jitter=jitter)) for jitter in JITTERS),
-            *((f'r = {ratio:g}', replace(usual, ratio=ratio)) for ratio in (0.25, 0.5, 2.40789, 4)),
+            *((f'r = {ratio:g}', replace(usual, ratio=ratio))
+              for ratio in (0.25, 0.5, 2.40789, 4.0)),
             *((f'{cycles} cycles', replace(usual, cycles=cycles)) for cycles in (10, 160)),
             *((f'{lines} lines', replace(usual, lines=lines)) for lines in (1, 8)),
             *((f'jitter {scale:g} x the declared', replace(usual, scale=scale))
