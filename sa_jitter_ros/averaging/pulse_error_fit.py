@@ -142,7 +142,7 @@ class CompressedCycles:
             mixed = mixed.reshape(parts, count, len(mixing))
             out[:, :, :len(mixing), column] = mixed.real
             out[:, :, :len(mixing), half + column] = -mixed.imag
-        return Response(*out[:3], out[-1])
+        return Response(out[0], out[1], out[2], out[-1])
 
 
 def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, orders: FloatArray,
