@@ -252,6 +252,19 @@ def test_each_shaft_has_its_prediction_and_residual(bench):
     assert 'prediction' not in b.snapshot()['parts']
 
 
+def test_channel_names_that_do_not_fit_are_a_warning_until_they_do(bench):
+    b = bench(channel_names=['casing'])
+    publish_all(b)
+    for _ in range(2):
+        level, text, _ = b.diagnostics()
+        assert level == DiagnosticStatus.WARN
+        assert text == ('names of the channels: channel_names has 1 and shaft has 2 channels: '
+                        'name each')
+    assert b.set_parameter('channel_names', ['casing', 'end'])[0]
+    publish_all(b)
+    assert b.diagnostics()[0] == DiagnosticStatus.OK
+
+
 def test_only_changes_since_a_version_are_served(bench):
     b = bench()
     publish_all(b)

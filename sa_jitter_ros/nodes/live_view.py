@@ -96,7 +96,8 @@ class LiveView(MonitoringNode):
         super().destroy_node()
 
     def _apply(self, values: Values) -> None:
-        shown = {key: values[key] for key in ('shafts', 'vibration_unit', 'channel_names')}
+        self._labels = shown = {
+            key: values[key] for key in ('shafts', 'vibration_unit', 'channel_names')}
         self._board.put('settings', lambda: shown, data=False)
 
     # --- messages ---
@@ -125,6 +126,10 @@ class LiveView(MonitoringNode):
             self._averages += 1
             self._average_flow.came()
             self._average_flow.allowance = average.header.end_time - average.header.start_time
+            names, channels = self._labels['channel_names'], len(average.values)
+            self.set_missing('names of the channels', (
+                f'channel_names has {len(names)} and {shaft} has {channels} channels: name each'
+                if names and len(names) != channels else ''))
             shown = average.values[:CHANNELS, :ORDERS]
             history = attenuations.add(shown[..., 0], shown[..., 5])
             self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))

@@ -177,6 +177,8 @@ class MachineSimulator(PlaybackNode):
         self._done = 0
         self.begin(portion_seconds=self._block / rate, portion_bytes=8 * self._block * channels,
                    pulses=self._pulses, waveform=self._with_waveform)
+        self.get_logger().info(f'started: {channels} channels at {rate:g} Hz, shafts '
+                               f'{", ".join(shafts)}')
 
     def check(self, values: Values) -> None:
         """Raise ParameterError for parameters that no machine can have."""

@@ -87,8 +87,8 @@ class RecordingPlayer(PlaybackNode):
                    portion_bytes=8 * self._block * recording.channels,
                    pulses=self._pulse_times is not None, waveform=self._with_waveform)
         self.get_logger().info(
-            f'{values["recording"]}: {recording.channels} channels at {recording.sample_rate:g} '
-            f'Hz, {recording.duration:.3f} s')
+            f'started: {values["recording"]}, {recording.channels} channels at '
+            f'{recording.sample_rate:g} Hz, {recording.duration:.3f} s')
 
     def portions(self) -> Iterator[Portion]:
         """Return one pass through the recording; times and indices continue those of the last."""
