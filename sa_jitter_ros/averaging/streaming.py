@@ -172,6 +172,7 @@ class StreamingAverager:
     def finish(self) -> list[tuple[str, Average]]:
         """Return the averages that become due because neither samples nor pulses follow."""
         self._ended = True
+        self._queue(self.validator.flush())
         self.timeline.close()
         averages = self._process()
         waiting = self._triggers.items[self._next:]

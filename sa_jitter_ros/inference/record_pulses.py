@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
+from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.recordings.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -26,8 +26,6 @@ BoolArray = NDArray[np.bool_]
 
 _SPEED_TOLERANCE = 0.1  # of the declared speed, relative
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
-# Marks of an undeclared target may deviate from even spacing by an eighth of an interval.
-_TOLERANCE = 0.3
 _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
 _SAME_RATE = 0.01  # relative difference of a declared rate
@@ -95,7 +93,8 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if measured.size < _FEWEST:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'check that the tach waveform crosses its threshold')
-    pulses, counts = _validated(measured, recording)
+    pulses, counts = _validated(
+        measured, model.pulses_per_revolution, recording.missing_teeth)
     spurious = counts.doubles + counts.early
     if spurious > _MOST_SPURIOUS * measured.size:
         raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
@@ -111,7 +110,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
                          'pulses_per_revolution of this recording')
     reference = None
     if recording.reference_pulse_times is not None:
-        better, _ = _validated(recording.reference_pulse_times)
+        better, _ = _validated(recording.reference_pulse_times, 1)
         as_many = better.times.size >= _AS_MANY * pulses.times.size
         reference = _matched(found, better.every(1), step if as_many else 1)
     remarks = [*_remarks(counts, measured.size), *_tach_rate_remark(recording, model)]
@@ -143,15 +142,14 @@ class _Accepted:
             np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1])
 
 
-def _validated(times: FloatArray, recording: Recording | None = None
+def _validated(times: FloatArray, marks: int, missing_teeth: int = 0
                ) -> tuple[_Accepted, PulseCounts]:
-    """Return the accepted pulses of the target of `recording`, and the counts of all pulses."""
-    target = {} if recording is None or not recording.missing_teeth else {
-        'pulses_per_revolution': recording.pulses_per_revolution, 'pulses_per_trigger': 1,
-        'missing_teeth': recording.missing_teeth}
+    """Return the accepted pulses of a target of so many marks, and the counts of all pulses."""
     # Every pulse is a trigger here, so that pulses are counted also where a run is interrupted.
-    validator = PulseValidator(missing_pulses='bridge', interval_tolerance=_TOLERANCE, **target)
-    found = validator.update(times)
+    validator = PulseValidator(
+        pulses_per_revolution=marks, pulses_per_trigger=1, missing_teeth=missing_teeth,
+        missing_pulses='bridge')
+    found = TriggerPulses.joined([validator.update(times), validator.flush()])
     number = found.count.copy()
     for begin in np.flatnonzero(np.diff(number) <= 0) + 1:  # after a gap of unknown length
         usual = float(np.median(np.diff(found.times[max(begin - _ALIGNED, 0):begin])))

@@ -9,248 +9,554 @@
 # the License.
 
 """
-Classification of pulses by their interval from the last valid pulse.
+Classification of pulses by what the shaft can do.
 
-A pulse is *regular* if its interval is within the tolerance of the last accepted interval or of
-the median of the last three. The last interval follows a changing speed; the median is not changed
-by one displaced pulse. The interval in units of the nearer of the two classifies all other pulses:
+A pulse is *regular* if its interval is within the tolerance of the expected one
+(`interval_model`), and it passes at once if it is so near that no average would show the
+difference. All others wait for the next pulses. Then every explanation (`pulse_paths`) is tried:
+the pulse is true, it is a stray, pulses are missing before it, the speed changed. What all likely
+explanations have in common is decided:
 
-* double: less than a half. The pulse is dropped, the trigger cycle continues.
-* early: less than one. The pulse is dropped, the trigger cycle is discarded.
-* missing: within the tolerance of a multiple, up to the maximum of missing pulses. The missing
-  pulses are interpolated (bridge), or the trigger cycle is discarded and a new run begins (break).
-* late: everything else. The trigger cycle is discarded and a new run begins.
+* double, early: a stray less, or more, than half an interval after the last true pulse. It is
+  dropped; the trigger cycle continues if the true pulse came, too.
+* missing: pulses did not come. They are interpolated (bridge), or the trigger cycle is discarded
+  and a new run begins (break).
+* late: the interval is none that the shaft can have. The trigger cycle is discarded and a new run
+  begins.
+* a change of speed, which the intervals on either side show: nothing is lost.
 
-Four consecutive intervals that agree with each other but not with the expected one become the new
-expected interval. After eight consecutive irregular pulses the interval is learnt again as at the
-start, where pulses wait until they match the target. A wheel with gaps is matched again after
-every early or late pulse and every break, because its index is lost.
+If two pulses explain one tooth equally well, neither is used and the tooth counts as missing. If
+nothing explains ten pulses, the interval is learnt again as at the start, where pulses wait until
+several follow each other regularly. A target with several marks is learnt for four revolutions, so
+that the uneven angles between its marks are known before the first pulse is judged; none is lost.
 """
 
-from collections import deque
+from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 import numpy.typing as npt
-from sa_jitter_ros.pulses.target import DOUBLE, Lock, Target
+from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.mark_pattern import mark_pattern, regular_start, repeating
+from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
+from sa_jitter_ros.pulses.target import EvenTarget, Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter
 
 FloatArray = npt.NDArray[np.float64]
-_CALM = 4  # regular pulses in a row, after which they are judged in chunks
-_AGREEING = 4
-_LOST = 8
-_STANDSTILL = 1e9  # intervals; the ratio of a gap to denormal ones is infinite
+_MOST_WAITING = 10  # doubtful pulses, until the interval is learnt again
+_NEAR_WHOLE = 0.2  # intervals by which a gap may differ from a whole number of them
+_RAMP = 0.25  # largest change of an interval that is a change of speed
+_AGREEING = 5  # equal intervals that show another pulse rate
+_AGREE, _FASTER = 0.03, 0.75
+_SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
+_REVOLUTIONS, _LONGEST = 5, 3.0  # and seconds in which the marks are learnt
+_FEW_MARKS = 12
+_LEAST_REGULAR = 5e-3  # tolerance of the first intervals
+_BELIEVED = 0.45  # unevenness of marks that are not known yet
+_LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
+_FITS = 0.1  # tolerance with which a pulse after a step of time fits
+_NEVER = 1 << 62
+_NONE: FloatArray = np.empty(0)
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Options of `PulseValidator` that its judge needs."""
+
+    bridge: bool
+    tolerance: float
+    maximum_missing: int
+    minimum_interval: float
+    pulses_per_trigger: int
+
+
+@dataclass(frozen=True)
+class _End:
+    """Where a sequence ended: time (s), level of its last interval, and the scatter of `known`."""
+
+    time: float
+    level: float
+    scatter: float
+    known: int
 
 
 class IntervalJudge:
     """
     Judge pulses in order of time and pass the valid ones on to a trigger counter.
 
-    `last` is the latest pulse (s) not dropped, `confirmed` the latest with a valid interval.
+    `last` is the latest pulse (s) not dropped, `confirmed` the latest that was accepted.
     """
 
-    def __init__(
-        self, target: Target, counter: TriggerCounter, *, bridge: bool, tolerance: float,
-        maximum_missing: int, minimum_interval: float,
-    ) -> None:
-        self._target, self._counter = target, counter
-        self._bridge = bridge
-        self._tolerance = tolerance
-        self._maximum_missing = maximum_missing
-        self._minimum_interval = minimum_interval
+    def __init__(self, target: Target, counter: TriggerCounter, options: JudgeOptions) -> None:
+        self._target, self._counter, self._options = target, counter, options
+        self._rehearses = False  # it stops where the match is lost
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
              'unlocked', 'relearnt'), 0)
-        self._pending: list[float] = []  # pulses not yet matched to the target
+        block = 64 if target.marks >= _LARGE_BLOCK else 8
+        self._model = IntervalModel(
+            given=options.tolerance, pulses_per_trigger=options.pulses_per_trigger, block=block)
         self.forget()
 
     def forget(self) -> None:
         """Forget the interval and the match: the next pulses begin a new sequence."""
         self._counter.stop(known=False)
         self._lock: Lock | None = None
-        self.counts['unlocked'] += len(self._pending)
-        self._pending = []
-        self._recent: deque[float] = deque(maxlen=_AGREEING + 1)  # dropped ones too
-        self._intervals: deque[float] = deque(maxlen=3)
+        self._candidate: Lock | None = None
+        self._end: _End | None = None
+        self._queue: FloatArray = _NONE
+        self._tried = 0  # pulses of the queue that were tried to match, and failures
+        self._failed = 0
+        self._recent: list[float] = []  # of the latest pulses, dropped ones too
         self._slot = 0
-        self.last = self.confirmed = -np.inf
-        self._calm = self._strikes = 0
+        self.confirmed = -np.inf
+        self._marks: list[int] = []  # levels and ends of intervals since the pattern was learnt
+        self._levels: list[float] = []
+        self._times: list[float] = []
+        self._learnt = 0  # times that the pattern was learnt
 
     @property
-    def calm(self) -> bool:
-        """Whether so many pulses were regular that `take_regular` can be used."""
-        return self._calm >= _CALM
+    def _few_marks(self) -> bool:
+        """Whether two revolutions without a stray are likely."""
+        return isinstance(self._target, EvenTarget) and self._target.marks <= _FEW_MARKS
+
+    @property
+    def last(self) -> float:
+        """Time (s) of the latest pulse that was not dropped."""
+        return float(self._queue[-1]) if self._queue.size else self.confirmed
 
     @property
     def waiting(self) -> int:
-        """Return the number of pulses not yet matched to the target."""
-        return len(self._pending)
+        """Number of pulses not yet judged."""
+        return self._queue.size
 
-    def take_regular(self, pulses: FloatArray) -> int:
-        """Accept the pulses (n,) up to the first irregular one; return their number."""
-        assert self._lock is not None
-        slots = (self._slot + np.arange(pulses.size)) % self._lock.steps.size
-        steps, tolerance = self._lock.steps[slots], self._lock.tolerance[slots]
-        gaps = np.diff(pulses, prepend=self.last)
-        intervals = np.concatenate((self._intervals, gaps / steps))
-        a, b, c, new = (intervals[k:k + pulses.size] for k in range(4))
-        median = np.maximum(np.minimum(a, b), np.minimum(np.maximum(a, b), c))
-        regular = (np.abs(new - c) <= tolerance * c) | (np.abs(new - median) <= tolerance * median)
-        regular &= gaps >= self._minimum_interval
-        count = pulses.size if regular.all() else int(np.argmin(regular))
-        if count:
-            self._counter.extend(pulses[:count].tolist(), steps[:count].tolist())
-            self.counts['accepted'] += count
-            self._intervals.extend(intervals[count:count + 3].tolist())
-            self._recent.extend(pulses[:count][-_AGREEING - 1:].tolist())
-            self._slot = int(slots[count - 1] + 1) % self._lock.steps.size
-            self.last = self.confirmed = float(pulses[count - 1])
-        if count < pulses.size:
-            self._calm = 0
-        return count
+    def take(self, pulses: FloatArray) -> None:
+        """Take the next pulses (n,) in s, in order of time, none before the last one."""
+        self._queue = np.concatenate((self._queue, self._apart(pulses)))
+        self._run(final=False)
 
-    def take(self, pulse: float) -> None:
-        """Judge a pulse (s) that is not before the last one."""
-        if pulse == self.last or pulse - self.last < self._minimum_interval:
-            self._drop_double()
-        else:
-            self._recent.append(pulse)
-            self._judge(pulse)
+    def flush(self) -> None:
+        """Judge the pulses that wait, because none follows."""
+        self._run(final=True)
 
     def fits(self, gap: float) -> bool:
         """Whether a pulse at this interval (s) from the last one would be regular."""
         if self._lock is None:
             return False
-        interval = gap / float(self._lock.steps[self._slot])
-        tolerance = float(self._lock.tolerance[self._slot])
-        return any(abs(interval - each) <= tolerance * each for each in self._expected())
+        expected = math.exp(self._model.expected) * float(self._lock.widths[self._slot])
+        return abs(gap / expected - 1.0) <= max(self._model.tolerance, _FITS)
 
-    def drop_unconfirmed(self) -> int:
-        """Drop the pulses after the last confirmed one; return their number."""
-        self._counter.stop(known=False)
-        dropped = max(len(self._pending), 1)
-        self.counts['accepted'] -= not self._pending  # it was accepted as the start of a run
-        self._pending = []
-        self.last = self.confirmed
-        self._calm = 0
-        return dropped
+    def drop_later(self, time: float, most: int) -> int:
+        """Drop the waiting pulses after a time (s) if they are `most` or fewer; their number."""
+        later = int(np.count_nonzero(self._queue > time))
+        if not 0 < later <= most:
+            return 0
+        self._queue = self._queue[:-later]
+        self._tried = min(self._tried, self._queue.size)
+        return later
 
-    def _judge(self, pulse: float) -> None:
-        """Accept a pulse that follows the last one, drop it, or begin a new run at it."""
-        if self._lock is None:
-            self._match(pulse)
-            return
-        step = int(self._lock.steps[self._slot])
-        gap = pulse - self.last
-        if self.fits(gap):
-            self._calm += len(self._intervals) == 3
-            self._strikes = 0
-            self._accept(pulse, step, 1)
-            return
-        self._calm = 0
-        self._strikes += 1
-        if self._lock.even and self._agree():
-            self.counts['relearnt'] += 1
-            self._intervals.extend(np.diff(self._recent)[-3:].tolist())
-            self._break(pulse)
-            return
-        if self._strikes == _LOST:
-            self._lose(pulse)
-            return
-        number = gap / min(self._expected(), key=lambda interval: abs(gap / step - interval))
-        missing = round(min(number, _STANDSTILL)) - step
-        if number < DOUBLE:
-            self._drop_double()
-        elif number < step:
-            self.counts['early'] += 1
-            self._counter.stop()
-            if not self._lock.even:
-                self._lose(pulse)
-        elif (0 < missing <= self._maximum_missing
-              and abs(number - step - missing) <= self._lock.tolerance[self._slot]):
-            passed = self._slots_passed(step + missing)
-            self._intervals.append(gap / (step + missing))
-            if self._bridge and passed:
-                self.counts['missing_bridged'] += missing
-                self._accept(pulse, step + missing, passed)
+    # --- the queue ---
+
+    def _apart(self, pulses: FloatArray) -> FloatArray:
+        """Drop doubles: pulses at the time of the last one, or sooner than `minimum_interval`."""
+        least = self._options.minimum_interval
+        gaps = np.diff(pulses, prepend=self.last)
+        if np.all((gaps >= least) & (gaps > 0.0)):
+            return pulses
+        kept: list[float] = []
+        last = self.last
+        for pulse in pulses.tolist():
+            if pulse - last < least or pulse == last:
+                self.counts['doubles'] += 1
             else:
-                self.counts['missing_broken'] += missing
-                self._break(pulse, step + missing)
-        else:
-            self.counts['late'] += 1
-            self._break(pulse)
+                kept.append(pulse)
+                last = pulse
+        return np.array(kept)
 
-    def _drop_double(self) -> None:
-        self.counts['doubles'] += 1
-        self._counter.double()
+    def _run(self, *, final: bool) -> None:
+        while self._queue.size:
+            going_on = (self._match(final) if self._lock is None
+                        else self._take_regular(final) or self._decide(final))
+            if not going_on:
+                return
+            if self._lock is not None and self._model.irregular:
+                self._lose()
+                self._end = None
 
-    def _expected(self) -> tuple[float, float]:
-        return self._intervals[-1], sorted(self._intervals)[len(self._intervals) // 2]
+    def _drop(self, kind: str, at: int = 0) -> None:
+        """Drop a waiting pulse."""
+        self._remember(float(self._queue[at]))
+        self._queue = np.delete(self._queue, at)
+        self.counts[kind] += 1
+        if kind != 'unlocked':
+            self._counter.drop()
 
-    def _agree(self) -> bool:
-        """Whether the intervals of the latest pulses agree with each other."""
-        intervals = np.diff(self._recent)
-        # Strictly less: intervals of 0, of a repeated pulse, do not count as agreement.
-        return len(intervals) == _AGREEING and bool(np.all(
-            np.abs(np.diff(intervals)) < self._tolerance * intervals[:-1]))
+    def _remember(self, pulse: float) -> None:
+        self._recent = [*self._recent[-_AGREEING:], pulse]
 
-    def _slots_passed(self, teeth: int) -> int:
-        """Return the number of pulses in the next `teeth` teeth, 0 if the last one is missing."""
+    # --- regular pulses ---
+
+    def _take_regular(self, final: bool) -> int:
+        """Accept the pulses up to the first doubtful one; return their number."""
+        lock, model = self._lock, self._model
+        assert lock is not None
+        room = model.room
+        pulses = self._queue[:room + 1]
+        slots = (self._slot + np.arange(pulses.size)) % lock.steps.size
+        gaps = np.diff(pulses, prepend=self.confirmed)
+        levels = np.log(gaps / lock.widths[slots])
+        off = np.abs(model.deviations(levels))
+        # Teeth beside gaps are uneven; a stray among marks that may be uneven needs a search.
+        regular = off <= (model.tolerance if lock.even else
+                          np.maximum(model.tolerance, lock.believed[slots]))
+        # A pulse with a small deviation cannot spoil an average. A larger one may be a stray's:
+        # then the next interval is too short.
+        followed = np.append(regular[1:], final and pulses.size == self._queue.size)
+        passes = (off <= model.harmless) | (regular & followed)
+        count = min(pulses.size if passes.all() else int(np.argmin(passes)), room,
+                    self._room_of_marks)
+        if count:
+            self._counter.extend(pulses[:count].tolist(), lock.steps[slots[:count]].tolist())
+            self.counts['accepted'] += count
+            model.accept(levels[:count])
+            self._recent = [*self._recent, *pulses[:count][-_AGREEING - 1:].tolist()][
+                -_AGREEING - 1:]
+            self._note(slots[:count].tolist(), levels[:count].tolist(), pulses[:count].tolist())
+            self._slot = int(slots[count - 1] + 1) % lock.steps.size
+            self.confirmed = float(pulses[count - 1])
+            self._queue = self._queue[count:]
+            self._learn_marks()
+        return count
+
+    def _note(self, slots: list[int], levels: list[float], times: list[float]) -> None:
+        """Note the intervals behind these slots, and when they end, for the pattern."""
         assert self._lock is not None
-        passed = 0
-        while teeth > 0:
-            teeth -= int(self._lock.steps[(self._slot + passed) % self._lock.steps.size])
-            passed += 1
-        return passed if teeth == 0 else 0
+        if self._lock.steps.size > 1:
+            self._marks += slots
+            self._levels += levels
+            self._times += times
 
-    def _accept(self, pulse: float, step: int, passed: int) -> None:
+    # --- doubtful pulses ---
+
+    def _rules(self) -> PathRules:
         assert self._lock is not None
-        self._slot = (self._slot + passed) % self._lock.steps.size
-        if self._counter.running:
-            self._counter.extend([pulse], [step])
-        else:
-            self._counter.begin(pulse, int(self._lock.teeth[self._slot]), passed=step)
-        if passed == 1:
-            self._intervals.append((pulse - self.last) / step)
-        self.counts['accepted'] += 1
-        self.last = self.confirmed = pulse
+        return PathRules(
+            self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
+            np.maximum(self._lock.believed, self._options.tolerance).tolist(),
+            self._options.maximum_missing, self._model.expected)
 
-    def _break(self, pulse: float, passed: int | None = None) -> None:
+    def _decide(self, final: bool) -> bool:
+        """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""
+        assert self._lock is not None
+        queue, model = self._queue, self._model
+        expected = math.exp(model.expected) * float(self._lock.widths[self._slot])
+        same = model.harmless * expected  # no average shows which of two so near is true
+        if queue[0] - self.confirmed < same:
+            self._drop('doubles')
+            return True
+        if queue.size > 1 and queue[1] - queue[0] < same:
+            self._drop('doubles', at=1)
+            return True
+        if queue.size == 1 and not final:
+            return False
+        rules = self._rules()
+        paths = [Path(0.0, self.confirmed, self._slot, 0, model.level, model.before)]
+        for number, pulse in enumerate(queue[:_MOST_WAITING].tolist()):
+            paths = rules.extend(paths, pulse)
+            if (number or queue.size == 1) and self._commit(paths, final):
+                return True
+        if queue.size >= _MOST_WAITING:
+            self._lose()
+            return True
+        if final:
+            self._drop('unlocked')
+        return final
+
+    def _commit(self, paths: list[Path], final: bool) -> bool:
+        """Decide about the first pulses if the likely paths agree about them."""
+        near = likely(paths)
+        best = near[0]
+        if all(path.marks[0] == best.marks[0] for path in near):
+            if best.marks[0] == 0:
+                if not (any(best.marks) or final):  # strays come between true pulses
+                    return False
+                self._drop_stray()
+                return True
+            later = [level for level in best.levels[1:] if not math.isnan(level)]
+            if best.marks[0] == 1 and abs(best.deviations[0]) <= self._tolerance:
+                self._accept(1, best.levels[0])
+                return True
+            if not later and not final:
+                return False
+            self._irregular(best.marks[0], best.levels[0], best.deviations[0],
+                            later[0] if later else None)
+            return True
+        count = len(best.marks)
+        if count < 3 or not (best.marks[-1] and best.marks[-2]):
+            return False
+        if any(path.marks[-2:] != best.marks[-2:] or path.slot != best.slot
+               or path.passed != best.passed for path in near):
+            return False
+        # Which of the pulses before is true makes no difference to these two.
+        skipped = sum(best.marks[:-1])
+        for _ in range(count - 2):
+            self._drop('early')
+        lock = self._lock
+        assert lock is not None
+        slots = (self._slot + np.arange(skipped)) % lock.steps.size
+        gap = float(self._queue[0]) - self.confirmed
+        level = math.log(gap / float(lock.widths[slots].sum()))
+        self._irregular(skipped, level, 0.0, best.levels[-1])
+        return True
+
+    def _drop_stray(self) -> None:
+        assert self._lock is not None
+        gap = float(self._queue[0]) - self.confirmed
+        expected = math.exp(self._model.expected) * float(self._lock.widths[self._slot])
+        self._drop('doubles' if gap < 0.5 * expected else 'early')
+        recent = np.diff(self._recent)
+        mean = float(recent.mean()) if recent.size == _AGREEING else np.inf
+        if (self._lock.even and mean < _FASTER * expected
+                and np.all(np.abs(np.diff(recent))
+                           < max(_AGREE, self._model.tolerance) * recent[1:])):
+            self.counts['relearnt'] += 1
+            self._lose()
+
+    def _accept(self, mark: int, level: float) -> None:
+        """Accept the first waiting pulse, `mark` slots after the last one."""
+        slots, steps = self._passed(mark)
+        pulse = self._next(slots, level)
+        self._model.accept(np.array([level]))
+        self._counter.extend([pulse], [steps])
+        self._learn_marks()
+
+    def _irregular(self, mark: int, level: float, deviation: float, after: float | None) -> None:
         """
-        Discard the trigger cycle and begin a new run, of a wheel once it is matched again.
+        Accept the first waiting pulse, whose interval needs an explanation.
 
-        `passed` is the number of teeth since the last pulse, None where it is not known.
+        `after` is the level of the interval behind it, None if there is none.
         """
-        if self._lock is None or not self._lock.even:
-            self._lose(pulse)
+        model, tolerance = self._model, self._tolerance
+        slots, steps = self._passed(mark)
+        gap = float(self._queue[0]) - self.confirmed
+        regular = abs(deviation) <= tolerance
+        known = self._is_whole(gap, slots, model.level) and (
+            after is None or self._is_whole(gap, slots, after))
+        if mark == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
+                _RAMP, self._options.tolerance):
+            low, high = sorted((model.level, after))
+            changes = low - tolerance <= level <= high + tolerance  # the speed does
+            if changes or model.is_clock_step(deviation, after):
+                pulse = self._next(slots, level)
+                model.jump(level)
+                self._counter.extend([pulse], [steps])
+                self._learn_marks()
+                return
+        if mark > 1 and regular and known:
+            kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
+            self.counts[kind] += mark - 1
+            pulse = self._next(slots, level)
+            model.accept(np.array([level]))
+            if self._options.bridge:
+                self._counter.extend([pulse], [steps])
+            else:
+                self._counter.begin(pulse, 0, passed=steps)
+            self._learn_marks()
             return
-        self._counter.begin(pulse, 0, passed=passed)
-        self.counts['accepted'] += 1
-        self.last = pulse
-
-    def _lose(self, pulse: float) -> None:
-        """Discard the trigger cycle and match the target again from this pulse on."""
-        self._counter.stop(known=False)
-        self._lock = None
-        self._calm = self._strikes = 0
-        self._pending = [pulse]
-        self.last = pulse
-
-    def _match(self, pulse: float) -> None:
-        """Match the waiting pulses to the target if they fit it."""
-        self._pending.append(pulse)
-        self.last = pulse
-        lock = self._target.lock(self._pending)
-        if lock is None:
-            if len(self._pending) > self._target.memory:
-                self._pending.pop(0)
-                self.counts['unlocked'] += 1
+        self.counts['late'] += 1
+        if not known and (self._rehearses or not self._lock_is_plain):
+            self._lose()
             return
-        waiting, self._pending = self._pending[lock.first:], []
-        self.counts['unlocked'] += lock.first
+        if after is not None and abs(after - model.level) > tolerance:
+            self.counts['relearnt'] += 1
+        pulse = self._next(slots, level if mark == 1 and known else math.nan)
+        if after is not None:
+            model.jump(after)
+        self._counter.begin(pulse, 0, passed=steps if known else None)
+
+    @property
+    def _tolerance(self) -> float:
+        """Largest deviation of a regular interval from the last pulse."""
+        assert self._lock is not None
+        return max(self._model.tolerance, float(self._lock.believed[self._slot]))
+
+    @property
+    def _lock_is_plain(self) -> bool:
+        """Whether all marks are alike, so that none has to be found again."""
+        lock = self._lock
+        return lock is not None and lock.even and bool(np.all(lock.widths == 1.0))
+
+    def _passed(self, mark: int) -> tuple[list[int], int]:
+        """Return the next `mark` slots, and the teeth that they span."""
+        assert self._lock is not None
+        slots = [(self._slot + k) % self._lock.steps.size for k in range(mark)]
+        return slots, int(self._lock.steps[slots].sum())
+
+    def _next(self, slots: list[int], level: float) -> float:
+        """Take the first pulse out of the queue as the one at the end of these slots."""
+        assert self._lock is not None
+        pulse = float(self._queue[0])
+        self._queue = self._queue[1:]
+        self._remember(pulse)
         self.counts['accepted'] += 1
-        self._lock, self._slot, self.last = lock, lock.slot, waiting[0]
-        self._intervals.clear()
-        self._intervals.append(lock.interval)
-        self._counter.begin(waiting[0], int(lock.teeth[lock.slot]))
-        for each in waiting[1:]:
-            self._judge(each)
+        self.confirmed = pulse
+        self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
+                   [pulse] * len(slots))
+        self._slot = (slots[-1] + 1) % self._lock.steps.size
+        return pulse
+
+    def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
+        """Whether intervals of this level make the gap (s) the whole number of teeth."""
+        assert self._lock is not None
+        width = float(self._lock.widths[slots].sum())
+        return abs(gap / math.exp(level) - width) <= _NEAR_WHOLE
+
+    # --- learning ---
+
+    def _lose(self) -> None:
+        """Discard the trigger cycle and match the target again from the waiting pulses on."""
+        self._end = _End(self.confirmed, self._model.level, self._model.scatter,
+                         self._model.known)
+        self._counter.stop()
+        self._lock = self._candidate = None
+        self._tried = self._failed = 0
+        self._marks, self._levels, self._times = [], [], []
+
+    def _match(self, final: bool) -> bool:
+        """Match the waiting pulses to the target; False if there are too few to fit it."""
+        if self._rehearses:
+            return False
+        scatter = None if self._end is None else self._end.scatter
+        while self._candidate is None:
+            size = self._target.next_size(
+                self._queue, self._tried, self._failed, known=scatter is not None)
+            if size > self._queue.size:
+                if not final or self._tried >= self._queue.size:
+                    return self._drop_rest(final)
+                size = self._queue.size
+            self._tried = size
+            self._candidate = self._target.lock(self._queue[:size], scatter)
+            self._failed += self._candidate is None
+            excess = size - self._target.memory
+            if self._candidate is None and excess > 0:
+                self._drop_unlocked(excess)
+        lock = self._candidate
+        if lock.steps.size > 1:
+            wanted = lock.first + 1 + min(
+                _REVOLUTIONS * lock.steps.size, math.ceil(_LONGEST / lock.interval))
+            if self._queue.size < wanted and not final:
+                return False
+            found = None
+            if self._few_marks:
+                found = self._repeating(lock, self._queue[:wanted])
+                if found is None and self._queue.size < 2 * wanted and not final:
+                    return False
+                found = found or self._repeating(lock, self._queue[:2 * wanted])
+            lock = found or self._rehearsed(lock, self._queue[:wanted])
+        self._drop_unlocked(lock.first)
+        self._begin(lock)
+        return True
+
+    def _drop_unlocked(self, count: int) -> None:
+        self._queue = self._queue[count:]
+        self._tried -= count
+        self.counts['unlocked'] += count
+
+    def _drop_rest(self, final: bool) -> bool:
+        if final:
+            self._drop_unlocked(self._queue.size)
+        return False
+
+    def _rehearsed(self, lock: Lock, pulses: FloatArray) -> Lock:
+        """Return the lock with the angles between the marks, which the pulses (n,) show."""
+        judge = self._rehearsal(replace(lock, believed=np.maximum(lock.believed, _BELIEVED)),
+                                pulses[lock.first:])
+        marks, levels = np.array(judge._marks, np.int64), np.array(judge._levels)
+        pattern = mark_pattern(marks, levels, lock.steps.size)
+        if pattern is None:
+            return lock
+        learnt = lock.with_pattern(pattern)
+        # The first pulse may have been a stray, which only the pattern shows.
+        levels = levels + np.log(lock.widths[marks] / learnt.widths[marks])
+        begin = regular_start(levels, max(6.0 * pattern.scatter, _LEAST_REGULAR))
+        time = judge._times[begin - 1] if begin else pulses[lock.first]
+        return self._from_earliest(replace(
+            learnt, first=int(np.searchsorted(pulses, time)), slot=int(marks[begin]),
+            interval=math.exp(levels[begin])), pulses)
+
+    def _repeating(self, lock: Lock, pulses: FloatArray) -> Lock | None:
+        """Return the lock on pulses (n,) of few even marks that repeat for two revolutions."""
+        size = lock.steps.size
+        levels = np.log(np.diff(pulses))
+        found = repeating(levels, size)
+        if found is None:
+            return None
+        begin, pattern = found
+        learnt = lock.with_pattern(pattern)
+        return self._from_earliest(replace(
+            learnt, first=begin, slot=0,
+            interval=math.exp(levels[begin]) / float(learnt.widths[0])), pulses)
+
+    def _from_earliest(self, lock: Lock, pulses: FloatArray) -> Lock:
+        """Return the lock from the earliest of the pulses (n,) on that fits, in reversed time."""
+        back = (lock.slot - 1 - np.arange(lock.steps.size)) % lock.steps.size
+        judge = self._rehearsal(replace(
+            lock, slot=0, steps=lock.steps[back], widths=lock.widths[back],
+            believed=lock.believed[back]), -pulses[lock.first::-1])
+        return replace(lock, first=int(np.searchsorted(pulses, -judge.confirmed)),
+                       slot=(lock.slot - judge._slot) % lock.steps.size).numbered()
+
+    def _rehearsal(self, lock: Lock, pulses: FloatArray) -> 'IntervalJudge':
+        """Return a judge that judged the pulses (n,) with this lock until it lost it."""
+        judge = IntervalJudge(
+            self._target, TriggerCounter(teeth=1, teeth_per_trigger=1), self._options)
+        judge._queue, judge._rehearses = pulses, True
+        judge._begin(lock)
+        judge._run(final=True)
+        return judge
+
+    def _begin(self, lock: Lock) -> None:
+        """Begin a sequence at the first waiting pulse."""
+        first = float(self._queue[0])
+        self._lock, self._candidate, self._slot = lock, None, lock.slot
+        tooth = int(lock.teeth[lock.slot])
+        passed = None
+        scatter, count = lock.scatter, lock.known
+        if self._end is not None:
+            gap = first - self._end.time
+            teeth = [gap / math.exp(level) for level in (self._end.level, math.log(lock.interval))]
+            number = round(teeth[0]) if math.isfinite(teeth[0]) else 0
+            if number and max(abs(item - number) for item in teeth) <= _NEAR_WHOLE:
+                passed = number
+            if scatter < _SAME_SCATTER * self._end.scatter:  # which is known better
+                scatter, count = self._end.scatter, max(count, self._end.known)
+        self._counter.begin(first, tooth, passed=passed)
+        self.counts['accepted'] += 1
+        self._queue = self._queue[1:]
+        self._remember(first)
+        self.confirmed = first
+        self._end = None
+        self._tried = self._failed = 0
+        self._model.start(np.array([math.log(lock.interval)]), scatter=scatter, count=count)
+
+    @property
+    def _room_of_marks(self) -> int:
+        """Number of intervals until the angles between the marks are learnt."""
+        assert self._lock is not None
+        size = self._lock.steps.size
+        if size == 1 or self._rehearses:
+            return _NEVER
+        return _REVOLUTIONS * size + 1 - len(self._levels)
+
+    def _learn_marks(self) -> None:
+        """Learn the angles between the marks from the latest revolutions."""
+        lock = self._lock
+        assert lock is not None
+        size = lock.steps.size
+        if self._room_of_marks > 0:
+            return
+        self._lock = lock.with_pattern(
+            mark_pattern(np.array(self._marks, np.int64), np.array(self._levels), size),
+            weight=1.0 / min(2 + self._learnt, 8))
+        self._learnt += 1
+        self._marks, self._levels, self._times = [], [], []

@@ -16,20 +16,25 @@ An even target has equal angles between its pulses. A toothed wheel may lack som
 tells which tooth caused each of them.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.pulses.interval_model import chain_scatter
+from sa_jitter_ros.pulses.mark_pattern import MarkPattern
+from sa_jitter_ros.pulses.pulse_paths import find_chain, STRAY_OF_MARKS, STRAY_OF_ONE
 from scipy.ndimage import median_filter
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+# Pulses from which the interval is learnt: those of this time (s), in these limits.
+_LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12
+_SELDOM = 64  # pulses after which noise is tried again
 # A pulse after less than this fraction of the expected interval is a second one of the same tooth.
-DOUBLE = 0.5
+_DOUBLE = 0.5
 # Sensors shift the pulses of teeth next to a gap by up to 2 degrees, a fifth of the pitch of 36
 # teeth.
 # The gap must still be distinguished from one that is a tooth wider or narrower.
@@ -43,8 +48,9 @@ class Lock:
     How the latest pulses fit a target, from pulse number `first` on, which is tooth `slot`.
 
     For every tooth present (m,), counted from the index: `steps` to the next one in teeth, `teeth`
-    its number, and the `tolerance` of the interval behind it, a fraction of that interval.
-    `interval` (s) is the expected time from tooth to tooth.
+    its number, and `widths`, the steps with what is known of uneven marks. Deviations of the
+    interval behind it within `believed` are expected as long as the widths are not known.
+    `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`.
     """
 
     first: int
@@ -52,51 +58,88 @@ class Lock:
     interval: float
     steps: IntArray
     teeth: IntArray
-    tolerance: FloatArray
+    widths: FloatArray
+    believed: FloatArray
+    scatter: float
+    known: int
 
     @property
     def even(self) -> bool:
-        """Whether all teeth are equal, so that the index cannot be lost."""
-        return self.steps.size == 1
+        """Whether no tooth is missing, so that there is no index."""
+        return bool(np.all(self.steps == 1))
+
+    def with_pattern(self, pattern: MarkPattern | None, *, weight: float = 1.0) -> 'Lock':
+        """Return the lock with what was learnt of its marks."""
+        if pattern is None:
+            return self
+        widths = self.widths * np.exp(weight * pattern.widths)
+        return replace(self, widths=widths * self.steps.sum() / widths.sum(),
+                       believed=np.where(pattern.known, 0.0, self.believed),
+                       scatter=pattern.scatter)
+
+    def numbered(self) -> 'Lock':
+        """Return the lock in which the first pulse is number 0 if there is no index."""
+        if not self.even:
+            return self
+        return replace(self, slot=0, widths=np.roll(self.widths, -self.slot),
+                       believed=np.roll(self.believed, -self.slot))
 
 
 class Target(Protocol):
     """What the pulse validator needs to know of a target."""
 
+    marks: int
     memory: int
 
-    def lock(self, pulses: Sequence[float]) -> Lock | None:
-        """Match the latest pulses (s), None if they do not fit (yet)."""
+    def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
+                  ) -> int:
+        """
+        Return how many of the waiting pulses to match next, after the first `tried` ones.
+
+        It `failed` so often before.
+        """
+
+    def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
+        """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
 
 
 class EvenTarget:
-    """Equal angles: two consecutive intervals that agree, without double pulses, are a lock."""
+    """Equal or nearly equal angles: several intervals that follow each other are a lock."""
 
-    memory = 8
+    memory = 16
 
-    def __init__(self, *, tolerance: float) -> None:
-        self._tolerance = tolerance
+    def __init__(self, *, marks: int) -> None:
+        self.marks = marks
 
-    def lock(self, pulses: Sequence[float]) -> Lock | None:
-        """Match the latest pulses (s), None if they do not fit (yet)."""
-        if len(pulses) < 3:
+    def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
+                  ) -> int:
+        """
+        Return how many of the waiting pulses to match next, after the first `tried` ones.
+
+        It `failed` so often before.
+        """
+        if pulses.size < _FEWEST:
+            return _FEWEST
+        interval = float(np.median(np.diff(pulses[:_FEWEST])))
+        first = _FEWEST
+        if not known and interval * _FEWEST < _LEARNING_TIME:
+            first = int(_LEARNING_TIME / interval) if interval * _MOST > _LEARNING_TIME else _MOST
+        return first if tried < first else tried + min(2 << (failed // 2), _SELDOM)
+
+    def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
+        """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
+        start = max(pulses.size - self.memory, 0)
+        found = find_chain(pulses[start:], scatter,
+                           stray=STRAY_OF_ONE if self.marks == 1 else STRAY_OF_MARKS)
+        if found is None:
             return None
-        # If the pulses fit, the latest one is no double; the one before it may be one.
-        for before in pulses[-2], pulses[-3]:
-            if self._agrees(pulses, pulses[-1] - before):
-                one = np.ones(1, dtype=np.int64)
-                return Lock(first=0, slot=0, interval=pulses[-1] - before, steps=one,
-                            teeth=one - 1, tolerance=np.full(1, self._tolerance))
-        return None
-
-    def _agrees(self, pulses: Sequence[float], interval: float) -> bool:
-        agreeing, last = 0, pulses[0]
-        for pulse in pulses[1:]:
-            if pulse - last >= DOUBLE * interval:
-                near = abs(pulse - last - interval) <= self._tolerance * interval
-                agreeing = agreeing + 1 if near else 0
-                last = pulse
-        return agreeing >= 2
+        chain, steps = found
+        levels = np.log(np.diff(pulses[start + chain]) / steps)
+        ones = np.ones(self.marks, dtype=np.int64)
+        return Lock(first=start + int(chain[0]), slot=0, interval=float(np.exp(levels[0])),
+                    steps=ones, teeth=np.arange(self.marks), widths=ones.astype(np.float64),
+                    believed=np.zeros(self.marks), scatter=chain_scatter(levels),
+                    known=levels.size)
 
 
 class ToothedWheel:
@@ -110,7 +153,7 @@ class ToothedWheel:
     The pulses of a wheel 8-1 at one tooth per second; the one after the fifth pulse is missing:
 
     >>> wheel = ToothedWheel(teeth=8, missing=1, tolerance=0.25)
-    >>> lock = wheel.lock([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0])
+    >>> lock = wheel.lock(np.array([0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0]), None)
     >>> lock.slot, lock.steps.tolist(), lock.teeth.tolist()
     (2, [1, 1, 1, 1, 1, 1, 2], [0, 1, 2, 3, 4, 5, 6])
     """
@@ -122,15 +165,24 @@ class ToothedWheel:
                 f'missing_teeth {missing} of {teeth} leaves {self._present} teeth: a wheel needs '
                 '2 or more; for a single tooth set pulses_per_revolution to 1')
         self._tolerance = tolerance
+        self.marks = self._present
         self.memory = 2 * (self._present + 1)
 
-    def lock(self, pulses: Sequence[float]) -> Lock | None:
-        """Match the latest pulses (s), None if they do not fit (yet): one revolution is needed."""
-        if len(pulses) <= self._present:
+    def next_size(self, pulses: FloatArray, tried: int, failed: int, *, known: bool
+                  ) -> int:
+        """
+        Return how many of the waiting pulses to match next, after the first `tried` ones.
+
+        It `failed` so often before.
+        """
+        return max(self._present + 1, tried + 1)
+
+    def lock(self, every: FloatArray, scatter: float | None) -> Lock | None:
+        """Match the latest pulses (n,) in s, None if they do not fit: a revolution is needed."""
+        if every.size <= self._present:
             return None
-        every = np.asarray(pulses)
         intervals = np.diff(every)
-        single = np.append(0, 1 + np.flatnonzero(intervals >= DOUBLE * np.median(intervals)))
+        single = np.append(0, 1 + np.flatnonzero(intervals >= _DOUBLE * np.median(intervals)))
         if single.size <= self._present:
             return None
         single = single[-self._present - 1:]
@@ -148,9 +200,13 @@ class ToothedWheel:
                 tolerance = self._tolerances(steps)
                 error = np.abs(np.roll(intervals / guess, -index) / steps - 1.0)
                 if np.all(error <= tolerance):
-                    return Lock(first=int(single[0]), slot=-index % steps.size,
-                                interval=float(guess[0]), steps=steps,
-                                teeth=np.cumsum(steps) - steps, tolerance=tolerance)
+                    slot = -index % steps.size
+                    levels = np.log(intervals / np.roll(steps, -slot))
+                    return Lock(first=int(single[0]), slot=slot, interval=float(guess[0]),
+                                steps=steps, teeth=np.cumsum(steps) - steps,
+                                widths=steps.astype(np.float64),
+                                believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
+                                scatter=chain_scatter(levels), known=levels.size)
         return None
 
     def _tolerances(self, steps: IntArray) -> FloatArray:

@@ -27,10 +27,9 @@ class TriggerPulses:
 
     `times` in s. `starts_run`: no valid cycle ends at this pulse. `restarted`: time also ran back.
     `count` is the number of trigger cycles since the first pulse. It includes cycles with missing
-    pulses, also where these break a run, and restarts at 0 where the number of cycles is unknown
-    or not whole. `measured` is False for a missing pulse that was interpolated between its
-    neighbours. `doubtful`: a double pulse was dropped in the trigger cycle that ends here, and the
-    one that was kept may be the wrong one.
+    pulses, also where these break a run, and restarts at 0 where the number of cycles is unknown.
+    `measured` is False for a missing pulse that was interpolated between its neighbours.
+    `doubtful`: a pulse was dropped in the trigger cycle that ends here.
     """
 
     times: FloatArray
@@ -56,18 +55,18 @@ class TriggerCounter:
     """
     Count the teeth in runs of pulses and return the time of every `teeth_per_trigger`-th.
 
-    A run begins at tooth 0. Its first trigger pulse is returned together with the second one, when
-    a whole trigger cycle is known. A run without a whole cycle counts as one discarded cycle.
+    Trigger pulses are on the same teeth as long as the number of teeth since the first pulse is
+    known. The first trigger pulse of a run is returned together with the second one, when a whole
+    trigger cycle is known. A run without a whole cycle counts as one discarded cycle.
     """
 
     def __init__(self, *, teeth: int, teeth_per_trigger: int) -> None:
         self._teeth, self._per_trigger = teeth, teeth_per_trigger
         self._times: list[float] = []  # of the last pulse and those since the last count
         self._steps: list[int] = []
-        self._doubles: list[int] = []  # in `_times`, the pulses that a double followed
-        self._target = 0  # tooth of the next trigger pulse
-        self._origin = 0  # teeth from the pulse with count 0 to the run's tooth 0
-        self._last: int | None = None  # teeth from the pulse with count 0 to the last run's end
+        self._dropped: list[int] = []  # in `_times`, the pulses behind which one was dropped
+        self._target = 0  # number of the tooth of the next trigger pulse
+        self._last: int | None = None  # number of the last run's last tooth
         self._starting = False
         self._doubtful = False
         self._waiting: list[TriggerPulses] = []  # the first trigger pulse of a run
@@ -84,13 +83,11 @@ class TriggerCounter:
         """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
         self.stop()
         if passed is None or self._last is None:
-            self._origin = -(0 if tooth == 0 else self._teeth)
+            number = tooth - self._teeth if tooth else 0  # trigger cycles begin at tooth 0
         else:
-            self._origin = self._last + passed - tooth
-        self._times, self._steps = [time], [tooth]
-        self._target = 0 if tooth == 0 else self._teeth
-        if (self._origin + self._target) % self._per_trigger:  # trigger pulses on other teeth
-            self._origin = -self._target
+            number = self._last + passed
+        self._times, self._steps = [time], [number]
+        self._target = max(-(-number // self._per_trigger) * self._per_trigger, 0)
         self._starting = True
 
     def extend(self, times: list[float], steps: list[int]) -> None:
@@ -98,20 +95,20 @@ class TriggerCounter:
         self._times += times
         self._steps += steps
 
-    def double(self) -> None:
-        """Record that a double of the latest pulse was dropped."""
+    def drop(self) -> None:
+        """Record that a pulse behind the latest one was dropped."""
         if self.running:
-            self._doubles.append(len(self._times) - 1)
+            self._dropped.append(len(self._times) - 1)
 
     def stop(self, *, known: bool = True) -> None:
         """End the run, discard its unfinished trigger cycle; `known`: the last pulse is valid."""
         if self.running:
             self._count()
-            self._last = self._origin + self._steps[0]
+            self._last = self._steps[0]
             self.discarded += not self._starting or bool(self._waiting)
         if not known:
             self._last = None
-        self._times, self._steps, self._doubles, self._waiting = [], [], [], []
+        self._times, self._steps, self._dropped, self._waiting = [], [], [], []
         self._doubtful = False
 
     def restart(self) -> None:
@@ -126,17 +123,15 @@ class TriggerCounter:
         return TriggerPulses.joined(found)
 
     def _count(self) -> None:
-        teeth = np.cumsum(self._steps)
-        targets = np.arange(self._target, teeth[-1] + 1, self._per_trigger)
+        numbers = np.cumsum(self._steps)
+        targets = np.arange(self._target, numbers[-1] + 1, self._per_trigger)
         if targets.size:
-            found = self._trigger_pulses(targets, teeth)
+            found = self._trigger_pulses(targets, numbers)
         else:
-            self._doubtful |= bool(self._doubles)
-        self._doubles = []
+            self._doubtful |= bool(self._dropped)
+        self._dropped = []
         self._target += targets.size * self._per_trigger
-        self._times, self._steps = self._times[-1:], [int(teeth[-1]) - self._target]
-        self._origin += self._target
-        self._target = 0
+        self._times, self._steps = self._times[-1:], [int(numbers[-1])]
         if not targets.size:
             return
         if self._starting:
@@ -149,15 +144,15 @@ class TriggerCounter:
             self._starting = self._restarted = False
         self._found.append(found)
 
-    def _trigger_pulses(self, targets: IntArray, teeth: IntArray) -> TriggerPulses:
+    def _trigger_pulses(self, targets: IntArray, numbers: IntArray) -> TriggerPulses:
         doubtful = np.zeros(targets.size + 1, np.bool_)
-        if self._doubles:
-            doubtful[np.searchsorted(targets, teeth[self._doubles], side='right')] = True
+        if self._dropped:
+            doubtful[np.searchsorted(targets, numbers[self._dropped], side='right')] = True
         doubtful[0] |= self._doubtful
         self._doubtful = bool(doubtful[-1])
         starts, restarts = np.zeros((2, targets.size), np.bool_)
         # Missing teeth are interpolated between their neighbours.
         return TriggerPulses(
-            np.interp(targets, teeth, self._times), starts, restarts,
-            (self._origin + targets) // self._per_trigger,
-            teeth[np.searchsorted(teeth, targets)] == targets, doubtful[:-1])
+            np.interp(targets, numbers, self._times), starts, restarts,
+            targets // self._per_trigger, numbers[np.searchsorted(numbers, targets)] == targets,
+            doubtful[:-1])

@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.interval_judge import IntervalJudge
+from sa_jitter_ros.pulses.interval_judge import IntervalJudge, JudgeOptions
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
@@ -35,10 +35,9 @@ __all__ = ['MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
 FloatArray = npt.NDArray[np.float64]
 MissingPulses = Literal['break', 'bridge']
-# Pulses judged together while they are regular, and one by one around irregular ones.
-_CHUNK = 1024
-_FEW = 32
-_RESTART = 3
+_PIECE = 4096  # pulses judged at once
+_RESTART = 3  # pulses after time ran back that begin a new run
+_WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
 
 
 @dataclass(frozen=True)
@@ -76,16 +75,17 @@ class PulseValidator:
     Validate a stream of pulse times, in blocks of any size, and return its trigger pulses.
 
     A trigger pulse is returned as soon as it ends a trigger cycle, the first one of a run together
-    with the second. At the start, pulses wait until two intervals agree (for a wheel with missing
-    teeth: for a revolution); no pulse is lost by this.
+    with the second; a doubtful one waits for the next pulses. At the start, the pulses of a second
+    wait, at least 4 and at most 12, and those of four revolutions of a target with several marks,
+    at most 3 s; no pulse is lost by this. `flush` returns those that wait at the end.
 
     :param pulses_per_revolution: of the tach shaft; with missing teeth, those counted.
     :param pulses_per_trigger: pulses in a trigger cycle, None for all of a revolution.
     :param missing_teeth: number of teeth that the wheel lacks, in one gap or several.
     :param missing_pulses: 'bridge' interpolates missing pulses between their neighbours, 'break'
         discards the trigger cycle.
-    :param interval_tolerance: of an interval, as a fraction of the expected one. A lower value
-        finds smaller displacements of pulses; a higher one, up to 0.45, follows a cranking engine.
+    :param interval_tolerance: of an interval, as a fraction of the expected one; 0 learns it from
+        the scatter of the intervals.
     :param maximum_missing: more missing pulses than this in a row are a standstill.
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
     :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
@@ -96,6 +96,8 @@ class PulseValidator:
     >>> validator = PulseValidator(missing_pulses='bridge')
     >>> validator.update([0.0, 1.0, 2.0, 2.01, 3.0, 5.0, 6.0, 7.0]).times.tolist()
     [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+    >>> validator.flush().times.tolist()
+    []
     >>> validator.counts.doubles, validator.counts.missing_bridged
     (1, 1)
     """
@@ -103,7 +105,7 @@ class PulseValidator:
     def __init__(
         self, *, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break',
-        interval_tolerance: float = 0.25, maximum_missing: int = 3,
+        interval_tolerance: float = 0.0, maximum_missing: int = 3,
         minimum_interval: float = 0.0, time_tolerance: float = 0.01,
     ) -> None:
         teeth = pulses_per_revolution
@@ -115,8 +117,8 @@ class PulseValidator:
                 raise ParameterError(f'{name} {number} must be a whole number, {least} or more')
         if missing_pulses not in ('break', 'bridge'):
             raise ParameterError(f"missing_pulses '{missing_pulses}': use 'break' or 'bridge'")
-        if not 0.0 < interval_tolerance < 0.5:
-            raise ParameterError(f'interval_tolerance {interval_tolerance} must be above 0 and '
+        if not 0.0 <= interval_tolerance < 0.5:
+            raise ParameterError(f'interval_tolerance {interval_tolerance} must be 0 (learnt) or '
                                  'below 0.5: from 0.5 on a missing pulse looks like a late one')
         for name, value in (('minimum_interval', minimum_interval),
                             ('time_tolerance', time_tolerance)):
@@ -127,14 +129,15 @@ class PulseValidator:
                 f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
                 'wheel, so that trigger cycles would begin at changing teeth: choose a divisor '
                 'or a multiple')
-        target: Target = EvenTarget(tolerance=interval_tolerance)
+        target: Target = EvenTarget(marks=teeth)
         if missing_teeth:
-            target = ToothedWheel(
-                teeth=teeth, missing=missing_teeth, tolerance=interval_tolerance)
+            target = ToothedWheel(teeth=teeth, missing=missing_teeth,
+                                  tolerance=interval_tolerance or _WHEEL_TOLERANCE)
         self._counter = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
-        self._judge = IntervalJudge(
-            target, self._counter, bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
-            maximum_missing=maximum_missing, minimum_interval=minimum_interval)
+        self._judge = IntervalJudge(target, self._counter, JudgeOptions(
+            bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
+            maximum_missing=maximum_missing, minimum_interval=minimum_interval,
+            pulses_per_trigger=per_trigger))
         self.pulses_per_trigger = per_trigger
         self._time_tolerance = time_tolerance
         self._held: list[float] = []  # pulses after time ran back
@@ -169,22 +172,29 @@ class PulseValidator:
         finite = np.isfinite(pulses)
         self._non_finite += int(np.count_nonzero(~finite))
         pulses = pulses[finite]
-        done = 0
-        while done < pulses.size:
-            if self._judge.calm and not self._held:
-                done += self._judge.take_regular(pulses[done:done + _CHUNK])
-            for pulse in pulses[done:done + _FEW].tolist():
-                self._take(pulse)
-                done += 1
-                if self._judge.calm:
-                    break
+        while pulses.size:
+            ahead = 0
+            if not self._held:
+                back = np.diff(pulses, prepend=self._judge.last) < 0.0
+                ahead = min(int(np.argmax(back)) if back.any() else pulses.size, _PIECE)
+                self._judge.take(pulses[:ahead])
+            if ahead < min(pulses.size, _PIECE):
+                self._take(float(pulses[ahead]))
+                ahead += 1
+            pulses = pulses[ahead:]
+        return self._counter.take()
+
+    def flush(self) -> TriggerPulses:
+        """Return the trigger pulses that were not certain, because no pulse follows."""
+        self._judge.flush()
         return self._counter.take()
 
     def _take(self, pulse: float) -> None:
         judge = self._judge
-        if judge.confirmed < pulse < judge.last - self._time_tolerance:
-            self._out_of_order += judge.drop_unconfirmed()
         back = pulse < judge.last - self._time_tolerance
+        if back and pulse > judge.confirmed:
+            self._out_of_order += judge.drop_later(pulse, _RESTART - 1)
+            back = pulse < judge.last - self._time_tolerance
         if back or (self._held and self._continues_held(pulse)):
             self._hold(pulse)
             return
@@ -193,7 +203,7 @@ class PulseValidator:
         if pulse < judge.last:
             self._out_of_order += 1
         else:
-            judge.take(pulse)
+            judge.take(np.array([pulse]))
 
     def _continues_held(self, pulse: float) -> bool:
         """Whether a pulse continues the waiting pulses rather than the sequence before."""
@@ -209,8 +219,8 @@ class PulseValidator:
         self._held.append(pulse)
         if len(self._held) == _RESTART or pulse > self._judge.last:
             self._restarts += 1
+            self._judge.flush()
             self._judge.forget()
             self._counter.restart()
             held, self._held = self._held, []
-            for each in held:
-                self._judge.take(each)
+            self._judge.take(np.array(held))

@@ -1,0 +1,203 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the intervals of a shaft say about the next one: its expected length, and their scatter.
+
+Intervals are compared by their logarithm (*level*), so that a constant acceleration in percent is
+a straight line. Four predictions run beside each other: the last interval, the line through the
+last two, the mean of the last eight and the line through these. A steady shaft with jitter is
+predicted best by the mean, a run-up by a line. The one with the smallest errors is used. The
+scatter of its errors gives the tolerance: narrow for a steady shaft, wide for an unsteady one.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+_REACH = 8  # intervals that predict the next one
+_PLACE = np.arange(_REACH, 0, -1) - 0.5 * (_REACH + 1)  # of the latest interval first
+_LINE = 1.0 / _REACH + _PLACE * 0.5 * (_REACH + 1) / float(np.sum(_PLACE**2))
+_WEIGHTS = ((1.0,), (2.0, -1.0), (1.0 / _REACH,) * _REACH, tuple(_LINE.tolist()))
+# Standard deviations within which an interval is regular: one of 1e9 normal ones is not.
+_WIDTH = 6.0
+_BELIEVED = 3.0  # standard deviations that a given tolerance stands for at least
+_WIDEST = 0.45  # of an interval: from a half on a missing pulse looks like a late one
+_NO_SHAFT = 0.2  # scatter of pulses that come at random: 0.3 and more
+# What is assumed about the scatter before it is known, and how many intervals that counts for.
+_PRIOR, _PRIOR_COUNT = 0.01, 0.05
+_UNCERTAIN = 2.0  # of n intervals the scatter may be too small by a factor 1 + this / n
+_MEMORY = 64.0  # intervals after which the scatter is forgotten
+_KEPT_SQUARE = 0.3685  # mean square of the smallest three quarters of normal variables
+# Levels that are equal but for rounding, the longest period of a clock (relative to an interval)
+# that they show, and the periods by which an interval may differ.
+_EQUAL, _LONGEST_STEP, _STEPS = 1e-6, 0.02, 2.2
+# Fractions of a trigger cycle: smallest tolerance, and displacement that no average shows. A pulse
+# further off its expected time waits for the next one, which tells if it was a stray.
+_FLOOR, _HARMLESS = 1e-3, 3e-3
+
+
+class IntervalModel:
+    """
+    Expected level of the next interval and the tolerance, both learnt from the intervals so far.
+
+    `given` is the tolerance that the user gave, 0 to learn it. A trigger cycle has
+    `pulses_per_trigger` intervals. The scatter is computed anew after every `block` intervals,
+    whatever the size of the pieces in which they come.
+
+    >>> model = IntervalModel(given=0.0, pulses_per_trigger=1, block=8)
+    >>> model.start(np.log([1.0, 1.01, 0.99, 1.0]), scatter=0.01, count=20)
+    >>> model.deviations(np.log([1.0, 1.1])).round(2).tolist(), round(model.tolerance, 3)
+    ([0.0, 0.1], 0.066)
+    """
+
+    def __init__(self, *, given: float, pulses_per_trigger: int, block: int) -> None:
+        self.given, self.block = given, block
+        self._floor = min(_FLOOR * pulses_per_trigger, 0.03)
+        self._harmless = min(_HARMLESS * pulses_per_trigger, 0.1)
+        self.start(np.zeros(1), scatter=_PRIOR, count=1)
+
+    def start(self, levels: FloatArray, *, scatter: float, count: int) -> None:
+        """Begin with these levels (n,); `count` intervals had this scatter, relative to 1."""
+        missing = max(_REACH - levels.size, 0)
+        self._levels = np.concatenate((np.full(missing, levels[0]), levels[-_REACH:]))
+        self._variance = np.full(len(_WEIGHTS), scatter**2)
+        self._count = float(count)
+        self._chosen = 0
+        self._settling = _REACH
+        self._coarse = False
+        self._step = 0.0
+        self._set_tolerance()
+
+    @property
+    def room(self) -> int:
+        """Number of intervals until the scatter is computed anew."""
+        return self.block + _REACH - self._levels.size
+
+    @property
+    def irregular(self) -> bool:
+        """Whether the intervals scatter so much that they are not those of a shaft."""
+        return not self.given and self.scatter > _NO_SHAFT
+
+    @property
+    def known(self) -> int:
+        """Number of intervals from which the scatter is known."""
+        return int(self._count)
+
+    @property
+    def level(self) -> float:
+        """Level of the last interval."""
+        return float(self._levels[-1])
+
+    @property
+    def before(self) -> float:
+        """Level of the interval before the last one."""
+        return float(self._levels[-2])
+
+    @property
+    def expected(self) -> float:
+        """Expected level of the next interval."""
+        return float(self._predicted(self._chosen, np.append(self._levels, 0.0), 1)[0])
+
+    def deviations(self, levels: FloatArray) -> FloatArray:
+        """Return by how much each of the next levels (n,) is off, relative to its interval."""
+        every = np.concatenate((self._levels, levels))
+        found: FloatArray = np.expm1(levels - self._predicted(self._chosen, every, levels.size))
+        if self._settling or self.given:  # which prediction is the best one is not known yet
+            for kind in range(len(_WEIGHTS)):
+                other = np.expm1(levels - self._predicted(kind, every, levels.size))
+                nearer = np.abs(other) < np.abs(found)
+                if not self.given:
+                    nearer[self._settling:] = False
+                found = np.where(nearer, other, found)
+        return found
+
+    def accept(self, levels: FloatArray) -> None:
+        """Take the next regular levels (n,), n at most `room`."""
+        self._levels = np.concatenate((self._levels, levels))
+        self._settling = max(self._settling - levels.size, 0)
+        if not self.room:
+            self._learn()
+
+    def jump(self, level: float) -> None:
+        """Take a level that was not expected: the next ones may follow it."""
+        self.accept(np.array([level]))
+        self._settling = _REACH
+
+    def is_clock_step(self, deviation: float, after: float) -> bool:
+        """
+        Whether the clock of the pulses explains a deviation before an interval of level `after`.
+
+        No shaft has equal intervals. If most are equal, they are read from a slow clock, and one
+        of them is a period longer or shorter now and then.
+        """
+        found = (self._coarse and abs(deviation) <= _LONGEST_STEP
+                 and abs(after - self.expected) <= self.tolerance)
+        if found:
+            self._step = max(self._step, abs(deviation))
+            self._set_tolerance()
+        return found
+
+    def _predicted(self, kind: int, every: FloatArray, count: int) -> FloatArray:
+        """Return what is expected of the last `count` levels, from those before each."""
+        end = every.size - 1
+        total = np.zeros(count)
+        # Sums of slices are equal for any cutting of the stream, unlike a convolution.
+        for back, weight in enumerate(_WEIGHTS[kind]):
+            total += weight * every[end - count - back:end - back]
+        return total
+
+    def _learn(self) -> None:
+        every, weight = self._levels, self.block / min(self._count + self.block, _MEMORY)
+        levels = every[-self.block:]
+        for kind in range(len(_WEIGHTS)):
+            off = np.expm1(levels - self._predicted(kind, every, self.block))
+            square = _robust_square(np.minimum(np.square(off), self.tolerance**2))
+            self._variance[kind] += weight * (square - self._variance[kind])
+        self._count = min(self._count + self.block, _MEMORY)
+        self._chosen = int(np.argmin(self._variance))
+        self._coarse = bool(np.mean(np.abs(np.diff(every)) < _EQUAL) >= 0.5)
+        self._levels = every[-_REACH:].copy()
+        self._set_tolerance()
+
+    def _set_tolerance(self) -> None:
+        total = _PRIOR_COUNT * _PRIOR**2 + self._count * float(self._variance[self._chosen])
+        #: standard deviation of the error of a prediction, relative to the interval
+        learnt = math.sqrt(total / (_PRIOR_COUNT + self._count)) * (1.0 + _UNCERTAIN / self._count)
+        self.scatter = max(learnt, self._floor / _WIDTH)
+        if self.given:
+            self.scatter = min(self.scatter, self.given / _BELIEVED)
+        widest = min(max(_WIDTH * self.scatter, _STEPS * self._step), _WIDEST)
+        #: a deviation up to this is regular
+        self.tolerance = self.given or widest
+        #: a deviation up to this passes without looking at the next pulse
+        self.harmless = min(widest, self._harmless, self.tolerance)
+
+
+def _robust_square(squares: FloatArray) -> float:
+    """Return the mean square (n,) without the largest quarter, which strays may have caused."""
+    kept = np.sort(squares)[:squares.size - squares.size // 4]
+    # Where most deviations are 0, as those of a slow clock, the largest ones tell the scatter.
+    return max(float(kept.mean()) / _KEPT_SQUARE, float(squares.mean()) / 4.0)
+
+
+def chain_scatter(levels: FloatArray) -> float:
+    """Return the robust scatter of levels (n,) about the better of two predictions."""
+    if levels.size < 2:
+        return _PRIOR
+    kinds = [np.abs(np.diff(levels))]
+    if levels.size > 3:
+        kinds.append(np.abs(np.diff(levels, 2)))
+    typical = [1.48 * float(np.median(kind)) if kind.size > 4
+               else math.sqrt(float(np.mean(np.square(kind)))) for kind in kinds]
+    return min(typical)

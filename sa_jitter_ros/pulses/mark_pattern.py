@@ -1,0 +1,131 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The angles between the marks of a target, from the intervals of several revolutions."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+_FEWEST = 2  # intervals of a mark
+# How much more the means of the marks have to scatter than the intervals of one mark explain.
+_SIGNIFICANT = 4.0
+# Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
+_REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
+
+
+@dataclass(frozen=True)
+class MarkPattern:
+    """
+    Logarithms of the relative `widths` (mark,), and the `scatter` of the intervals about them.
+
+    The widths shrink towards 0 as far as the scatter explains them. Those of marks that are not
+    `known` (mark,) are 0.
+    """
+
+    widths: FloatArray
+    known: BoolArray
+    scatter: float
+
+
+def mark_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern | None:
+    """
+    Return what repeats in the levels (n,) of consecutive intervals, None if they are too few.
+
+    The interval i begins at the mark `marks[i]` of `count`; its level is the logarithm of its
+    length, NaN where it is not known.
+
+    >>> late = np.tile([0.1, -0.1, 0.0, 0.0], 5)
+    >>> pattern = mark_pattern(np.arange(20) % 4, late + 0.001 * np.arange(20), 4)
+    >>> pattern.widths.round(2) + 0.0
+    array([ 0.1, -0.1,  0. ,  0. ])
+    """
+    if levels.size < (1 + _FEWEST) * count:
+        return None
+    known = np.isfinite(levels)
+    window = np.ones(count)
+    weights = np.convolve(known, window, 'valid')
+    with np.errstate(invalid='ignore', divide='ignore'):
+        smooth = np.convolve(np.where(known, levels, 0.0), window, 'valid') / weights
+    first = (count - 1) // 2
+    middle = slice(first, first + smooth.size)
+    off = levels[middle] - smooth
+    at = marks[middle]
+    # Row by row a revolution, as far as the intervals follow each other.
+    row = np.cumsum(np.append(0, np.diff(at) <= 0))
+    table = np.full((int(row[-1]) + 1, count), np.nan)
+    table[row, at] = off
+    seen = np.count_nonzero(np.isfinite(table), axis=0)
+    known_marks = seen >= _FEWEST
+    if not known_marks.any():
+        return None
+    widths = np.zeros(count)
+    widths[known_marks] = np.nanmedian(table[:, known_marks], axis=0)
+    deviations = (table - widths) * np.sqrt(seen / np.maximum(seen - 1.0, 1.0))
+    every = deviations[:, known_marks]
+    every = every[np.isfinite(every)]
+    # The median of the magnitudes is not moved by strays; of two values it is their deviation.
+    scatter = 1.48 * float(np.median(np.abs(every)))
+    per_mark = every.size / np.count_nonzero(known_marks)
+    widths[known_marks] -= widths[known_marks].mean()
+    between = float(np.mean(widths[known_marks]**2))
+    explained = scatter**2 / per_mark
+    if between <= _SIGNIFICANT * explained:
+        return MarkPattern(np.zeros(count), known_marks, scatter)
+    return MarkPattern(widths * (1.0 - explained / between), known_marks, scatter)
+
+
+def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
+    """
+    Return where levels (n,) first repeat for two revolutions of `count` marks, and their pattern.
+
+    Two revolutions without a stray or missing pulse show the pattern of few marks, however uneven.
+
+    >>> begin, pattern = repeating(np.array([0.4, *[0.1, -0.1, 0.0] * 2]), 3)
+    >>> begin, pattern.widths.round(3).tolist()
+    (1, [0.1, -0.1, 0.0])
+    """
+    if levels.size < 2 * count:
+        return None
+    change = levels[count:] - levels[:-count]
+    windows = np.lib.stride_tricks.sliding_window_view(change, count)
+    apart = windows.max(axis=1) - windows.min(axis=1)  # apart from a change of speed
+    for tolerance in _REPEATING:
+        fits = np.flatnonzero((apart <= tolerance) & (np.abs(windows).max(axis=1) <= _CHANGE))
+        if fits.size:
+            begin = int(fits[0])
+            slope = float(windows[begin].mean()) / count
+            two = (levels[begin:begin + 2 * count].reshape(2, count)
+                   - slope * np.arange(2 * count).reshape(2, count))
+            widths = two.mean(axis=0)
+            scatter = float(np.std(two[1] - two[0])) + float(np.median(apart[fits])) / 4.0
+            return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
+    return None
+
+
+def regular_start(levels: FloatArray, tolerance: float) -> int:
+    """
+    Return the number of the first of the levels (n,) that those behind it confirm.
+
+    It differs from the next one, or from the line through the next two, by at most `tolerance`.
+
+    >>> regular_start(np.array([0.5, 0.1, 0.0, 0.0, 0.0]), 0.01)
+    2
+    """
+    if levels.size < 3:
+        return 0
+    first, second, third = levels[:-2], levels[1:-1], levels[2:]
+    near = np.minimum(np.abs(first - second), np.abs(first - 2.0 * second + third)) <= tolerance
+    return int(np.argmax(near)) if near.any() else 0

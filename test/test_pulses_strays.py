@@ -1,0 +1,173 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Pulses that no tooth made, or at another time: no trigger cycle is wrong, on any wheel."""
+
+import numpy as np
+import pytest
+from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
+from sa_jitter_ros.pulses.validation import PulseValidator
+from scipy.ndimage import gaussian_filter1d
+
+SECONDS = 2.5
+WHEELS = {
+    '1': ({}, np.zeros(1)),
+    '4': ({'pulses_per_revolution': 4}, np.arange(4) / 4.0),
+    '4 uneven': ({'pulses_per_revolution': 4}, np.arange(4) / 4.0 + [0.0, 0.01, -0.012, 0.006]),
+    '60': ({'pulses_per_revolution': 60}, np.arange(60) / 60.0),
+    '36-1': ({'pulses_per_revolution': 36, 'missing_teeth': 1}, np.arange(35) / 36.0),
+    '60-2': ({'pulses_per_revolution': 60, 'missing_teeth': 2}, np.arange(58) / 60.0)}
+FAULTS = ('stray', 'double', 'displaced', 'missing', 'beside gaps')
+
+
+class Shaft:
+    """A shaft at 33.3 Hz (one mark) or 12 Hz, steady or with a speed that changes at random."""
+
+    def __init__(self, rng, wheel, unsteady):
+        self.options, marks = WHEELS[wheel]
+        self._time = np.linspace(0.0, SECONDS, 50_001)
+        speed = np.full(self._time.size, 33.3 if marks.size == 1 else 12.0)
+        if unsteady:
+            noise = gaussian_filter1d(rng.standard_normal(speed.size), 1000)
+            speed *= 1.0 + 0.02 * noise / noise.std()
+        self._angle = np.append(0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1])
+                                               * np.diff(self._time)))
+        turns = np.arange(int(self._angle[-1]) - 1)[:, None] + marks
+        self.pulses = np.interp(turns.ravel(), self._angle, self._time)
+        self.pulses += rng.normal(0.0, 2e-6, self.pulses.size)
+
+    def angle(self, times):
+        """Return the true angle in revolutions."""
+        return np.interp(times, self._time, self._angle)
+
+
+def spoilt(rng, pulses, fault):
+    """Return the pulses with one fault in 24 of them, uniform over record and interval."""
+    count = max(pulses.size // 24, 3)
+    some = rng.choice(np.arange(1, pulses.size - 2), count, replace=False)
+    interval = np.gradient(pulses)[some]
+    given = pulses.copy()
+    if fault == 'displaced':
+        given[some] += rng.uniform(-0.5, 0.5, count) * interval
+    extra = {'stray': rng.uniform(pulses[0], pulses[-1], count),
+             'double': pulses[some] + rng.uniform(0.001, 0.5, count) * interval,
+             'beside gaps': pulses[some] + rng.uniform(-1.0, 1.0, count) * interval
+             }.get(fault, [])
+    keep = np.ones(pulses.size, np.bool_)
+    if fault in ('missing', 'beside gaps'):
+        keep[some] = False
+    return np.sort(np.append(given[keep], extra))
+
+
+@pytest.mark.parametrize('unsteady', [False, True])
+@pytest.mark.parametrize('wheel', WHEELS)
+def test_no_trigger_cycle_is_wrong(wheel, unsteady):
+    for seed, fault in enumerate(FAULTS):
+        if fault == 'displaced' and unsteady and wheel == '1':
+            continue  # a speed that changes as much explains small displacements
+        rng = np.random.default_rng([seed, len(wheel)])
+        shaft = Shaft(rng, wheel, unsteady)
+        validator = PulseValidator(**shaft.options)
+        found = TriggerPulses.joined([
+            validator.update(spoilt(rng, shaft.pulses, fault)), validator.flush()])
+        turned = np.diff(shaft.angle(found.times))
+        whole = ~found.starts_run[1:]
+        assert np.abs(turned[whole] - 1.0).max(initial=0.0) < 4e-3, fault
+        known = np.diff(found.count) > 0  # over gaps, too
+        assert np.abs(turned - np.diff(found.count))[known].max(initial=0.0) < 0.05, fault
+        if fault in ('stray', 'double'):
+            assert np.count_nonzero(whole) > 0.9 * turned.size > 0, fault
+
+
+@pytest.mark.parametrize('size', [0.01, 0.03, 0.1, 0.3])
+def test_a_displaced_pulse_of_a_steady_shaft_is_in_no_cycle(rng, size):
+    pulses = 0.03 * np.arange(300.0) + rng.normal(0.0, 3e-6, 300)
+    given = pulses.copy()
+    given[40::29] += size * 0.03 * rng.choice([-1.0, 1.0], given[40::29].size)
+    validator = PulseValidator()
+    found = np.concatenate([validator.update(given).times, validator.flush().times])
+    assert np.isin(found, pulses).all()
+    assert found.size > 270
+
+
+def test_the_second_of_two_near_pulses_is_the_true_one():
+    """A stray at 75 to 95 % of an interval is not taken for the pulse, nor the pulse dropped."""
+    pulses = 0.03 * np.arange(100.0)
+    for place in np.linspace(0.75, 0.95, 9):
+        validator = PulseValidator()
+        found = validator.update(np.sort(np.append(pulses, pulses[50] + 0.03 * place)))
+        assert np.array_equal(found.times, pulses)
+        assert validator.counts.early == 1
+
+
+def test_strays_before_and_after_the_first_pulse(rng):
+    pulses = 1.0 + 0.03 * np.arange(60.0) + rng.normal(0.0, 3e-6, 60)
+    for place in np.arange(-0.9, 1.0, 0.1):
+        validator = PulseValidator()
+        found = validator.update(np.sort(np.append(pulses, pulses[0] + 0.03 * place)))
+        assert np.isin(found.times, pulses).all()
+        assert found.times.size >= 59
+
+
+def test_a_doubled_rate_is_learnt_and_counted():
+    """Pulses of a second keyphasor half an interval apart, say."""
+    pulses = 0.03 * np.arange(100.0)
+    validator = PulseValidator()
+    found = validator.update(np.sort(np.append(pulses, pulses[50:] + 0.015)))
+    assert validator.counts.relearnt == 1
+    assert np.count_nonzero(found.starts_run) == 2
+    assert np.diff(found.times)[~found.starts_run[1:]].min() == pytest.approx(0.015)
+
+
+def test_the_tolerance_follows_the_shaft(rng):
+    tolerance = []
+    for scatter in (1e-4, 1e-3, 1e-2):
+        model = IntervalModel(given=0.0, pulses_per_trigger=1, block=8)
+        model.start(np.zeros(1), scatter=0.01, count=3)
+        for _ in range(100):
+            model.accept(rng.normal(0.0, scatter, model.room))
+        tolerance.append(model.tolerance)
+    assert tolerance == pytest.approx([2e-3, 6.5e-3, 6.5e-2], rel=0.4)
+
+
+@pytest.mark.parametrize('clock', [3000.0, 5120.0, 8000.0])
+def test_steps_of_a_slow_clock_cost_nothing(clock):
+    """Equal intervals, one of them a period longer now and then."""
+    pulses = np.ceil(np.arange(400.0) / 33.331 * clock) / clock
+    validator = PulseValidator()
+    found = np.concatenate([validator.update(pulses).times, validator.flush().times])
+    assert np.array_equal(found, pulses)
+
+
+@pytest.mark.parametrize(('times', 'count'), [
+    ([], 0), ([1.0], 0), (np.full(50, 2.0), 0), (np.arange(50.0, 0.0, -1.0), 0)])
+def test_what_is_no_shaft_gives_no_cycle(times, count):
+    validator = PulseValidator()
+    found = validator.update(np.asarray(times, float)).times.size + validator.flush().times.size
+    assert found == count
+
+
+def test_strays_alone_give_hardly_any_cycle(rng):
+    validator = PulseValidator()
+    found = validator.update(np.sort(rng.uniform(0.0, 10.0, 300)))
+    assert found.times.size < 30
+    counts = validator.finish()
+    assert counts.unlocked + counts.early + counts.doubles > 200
+
+
+def test_a_wheel_that_changes_its_pattern_is_learnt_again(rng):
+    even, uneven = np.arange(4) / 4.0, np.array([0.0, 0.2, 0.5, 0.7])
+    turns = np.arange(60)[:, None] + np.where(np.arange(60)[:, None] < 30, even, uneven)
+    pulses = turns.ravel() / 12.0 + rng.normal(0.0, 2e-6, turns.size)
+    validator = PulseValidator(pulses_per_revolution=4)
+    found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
+    assert np.abs(np.diff(found.times)[~found.starts_run[1:]] * 12.0 - 1.0).max() < 4e-3
+    assert found.times.size > 40
