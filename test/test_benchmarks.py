@@ -139,11 +139,13 @@ def test_measured_cases_are_run_as_a_user_does(benchmark, tmp_path):
     model = {'keyphasor_rate': machines.KEYPHASOR_RATE, 'trigger_speed': machines.SPEED,
              'orders': list(machines.ORDERS), 'noise_std': machines.NOISE}
     stored = [cases.stored('machine.npz')]
-    used, refused = (cases.run(cases.Case(title, stored, {**model, 'trigger_cycles': count}),
-                               tmp_path) for title, count in (('used', 20), ('refused', 100)))
-    assert used.content['verdict'] == 'none'
-    assert 'fitting and scoring take at least 4' in refused.error
-    lines = cases.table([used, refused], 'machine').splitlines()
+    used, short, refused = (
+        cases.run(cases.Case(title, stored, {**model, 'trigger_cycles': count}), tmp_path)
+        for title, count in (('used', 20), ('short', 100), ('refused', 1000)))
+    assert used.content['verdict'] == short.content['verdict'] == 'none'
+    assert 'fitting and scoring take at least 4' in short.content['remarks'][-1]
+    assert 'do not make an acquisition' in refused.error
+    lines = cases.table([used, short, refused], 'machine').splitlines()
     assert {line.count('|') for line in lines} == {12}
     assert lines[2].startswith('| used | 5 | none | - | 0.0% |')
     assert cases.error_figure([used]).axes
