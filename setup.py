@@ -26,7 +26,7 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('chain', 'close_loop', 'demo', 'design')
+COMMANDS = ('chain', 'check_keyphasor', 'close_loop', 'demo', 'design')
 
 
 def scripts():

@@ -39,6 +39,8 @@ CORE = {
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},
+    'keyphasor_check': SCIENCE | {
+        'averaging', 'effects', 'errors', 'pulses', 'recordings'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib', 'prediction',
         'pulses', 'recordings'},

@@ -18,15 +18,17 @@ that were not used for fitting.
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, Parser, read_options, require_writable, show)
 from sa_jitter_ros.declaration import read_declaration
-from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop
-from sa_jitter_ros.recordings import read
+from sa_jitter_ros.parameter_file import read_parameters
+from sa_jitter_ros.recordings import read, Recording
 
 
 def make_parser() -> Parser:
@@ -50,13 +52,26 @@ def run(options: argparse.Namespace) -> Loop:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
-    recordings = [read(path, **read_options(options)) for path in options.recordings]
+    recordings = [_on_target(read(path, **read_options(options)), options.declared)
+                  for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
     if declaration.unknown:
         print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
               f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
     return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
                       progress=progress)
+
+
+def _on_target(recording: Recording, params: Path) -> Recording:
+    """Return a recording with the missing teeth that the machine file gives to the averager."""
+    try:
+        averager = read_parameters(params, 'synchronous_averager')
+    except ParameterError:  # a file for jitter_predictor only
+        return recording
+    target = {name: averager[name] for name in ('pulses_per_revolution', 'missing_teeth')
+              if name in averager}
+    return recording if recording.missing_teeth or not target.get('missing_teeth') else replace(
+        recording, **target)
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@
 
 """Pulse times that are not in seconds, not in order, or not on the clock of the vibration."""
 
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -17,6 +18,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MUCH = 10.0  # pulses that span so many times the vibration are in another unit
+_FACTOR = 2.0  # by which spans may differ in the right unit
+# Spread of the logarithm of the spans: a tach is often shorter than the vibration, seldom longer.
+_SHORTER, _LONGER = 0.5, 0.1
+_EPOCH = 1e8  # s; later first pulses are counted since 1970
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """
+    One explanation of pulse times that do not fit the vibration.
+
+    `code` names it, `text` says it with the remedy. Pulse times are in s after `shift` was
+    subtracted from them and `scale` multiplied; the sampling rate is `rate_scale` times as high.
+    `probability` is that among all explanations.
+    """
+
+    code: str
+    text: str
+    scale: float = 1.0
+    shift: float = 0.0
+    rate_scale: float = 1.0
+    probability: float = 1.0
 
 
 def likely_mistake(pulses: NDArray[Any], start: float, end: float, rate: float) -> str:
@@ -28,26 +51,63 @@ def likely_mistake(pulses: NDArray[Any], start: float, end: float, rate: float) 
     >>> likely_mistake(np.arange(0.0, 4000.0, 40.0), 0.0, 4.0, 5e3)  # doctest: +ELLIPSIS
     'the pulses span 3960 s, the vibration spans 4 s: the pulse times look like milliseconds; ...'
     """
+    found = find_mistakes(pulses, start, end, rate)
+    return found[0].text if found else ''
+
+
+def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
+                  ) -> tuple[Mistake, ...]:
+    """
+    Return what may be wrong with pulse times (n,) that do not fit the vibration, likeliest first.
+
+    Arguments as those of `likely_mistake`.
+
+    >>> mistake, = find_mistakes(1.7e9 + np.arange(0.0, 4.0, 0.04), 0.0, 4.0, 5e3)
+    >>> mistake.code, mistake.shift
+    ('unit_epoch', 1700000000.0)
+    """
     times = pulses[np.isfinite(pulses)].astype(np.float64)
     if times.size < 2 or end <= start:
-        return ''
+        return ()
     backwards = int(np.count_nonzero(np.diff(times) < 0.0))
     if 2 * backwards >= times.size:
-        return (f'{backwards} of {times.size} pulse times are earlier than the one before: give '
-                'them in order of time, numpy.sort(pulse_times)')
+        return (Mistake('backwards', f'{backwards} of {times.size} pulse times are earlier than '
+                        'the one before: give them in order of time, numpy.sort(pulse_times)'),)
     duration, span = end - start, float(np.ptp(times))
     spans = f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s'
     if span > _MUCH * duration:
-        units = {'sample indices': rate, 'milliseconds': 1e3, 'microseconds': 1e6}
-        unit = min(units, key=lambda name: abs(math.log(span / (units[name] * duration))))
-        if 0.5 < span / (units[unit] * duration) < 2.0:
-            return (f'{spans}: the pulse times look like {unit}; divide them by '
-                    f'{units[unit]:g} to have seconds')
-        return f'{spans}: give pulse times in s, and sample_rate in Hz'
+        return _other_unit(spans, span / duration, rate)
     if span * _MUCH**2 < duration:
-        return f'{spans}: give pulse times in s, and sample_rate in Hz'
+        if 0.5 / _MUCH < 1e3 * span / duration < _FACTOR:
+            return (Mistake(
+                'unit_khz', f'{spans}: the sampling rate of {rate:g} Hz looks like kHz; give '
+                f'sample_rate={1e3 * rate:.10g}', rate_scale=1e3),)
+        return (Mistake('span', f'{spans}: give pulse times in s, and sample_rate in Hz'),)
     if times.max() < start or times.min() > end:
-        return (f'the pulses come from {times.min():.6g} s to {times.max():.6g} s, when there is '
-                'no vibration: set start_time to the time of the first sample on the clock of the '
-                'pulses')
-    return ''
+        apart = (f'the pulses come from {times.min():.6g} s to {times.max():.6g} s, when there is '
+                 'no vibration: ')
+        first = math.floor(float(times.min()))
+        if first > _EPOCH > end:
+            return (Mistake('unit_epoch', f'{apart}they are counted since 1970; set start_time to '
+                            'the time of the first sample on the same clock', shift=first),)
+        return (Mistake('no_overlap', f'{apart}set start_time to the time of the first sample on '
+                        'the clock of the pulses', shift=float(times.min()) - start),)
+    return ()
+
+
+def _other_unit(spans: str, factor: float, rate: float) -> tuple[Mistake, ...]:
+    """Return the units in which pulses may span `factor` times the vibration."""
+    units = {'samples': ('sample indices', rate), 'ms': ('milliseconds', 1e3),
+             'us': ('microseconds', 1e6), 'ns': ('nanoseconds', 1e9)}
+    weights = {}
+    for name, (_, unit) in units.items():
+        away = math.log(factor / unit)
+        if abs(away) < math.log(_FACTOR):
+            weights[name] = math.exp(-0.5 * (away / (_LONGER if away > 0.0 else _SHORTER)) ** 2)
+    if not weights:
+        return (Mistake('span', f'{spans}: give pulse times in s, and sample_rate in Hz'),)
+    return tuple(Mistake(
+        f'unit_{name}', f'{spans}: the pulse times look like {units[name][0]}; divide them by '
+        f'{units[name][1]:g} to have seconds', scale=1.0 / units[name][1],
+        probability=weight / sum(weights.values()))
+        for name, weight in sorted(weights.items(), key=lambda item: -item[1]))

@@ -1,0 +1,88 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Command `check_keyphasor`: what the keyphasor of a recording is, and what is wrong with it.
+
+Hardly anything need be declared. The command finds the unit of the pulse times, the clock that
+timed them, the marks of the target, strays and lost pulses, the jitter, the speed, and the orders
+of the vibration. It says what each finding costs, and writes a parameter file for all nodes.
+"""
+
+import argparse
+from collections.abc import Sequence
+import json
+from pathlib import Path
+import sys
+
+from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
+from sa_jitter_ros.commands.command_line import (
+    add_recording_options, Parser, read_options, require_writable, show)
+from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.keyphasor_check.check import check_keyphasor
+from sa_jitter_ros.keyphasor_check.machine_file import machine_file
+from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
+from sa_jitter_ros.recordings import read
+
+
+def make_parser() -> Parser:
+    """Return the parser of the command line."""
+    parser = Parser(prog='check_keyphasor', description=__doc__,
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('recording', type=Path, metavar='RECORDING',
+                        help='.npz, .mat, .wav, .csv or rosbag2; a .npz or .mat with pulse times '
+                        'only is examined without vibration')
+    parser.add_argument('--output', type=Path, required=True, metavar='DIR',
+                        help='folder for keyphasor.json, machine.yaml and the figure')
+    parser.add_argument('--teeth', type=int, nargs='+', default=(), metavar='N',
+                        help='numbers of teeth of gears in the machine, to find the ratio')
+    parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_recording_options(parser)
+    return parser
+
+
+def run(options: argparse.Namespace) -> KeyphasorCheck:
+    """Check the recording; raises SaJitterError."""
+    def progress(text: str) -> None:
+        if not options.quiet:
+            print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
+
+    recording = read(options.recording, pulses_suffice=True, **read_options(options))
+    for remark in recording.remarks:
+        progress(remark)
+    return check_keyphasor(recording, teeth=options.teeth, progress=progress)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Check a keyphasor; return 0, or 2 after one line on unusable input or output."""
+    options = make_parser().parse_args(args)
+    try:
+        require_writable(options.output)
+        use_one_thread()
+        found = run(options)
+        options.output.mkdir(parents=True, exist_ok=True)
+        report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
+        (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
+        (options.output / 'machine.yaml').write_text(
+            machine_file(found, options.recording.name), encoding='utf-8')
+        check_figure(found, options.recording.name).savefig(
+            options.output / 'keyphasor.png', dpi=110)
+    except (SaJitterError, OSError) as error:
+        print(f'check_keyphasor: {" ".join(str(error).split())}', file=sys.stderr)
+        return 2
+    written = ', '.join(str(options.output / name)
+                        for name in ('keyphasor.json', 'machine.yaml', 'keyphasor.png'))
+    return show('check_keyphasor', found, f'written: {written}')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,423 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What a keyphasor is and what is wrong with it, found in a recording: `check_keyphasor`.
+
+Each finding has a value with its standard error, or other values with their probabilities, and
+says what decided it or would. Each warning says what it costs at each order, and what to do.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
+from sa_jitter_ros.keyphasor_check.costs import costs
+from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.lines import (
+    ENCODERS, find_lines, Lines, marks_evidence, on_orders, ratio_evidence, usual_marks)
+from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses
+from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
+from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
+from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
+from sa_jitter_ros.keyphasor_check.wheel import Pattern, patterns
+from sa_jitter_ros.pulses.unit_check import find_mistakes
+from sa_jitter_ros.recordings.channel_check import bad_channels
+from sa_jitter_ros.recordings.recording import Recording
+
+FloatArray = NDArray[np.float64]
+
+_MOST_MARKS = 72
+_SYMMETRY = 1.5  # log probability that a pattern repeats in a revolution
+_DECLARED = math.log(300.0)  # what the statement of a recording says for a number of marks
+_LISTED = 0.01  # probability of an alternative that is listed
+_SURE = 0.9
+_MOST_ORDERS = 12
+_MOST_SAMPLES = 12_000_000
+# Lines at whole orders of the tach shaft, beside those there by chance, with which it is the shaft
+# of interest; and the probability that another one is, all the same.
+_FEWEST_OWN, _ANOTHER = 3, 0.25
+_SPAN_SHORT, _SPAN_LONG = 0.8, 1.05
+_APART = 4.0  # standard errors
+_KILO = (500.0, 2000.0)  # times as long: a rate in kHz instead of Hz
+_FEWEST_SAMPLES = 16
+
+
+def check_keyphasor(recording: Recording, *, teeth: Sequence[int] = (),
+                    progress: Callable[[str], None] | None = None) -> KeyphasorCheck:
+    """
+    Examine the keyphasor of a recording of which hardly anything is declared.
+
+    `teeth` are numbers of teeth of gears in the machine, which help to find `ratio`. `progress` is
+    called with a line of text for every step. Raises SignalError for a keyphasor without pulses
+    that could be examined, RecordingError for a recording without a keyphasor.
+
+    A wheel of eight teeth, of which one is missing, on a shaft at 20 Hz; one pulse is lost:
+
+    >>> from sa_jitter_ros.recordings.recording import ArraySource
+    >>> place = np.arange(800)
+    >>> rng = np.random.default_rng(1)
+    >>> times = 0.1 + place / 160.0 + rng.normal(0.0, 2e-6, 800)
+    >>> check = check_keyphasor(Recording(
+    ...     ArraySource(np.zeros((1, 51_000))), 10e3,
+    ...     pulse_times=times[(place % 8 != 5) & (place != 300)]))
+    >>> check.findings['pulses_per_revolution'].value, check.findings['missing_teeth'].value
+    (8, 1)
+    >>> check.findings['missing'].value['count'], check.findings['jitter_std'].unit
+    (1, 's')
+    """
+    return _Check(recording, teeth, progress or (lambda text: None)).run()
+
+
+class _Check:
+    """The steps of a check, which share what was found."""
+
+    def __init__(self, recording: Recording, teeth: Sequence[int],
+                 progress: Callable[[str], None]) -> None:
+        self._recording, self._teeth, self._progress = recording, teeth, progress
+        self._rate, self._start = recording.sample_rate, recording.start_time
+        self._warnings: list[Warn] = []
+        self._from_waveform = recording.pulse_times is None and recording.tach is not None
+        self._orders: tuple[float, ...] = ()
+        self._largest = 0.0  # pulse time as recorded, s: the larger, the coarser its last digit
+
+    def run(self) -> KeyphasorCheck:
+        """Return what was found."""
+        times = self._pulses()
+        self._progress(f'{times.size} pulses from {times[0]:.6g} s to {times[-1]:.6g} s')
+        numbered = number_pulses(times)
+        clock = clock_of(numbered.times, largest=self._largest)
+        tick = 1.0 / clock.rate if clock.rate else 0.0
+        self._progress('looking for the pattern of the target')
+        found = patterns(numbered)
+        if found and found[0].present == 1:  # one mark, and the teeth between are none
+            numbered = numbered.every(found[0].teeth, found[0].origin)
+            found = patterns(numbered)
+        found = [item for item in found if item.present > 1]
+        first = fit_pulses(numbered, 1, tick=tick)
+        samples = self._samples()
+        lines = None
+        if samples is not None:
+            self._progress('looking for lines of the vibration over the angle')
+            base = first if not found else fit_pulses(numbered, found[0].teeth, tick=tick)
+            once = base.once_a_revolution()
+            lines = find_lines(samples.T, self._start, self._rate, base.true[once],
+                               base.numbers[once].astype(np.float64))
+        marks, decided = self._marks(numbered, found, lines)
+        count = int(marks.value)
+        fitted = fit_pulses(numbered, count, tick=tick)
+        if count == 1:
+            fitted = first
+        per_revolution = None if lines is None else lines.scaled(float(count))
+        ratio, orders = self._ratio(per_revolution)
+        self._orders = tuple(orders.value or ())
+        self._progress('measuring the jitter')
+        averages = {} if samples is None or not self._orders else self._averaged(
+            samples, times, fitted, ratio, clock)
+        findings = {
+            'pulses_per_revolution': marks,
+            'missing_teeth': Finding(
+                count - fitted.pattern.present,
+                decided_by='teeth without a pulse in every revolution' if decided else ''),
+            'marks': self._target(fitted, decided),
+            'clock_rate': self._clock(clock, times),
+            **self._jitter(fitted, averages.get(True, ())),
+            'missing': _counted(fitted.lost, 'marks without a pulse'),
+            'spurious': _counted(fitted.strays, 'pulses that stand beside every mark'),
+            'speed': self._speed(fitted),
+            'ratio': ratio, 'orders': orders,
+            'path_delay': self._delay(averages.get(False, ()), ratio)}
+        warnings = (*self._warnings, *costs(findings, fitted, times, self._orders))
+        return KeyphasorCheck(findings, warnings, fitted, per_revolution, self._rate,
+                              self._from_waveform)
+
+    # --- what is there ---
+
+    def _pulses(self) -> FloatArray:
+        """Return the pulse times in s on the clock of the vibration."""
+        self._check_tach_rate()
+        recording = self._recording
+        times = recording.keyphasor_pulses()
+        self._largest = float(np.max(np.abs(times), initial=0.0))
+        whose = f'{times.size} pulses in {recording.duration:.4g} s'
+        if times.size < FEWEST:
+            raise SignalError(f'{whose}: at least {FEWEST} are needed to examine a keyphasor; '
+                              'record longer, or check that the tach crosses its threshold')
+        if not np.ptp(times) > 0.0:
+            raise SignalError(f'all {times.size} pulses are at {times[0]:.9g} s: give their times')
+        if recording.samples > 1:
+            for _ in range(2):
+                end = self._start + recording.samples / self._rate
+                mistakes = find_mistakes(times, self._start, end, self._rate)
+                if not mistakes:
+                    break
+                likely = mistakes[0]
+                others = ''.join(f'; or {item.code[5:]} ({item.probability:.0%})'
+                                 for item in mistakes[1:] if item.probability > _LISTED)
+                self._warnings.append(Warn(likely.code, likely.text + others,
+                                           tuple((g, 100.0) for g in recording.orders[:4])))
+                times = (times - likely.shift) * likely.scale
+                self._rate *= likely.rate_scale
+                self._largest *= likely.scale
+                if likely.code in ('span', 'backwards'):
+                    break
+            self._span(times)
+        return times
+
+    def _check_tach_rate(self) -> None:
+        """Take a tach rate for kHz if the waveform then is as long as the vibration."""
+        recording = self._recording
+        if not self._from_waveform or recording.tach is None or not recording.tach_rate:
+            return
+        length = recording.tach.samples / recording.tach_rate
+        if _KILO[0] < length / recording.duration < _KILO[1]:
+            self._warnings.append(Warn(
+                'unit_khz', f'the tach waveform spans {length:.6g} s, the vibration '
+                f'{recording.duration:.6g} s: tach_rate looks like kHz; give '
+                f'tach_rate={1e3 * recording.tach_rate:.10g}'))
+            self._recording = replace(recording, tach_rate=1e3 * recording.tach_rate)
+
+    def _span(self, times: FloatArray) -> None:
+        duration, span = self._recording.samples / self._rate, float(np.ptp(times))
+        usual = float(np.median(np.diff(times)))
+        known = {item.code for item in self._warnings}
+        if 'span' in known or 'no_overlap' in known or span < 4.0 * usual:
+            return
+        if not _SPAN_SHORT * duration < span + 2.0 * usual < _SPAN_LONG * duration + 4.0 * usual:
+            self._warnings.append(Warn(
+                'span', f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s: '
+                'check that both were started and stopped together, and their sampling rates'))
+
+    def _samples(self) -> FloatArray | None:
+        """Return the good channels of the vibration (channel, sample); None without any."""
+        recording = self._recording
+        if recording.samples < _FEWEST_SAMPLES:
+            return None
+        if recording.samples * recording.channels > _MOST_SAMPLES:
+            count = _MOST_SAMPLES // recording.channels
+            samples = next(recording.blocks(count))
+        else:
+            samples = recording.read()
+        bad = bad_channels(samples)
+        for channel, reason in bad.items():
+            self._warnings.append(Warn(
+                'bad_channel', f'channel {recording.channel_names[channel]} {reason}: it is left '
+                'out; check its sensor, cable and range'))
+        good = [channel for channel in range(len(samples)) if channel not in bad]
+        return np.nan_to_num(samples[good], nan=0.0, posinf=0.0, neginf=0.0) if good else None
+
+    # --- marks ---
+
+    def _marks(self, numbered: NumberedPulses, found: Sequence[Pattern], lines: Lines | None
+               ) -> tuple[Finding, bool]:
+        """Return the marks of a revolution, and whether the pulses themselves show them."""
+        declared = self._recording.pulses_per_revolution
+        span = int(numbered.numbers[-1] - numbered.numbers[0])
+        counts = sorted({*range(1, _MOST_MARKS + 1), *ENCODERS, *(item.teeth for item in found),
+                         declared})
+        counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
+        vibration = marks_evidence(lines, counts)
+        log = {}
+        for count in counts:
+            pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(
+                count / item.teeth)) for item in found if count % item.teeth == 0), default=0.0)
+            log[count] = usual_marks(count) + vibration[count] + pattern
+        if declared > 1:
+            log[declared] += _DECLARED
+        probability = _normalised(log)
+        best = max(probability, key=lambda count: probability[count])
+        shown = any(best % item.teeth == 0 for item in found)
+        if shown:
+            by = 'the pattern of the pulses repeats with the revolution'
+        elif declared == best and declared > 1:
+            by = 'stated by the recording, which pulses and vibration do not contradict'
+        elif vibration[best] > 2.0:
+            by = 'lines of the vibration are multiples of the shaft speed'
+        else:
+            by = ('even marks look all alike: count the marks on the shaft, or measure its speed '
+                  'once with a strobe')
+        others = tuple((count, round(value, 4)) for count, value in sorted(
+            probability.items(), key=lambda item: -item[1]) if count != best and value > _LISTED)
+        if probability[best] < _SURE:
+            listed = ', '.join(f'{count} ({value:.0%})' for count, value in (
+                (best, probability[best]), *others[:4]))
+            self._warnings.append(Warn(
+                'marks_ambiguous', f'several numbers of marks a revolution fit: {listed}; count '
+                'the marks on the shaft, or measure its speed with a strobe, and give '
+                'pulses_per_revolution'))
+        if declared > 1 and declared != best:
+            self._warnings.append(Warn(
+                'marks_contradict', f'the recording states {declared} marks a revolution, but the '
+                f'pulses show {best}: check pulses_per_revolution',
+                tuple((g, 100.0) for g in self._recording.orders[:4])))
+        return Finding(best, None, '1', others, by), shown
+
+    def _target(self, fitted: FittedPulses, shown: bool) -> Finding:
+        pattern = fitted.pattern
+        scale = 2.0 * math.pi / pattern.teeth
+        errors = np.nan_to_num(pattern.errors * scale, nan=0.0)
+        return Finding(
+            (pattern.marks * scale).tolist(), errors.tolist() if pattern.teeth > 1 else None,
+            'rad', (), 'mean place of each mark over the revolutions, late positive; a ripple of '
+            'the speed with the revolution looks the same' if shown else '')
+
+    # --- clock and jitter ---
+
+    def _clock(self, clock: Clock, times: FloatArray) -> Finding:
+        recording = self._recording
+        if self._from_waveform:
+            return Finding(recording.tach_rate, None, 'Hz', (), 'sampling rate of the tach '
+                           'waveform, between whose samples pulses are interpolated')
+        if not clock.rate:
+            stated = recording.tach_rate
+            return Finding(stated, None, 'Hz', (), 'stated by the recording' if stated else
+                           'no grid in the pulse times: they are not rounded to a clock')
+        if is_decimal(clock):
+            return Finding(clock.rate, clock.standard_error, 'Hz', (), 'all pulse times are '
+                           'multiples of its period, which may be their last written decimal')
+        return Finding(clock.rate, clock.standard_error, 'Hz', (),
+                       'all pulse times are multiples of its period')
+
+    def _averaged(self, samples: FloatArray, times: FloatArray, fitted: FittedPulses,
+                  ratio: Finding, clock: Clock) -> dict[bool, tuple[Average, ...]]:
+        """Return averages with corrected jitter (True), and short ones at their speed (False)."""
+        measured = measure_jitter(fitted.true, fitted.numbers)
+        size = measured.std if measured else fitted.scatter
+        expected = max(math.sqrt(12.0) * size, 1.0 / clock.rate if clock.rate else 0.0)
+        turns = fitted.turns
+        kept = times[~np.isin(times, fitted.strays)]
+        cycles = {True: int(np.clip(turns // 8, 4, 40)), False: int(np.clip(turns // 24, 1, 20))}
+        teeth = fitted.pattern.teeth
+        return {correct: averages_of(
+            samples, self._rate, self._start, kept, ratio=float(ratio.value or 1.0),
+            orders=self._orders, pulses_per_revolution=teeth,
+            missing_teeth=teeth - fitted.pattern.present, trigger_cycles=count,
+            keyphasor_rate=1.0 / expected, correct_jitter=correct)
+            for correct, count in cycles.items()}
+
+    def _jitter(self, fitted: FittedPulses, averages: Sequence[Average]) -> dict[str, Finding]:
+        alone = measure_jitter(fitted.true, fitted.numbers)
+        recovered = recovered_jitter(averages)
+        if alone is None and recovered is None:
+            by = (f'the motion makes all of the scatter, {1e6 * fitted.scatter:.2g} us: a '
+                  'vibration with strong orders decides')
+            return {'jitter_std': Finding(None, None, 's', (), by),
+                    'jitter_correlation': Finding(None, None, '1', (), by)}
+        best, by = alone, 'scatter of the pulses beside their neighbours'
+        if recovered is not None:
+            apart = 0.0 if alone is None else (recovered.std - alone.std) / math.hypot(
+                recovered.std_error, alone.std_error)
+            if alone is None or abs(apart) > _APART or recovered.std_error < alone.std_error:
+                best, by = recovered, 'pulse errors recovered from the vibration'
+            if alone is not None and apart > _APART:
+                by += (f'; the pulses alone show {1e6 * alone.std:.3g} us, so that the rest is '
+                       'slow, or the vibration wanders against the tach shaft')
+        assert best is not None
+        return {'jitter_std': Finding(best.std, best.std_error, 's', (), by),
+                'jitter_correlation': Finding(
+                    None, None, '1', (), 'motion hides it: vibration with strong orders decides')
+                if math.isnan(best.correlation) else Finding(
+                    best.correlation, best.correlation_error, '1', (), by)}
+
+    # --- speed and orders ---
+
+    def _speed(self, fitted: FittedPulses) -> Finding:
+        speed = fitted.speed
+        return Finding({'minimum': float(speed.min()), 'mean': fitted.mean_speed,
+                        'maximum': float(speed.max())}, None, 'Hz', (), 'times of revolutions')
+
+    def _ratio(self, lines: Lines | None) -> tuple[Finding, Finding]:
+        stated = self._recording.ratio
+        if lines is None or not lines.places.size:
+            silent = self._recording.samples < _FEWEST_SAMPLES
+            reason = ('no vibration' if silent else
+                      'no line of the vibration stands above the noise')
+            if not silent:
+                self._warnings.append(Warn(
+                    'no_orders', 'no order of the tach shaft stands above the noise of the '
+                    'vibration: check that tach and vibration are of the same machine and time, '
+                    'and sample_rate'))
+            return (Finding(stated if stated != 1.0 else None, None, '1', (), 'stated' if stated
+                            != 1.0 else reason), Finding(None, None, '1', (), reason))
+        if stated != 1.0:
+            best, probability, others = stated, 1.0, []
+            by = 'stated by the recording'
+        else:
+            (best, probability), *others = self._ranked(lines)
+            by = ('lines of the vibration are whole orders of the tach shaft; numbers of teeth '
+                  '(--teeth) decide for another shaft' if best == 1.0 else
+                  'lines of the vibration, and their sidebands, are multiples of this speed; the '
+                  'numbers of teeth (--teeth) decide')
+        orders, near = on_orders(lines, best)
+        strength = lines.sizes * lines.levels
+        chosen = np.flatnonzero(near)
+        chosen = chosen[np.argsort(-strength[chosen])][:_MOST_ORDERS]
+        listed = sorted({float(orders[k]) for k in chosen})
+        if not listed:
+            self._warnings.append(Warn(
+                'no_orders', f'no order of a shaft at ratio {best:.6g} stands above the noise: '
+                'check ratio, pulses_per_revolution and sample_rate'))
+        if probability < _SURE and best != 1.0:
+            text = ', '.join(f'{value:.6g} ({chance:.0%})'
+                             for value, chance in ((best, probability), *others[:4]))
+            self._warnings.append(Warn(
+                'ratio_ambiguous', f'several ratios fit the lines of the vibration: {text}; give '
+                'the numbers of teeth (--teeth) or the ratio'))
+        missing = [g for g in self._recording.orders if not np.any(
+            near & (np.abs(orders - g) < 0.5))]
+        if missing:
+            self._warnings.append(Warn(
+                'orders_weak', 'stated orders that do not stand above the noise: '
+                + ', '.join(f'{g:g}' for g in missing[:8])))
+        return (Finding(best, lines.step * 0.1 if best != 1.0 and stated == 1.0 else None, '1',
+                        tuple((ratio, round(value, 4)) for ratio, value in others
+                              if value > _LISTED), by),
+                Finding(listed or None, None, '1', (), 'lines of the vibration over the angle'))
+
+    def _ranked(self, lines: Lines) -> list[tuple[float, float]]:
+        """Return the ratios that fit, best first, each with its probability."""
+        ranked = ratio_evidence(lines, self._teeth)
+        _, own = on_orders(lines, 1.0)
+        by_chance = 1.2 * lines.step * lines.places.size
+        if self._teeth or ranked[0][0] == 1.0 or np.count_nonzero(own) < _FEWEST_OWN + by_chance:
+            return ranked
+        # Nobody named another shaft, and the tach shaft has orders of its own.
+        others = [(ratio, value) for ratio, value in ranked if ratio != 1.0]
+        total = sum(value for _, value in others)
+        return [(1.0, 1.0 - _ANOTHER), *((ratio, _ANOTHER * value / total)
+                                         for ratio, value in others)]
+
+    def _delay(self, averages: Sequence[Average], ratio: Finding) -> Finding:
+        if not averages:
+            return Finding(None, None, 's', (), 'no averages of the vibration')
+        delay, why = path_delay(averages, float(ratio.value or 1.0))
+        if delay is None:
+            return Finding(None, None, 's', (), why)
+        return Finding(delay.delay, delay.standard_error, 's', (),
+                       'phases of the orders turn alike with the speed')
+
+    # --- what it costs ---
+
+
+def _counted(times: FloatArray, by: str) -> Finding:
+    return Finding({'count': int(times.size), 'times': times.tolist()}, None, '1', (), by)
+
+
+def _normalised(log: dict[int, float]) -> dict[int, float]:
+    top = max(log.values())
+    weight = {key: math.exp(value - top) for key, value in log.items()}
+    total = sum(weight.values())
+    return {key: value / total for key, value in weight.items()}

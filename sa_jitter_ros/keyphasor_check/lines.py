@@ -1,0 +1,271 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Lines of the vibration over the angle of the tach shaft, and what they tell of marks and ratio.
+
+A component that a shaft makes is a line in the spectrum over angle, also while the speed changes.
+All lines of a shaft are multiples of its speed. Lines at half a mark, a third, ... say that a
+revolution has two marks, three, ...; lines between the orders of the tach shaft say that another
+shaft turns at a ratio.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.pulses.resampling import interpolate
+
+FloatArray = NDArray[np.float64]
+
+_MOST_VALUES = 3_000_000
+_MOST_POINTS = 600_000
+_FEWEST_TEETH = 24
+_FEWEST_REVOLUTIONS = 10  # of a shaft whose own revolution shows as a line
+_PROMINENT = 7.0  # times the median of the spectrum around; noise reaches 4
+_NEIGHBOURHOOD = 100
+_MOST_LINES = 60
+_STRONGEST = 3e-3  # of the strongest line; below it are side lobes and distortion
+# Width of a line's place in bins of the spectrum.
+_WIDTH = 0.6
+_FOLLOWS = 0.7  # probability that a line is an order of a shaft that is considered
+# Log evidence of a family on fractions of the mark rate, which gear ratios are, too.
+_COINCIDENCE, _ONE_OF_MANY = 2.5, 1.0
+_MEMBER = 0.25  # what each further multiple of a line says, in parts of the first
+# A vibration that repeats several times in a revolution is so improbable.
+_SYMMETRY = 1.5
+_FEWEST_ON_RATIO = 3
+_PRIOR = 3.0  # log probability that the shaft of interest carries the tach
+_LARGEST_RATIO, _SMALLEST_RATIO = 30.0, 0.05
+#: Marks of usual targets with the probability of each.
+_USUAL_MARKS = {1: 0.45, 2: 0.1, 3: 0.03, 4: 0.06, 5: 0.02, 6: 0.05, 8: 0.05, 10: 0.02, 12: 0.03,
+                16: 0.02, 20: 0.01, 24: 0.02, 30: 0.01, 36: 0.02, 60: 0.03}
+#: Marks of usual encoders.
+ENCODERS = (100, 128, 180, 200, 250, 256, 300, 360, 400, 500, 512, 600, 720, 900, 1000, 1024, 1200,
+            1250, 1500, 1800, 2000, 2048, 2500, 3600, 4096)
+_OTHER_MARKS = 0.002
+
+
+@dataclass(frozen=True)
+class Lines:
+    """
+    Lines of the vibration: `places` (n,) in cycles a tooth, ascending, and their `sizes` (n,).
+
+    `sizes` are amplitudes over the median of the spectrum around; `levels` (n,) are amplitudes on
+    the strongest channel, in parts of the strongest line. `step` is a bin of the spectrum.
+    """
+
+    places: FloatArray
+    sizes: FloatArray
+    levels: FloatArray
+    step: float
+
+    def scaled(self, factor: float) -> 'Lines':
+        """Return the lines with places in cycles of something `factor` teeth long."""
+        return Lines(self.places * factor, self.sizes, self.levels, self.step * factor)
+
+
+def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray,
+               teeth: FloatArray) -> Lines | None:
+    """
+    Return the lines in `samples` (sample, channel) over the angle.
+
+    The shaft has turned `teeth` (n,) at `times` (n,) in s; the first sample was at `start`. None
+    where too few teeth passed during the samples.
+    """
+    end = start + (len(samples) - 1) / rate
+    inside = (times >= start) & (times <= end)
+    times, teeth = times[inside], teeth[inside]
+    if times.size < 3 or teeth[-1] - teeth[0] < _FEWEST_TEETH:
+        return None
+    most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
+    if (times[-1] - times[0]) * rate > most:  # its first part
+        count = int(np.searchsorted(times, times[0] + most / rate))
+        if count < 3 or teeth[count - 1] - teeth[0] < _FEWEST_TEETH:
+            return None
+        times, teeth = times[:count], teeth[:count]
+    turned = teeth[-1] - teeth[0]
+    points = int((times[-1] - times[0]) * rate)
+    angle = teeth[0] + turned * np.arange(points) / points
+    position = (np.interp(angle, teeth, times) - start) * rate
+    over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
+    over_angle -= over_angle.mean(axis=0)
+    window = np.hanning(points + 1)[:-1, None]
+    spectrum = np.abs(np.fft.rfft(over_angle * window, axis=0))[:int(0.42 * points)]
+    step = 1.0 / turned
+    base = _background(spectrum)
+    share = spectrum / np.maximum(base, np.finfo(float).tiny)
+    size, level = share.max(axis=1), (spectrum / np.max(spectrum, axis=0)).max(axis=1)
+    peak = np.zeros(size.size, np.bool_)
+    peak[3:-1] = (size[3:-1] >= size[2:-2]) & (size[3:-1] > size[4:])
+    peak &= (size > _PROMINENT) & (level > _STRONGEST)
+    found = np.flatnonzero(peak)
+    found = np.sort(found[np.argsort(-size[found])][:_MOST_LINES])
+    channel = np.argmax(share[found], axis=1)
+    left, middle, right = (np.log(np.maximum(spectrum[found + k, channel], 1e-300))
+                           for k in (-1, 0, 1))
+    bend = left - 2.0 * middle + right
+    offset = np.where(bend < 0.0, 0.5 * (left - right) / np.minimum(bend, -1e-12), 0.0)
+    return Lines((found + np.clip(offset, -0.5, 0.5)) * step, size[found], level[found], step)
+
+
+def _background(spectrum: FloatArray) -> FloatArray:
+    """Return the median (bin, channel) of a spectrum around each bin."""
+    blocks = max(1, len(spectrum) // _NEIGHBOURHOOD)
+    edges = np.linspace(0, len(spectrum), blocks + 1).astype(int)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    medians = np.array([np.median(spectrum[a:b], axis=0) for a, b in pairwise(edges)])
+    return np.array([np.interp(np.arange(len(spectrum)), middle, column)
+                     for column in medians.T]).T
+
+
+def marks_evidence(lines: Lines | None, counts: Sequence[int]) -> dict[int, float]:
+    """
+    Return the logarithm of the likelihood of each number of marks in a revolution.
+
+    Lines are in cycles a mark. A target with more marks than the lines need is possible: the
+    vibration then repeats several times in a revolution.
+    """
+    log = dict.fromkeys(counts, 0.0)
+    if lines is None or not lines.places.size:
+        return log
+    families = _families(lines)
+    for count in counts:
+        said = [_says(lines, family, count) for family in families]
+        # Where other lines are those of other shafts, one on a fraction may be, too.
+        most = _COINCIDENCE if all(value > 0.0 for value, _ in said) else _ONE_OF_MANY
+        chance = sum(value for value, certain in said if not certain)
+        log[count] = sum(value for value, certain in said if certain) + min(chance, most)
+    return {count: max([value, *(log[part] - _SYMMETRY - math.log(count / part)
+                                 for part in counts if count % part == 0 and part < count)])
+            for count, value in log.items()}
+
+
+def usual_marks(count: int) -> float:
+    """Return the logarithm of the probability that a target has so many marks."""
+    return math.log(_USUAL_MARKS.get(count, _OTHER_MARKS))
+
+
+def _families(lines: Lines) -> list[list[int]]:
+    """Return the lines in groups of one line and its multiples."""
+    left, families = list(range(lines.places.size)), []
+    while left:
+        base, sure = lines.places[left[0]], 1.0
+        family = [left[0]]
+        for index in left[1:]:
+            place = lines.places[index]
+            multiple = round(place / base)
+            # The base is as exact as the highest multiple that gave it.
+            width = _WIDTH * lines.step * (1.0 + 0.5 * multiple / sure)
+            if width < 0.25 * base and abs(place - multiple * base) < width:
+                family.append(index)
+                base, sure = place / multiple, float(multiple)
+        families.append(family)
+        left = [index for index in left if index not in family]
+    return families
+
+
+def _says(lines: Lines, family: list[int], count: int) -> tuple[float, bool]:
+    """
+    Return the log likelihood that a family lies on multiples of 1/count, over any other place.
+
+    It is certain where the lines are whole multiples of the marks, or of a shaft that shows its
+    own revolution; else they may be those of another shaft: gear ratios are fractions, too.
+    """
+    places = lines.places[family] * count
+    width = _WIDTH * lines.step
+    on = np.abs(places - np.rint(places)) < width * count
+    chance = min(1.0, 2.0 * _WIDTH * lines.step * count)
+    one = np.where(on, math.log1p(_FOLLOWS / (1.0 - _FOLLOWS) / chance), 0.0)
+    weight = np.where(np.arange(one.size) == 0, 1.0, _MEMBER)
+    whole = bool(np.all(np.abs(lines.places[family] - np.rint(lines.places[family])) < width))
+    # It turns once in some marks of which a whole number makes a revolution.
+    parts = np.array([part for part in range(2, count + 1) if count % part == 0])
+    once = lines.step * count < 1.0 / _FEWEST_REVOLUTIONS and bool(np.any(np.abs(
+        np.multiply.outer(parts, lines.places[family]) - 1.0) < _WIDTH * lines.step
+        * parts[:, None]))
+    # Multiples of a line that is no multiple of 1/count are those of another shaft.
+    return float(weight @ one) if on[0] else 0.0, whole or once
+
+
+def on_orders(lines: Lines, ratio: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return the orders (n,) of lines, in cycles a revolution, of a shaft, and which fit."""
+    orders = np.rint(lines.places / ratio)
+    near = np.abs(lines.places - orders * ratio) < _WIDTH * lines.step
+    return orders, near & (orders > 0.0)
+
+
+def ratio_evidence(lines: Lines, teeth: Sequence[int] = ()) -> list[tuple[float, float]]:
+    """
+    Return ratios of a shaft whose orders the lines are, with their probabilities, best first.
+
+    Lines are in cycles a revolution of the tach shaft. `teeth` are numbers of teeth that gears of
+    the machine have; without them, sidebands tell the speed of a shaft.
+    """
+    _, near = on_orders(lines, 1.0)
+    other = ~near
+    weight = np.log(lines.sizes / _PROMINENT) + 1.0
+    own = float(weight[near].sum())
+    log = {1.0: own * _per_line(lines, 1.0)}
+    strong = np.flatnonzero(other)[np.argsort(-lines.sizes[other])][:24]
+    candidates: set[float] = set()
+    for i in strong:
+        for count in teeth:
+            candidates.add(lines.places[i] / count)
+        for j in strong:
+            if i < j:
+                candidates.add(abs(lines.places[i] - lines.places[j]))
+    for a in teeth:
+        candidates |= {a / b for b in teeth if b != a}
+    for ratio in sorted(candidates):
+        if not _SMALLEST_RATIO < ratio < _LARGEST_RATIO or abs(ratio - 1.0) < 1e-4:
+            continue
+        ratio = _fine(lines, ratio, strong)
+        orders, fits = on_orders(lines, ratio)
+        fits &= other
+        if np.count_nonzero(fits) < _FEWEST_ON_RATIO:
+            continue
+        score = float(weight[fits].sum()) * _per_line(lines, ratio)
+        if teeth and not np.isin(orders[fits], np.outer(teeth, np.arange(1, 6))).any():
+            score *= 0.5
+        log[round(ratio, 9)] = score - _PRIOR - math.log(len(candidates))
+    return _normalised(log, lines.step)
+
+
+def _per_line(lines: Lines, ratio: float) -> float:
+    """Return what a line on an order of a shaft says for it: little where orders are dense."""
+    chance = min(1.0, 2.0 * _WIDTH * lines.step / ratio)
+    return math.log(1.0 - _FOLLOWS + _FOLLOWS / chance)
+
+
+def _fine(lines: Lines, ratio: float, strong: NDArray[np.intp]) -> float:
+    """Return a ratio adjusted to the lines that are its multiples."""
+    for _ in range(3):
+        orders = np.rint(lines.places[strong] / ratio)
+        near = (np.abs(lines.places[strong] - orders * ratio) < 1.5 * lines.step) & (orders > 0)
+        if not near.any():
+            break
+        g = orders[near] * np.sqrt(lines.sizes[strong][near])
+        ratio = float(g @ (lines.places[strong][near] * np.sqrt(lines.sizes[strong][near]))
+                      / (g @ g))
+    return ratio
+
+
+def _normalised(log: dict[float, float], step: float) -> list[tuple[float, float]]:
+    top = max(log.values())
+    merged: list[list[float]] = []
+    for ratio, value in sorted(log.items(), key=lambda item: -item[1]):
+        if not any(abs(ratio - kept[0]) < step for kept in merged):
+            merged.append([ratio, math.exp(max(value - top, -700.0))])
+    total = sum(item[1] for item in merged)
+    return [(ratio, weight / total) for ratio, weight in merged if weight / total > 1e-3][:6]

@@ -1,0 +1,83 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The machine file of a check: parameters of the nodes, as the findings have them."""
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
+
+_MOST_CYCLES, _AVERAGES = 100, 8
+_ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
+_DEFAULT_ORDERS = (1.0, 2.0, 3.0)
+_SHAFT = 'shaft'
+
+
+def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
+    """Return the parameters of the nodes, by the name of the node."""
+    found = {name: item.value for name, item in check.findings.items()}
+    count, std, clock = found['pulses_per_revolution'], found['jitter_std'], found['clock_rate']
+    tick = 1.0 / clock if clock else 0.0  # s
+    width = math.sqrt(12.0) * (std or check.fitted.scatter)
+    rounded = check.from_waveform or tick > _ROUNDED * width
+    rate = clock if rounded else 1.0 / width
+    cycles = int(np.clip(check.fitted.turns // _AVERAGES, 2, _MOST_CYCLES))
+    common: dict[str, Any] = {
+        'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0),
+        f'{_SHAFT}.orders': [float(g) for g in found['orders'] or _DEFAULT_ORDERS],
+        'pulses_per_revolution': count, 'trigger_cycles': cycles, 'keyphasor_rate': float(rate)}
+    jitter: dict[str, Any] = {'jitter_distribution': 'uniform'}
+    if not rounded and std:
+        jitter = {'jitter_distribution': 'normal', 'jitter_std': float(std)}
+    nodes: dict[str, dict[str, Any]] = {
+        'synchronous_averager': {**common, 'missing_teeth': found['missing_teeth'],
+                                 'correct_jitter': True},
+        'jitter_predictor': {**common, 'trigger_speed': float(found['speed']['mean']),
+                             'follow_shaft_speed': True, **jitter},
+        'residual_analyser': {'shaft': _SHAFT},
+        'live_view': {'shafts': [_SHAFT]}}
+    if check.from_waveform:
+        # The declared jitter is that of a pulse time which is the first sample past the threshold.
+        nodes['tach_detector'] = {'interpolate': False}
+    return nodes
+
+
+def machine_file(check: KeyphasorCheck, name: str) -> str:
+    """Return the text of a ROS parameter file for all nodes, with what is uncertain as remarks."""
+    name = ' '.join(name.split())
+    lines = [f'# The machine as check_keyphasor found it in {name}.']
+    for key, item in check.findings.items():
+        if item.alternatives:
+            others = ', '.join(f'{value:.6g} ({probability:.0%})'
+                               for value, probability in item.alternatives)
+            lines.append(f'# {key} may also be {others}: {item.decided_by}')
+    lines += ['', '/**:', '  ros__parameters:', f'    hardware_id: {json.dumps(name)}']
+    for node, parameters in machine_parameters(check).items():
+        lines += ['', f'/**/{node}:', '  ros__parameters:']
+        lines += [f'    {key}: {_yaml(value)}' for key, value in parameters.items()]
+    return '\n'.join(lines) + '\n'
+
+
+def _yaml(value: Any) -> str:
+    """Return a parameter as rcl reads it: a float has a point, also with an exponent."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f'[{", ".join(map(_yaml, value))}]'
+    if isinstance(value, float):
+        text = f'{value:.10g}'
+        if '.' not in text:
+            mantissa, e, exponent = text.partition('e')
+            text = f'{mantissa}.0{e}{exponent}'
+        return text
+    return str(value)

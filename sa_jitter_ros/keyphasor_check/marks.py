@@ -1,0 +1,314 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The pulses on their target: where each mark stands, which pulses are strays and which are lost.
+
+The mean over whole revolutions sees no pattern of the target. What a mark is late against it is
+averaged over the revolutions. Each pulse is then compared with its neighbours, marks corrected.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.keyphasor_check.teeth import joined, NumberedPulses
+from sa_jitter_ros.keyphasor_check.wheel import Pattern, pattern_of
+from scipy.ndimage import median_filter, uniform_filter1d
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+_ROUNDS = 3
+_OUTLIER = 8.0  # robust standard deviations
+_LEAST = 0.02  # teeth that a stray stands beside its tooth at least
+_MOST_AT_ONCE = 200
+_NEIGHBOURS = 7  # with the pulse itself
+_FEWEST_TURNS = 24
+_AROUND = 8  # teeth over which the speed is taken at least
+_LEAST_SCATTER = 1e-9  # s
+_SHIFTS = (0, -1, 1, -2, 2)
+_NEAR = 0.25  # teeth from its mark: a pulse may be that of the mark
+
+
+@dataclass(frozen=True)
+class FittedPulses:
+    """
+    Pulses of a known target.
+
+    `true` (n,) are their times in s with the marks corrected, `numbers` (n,) count teeth.
+    `strays` (m,) and `lost` (k,) in s are the pulses that belong to no mark, and the times at
+    which a mark has no pulse. `speed` (n - 1,) is that of the tach shaft in Hz between pulses.
+    """
+
+    pattern: Pattern
+    true: FloatArray
+    numbers: IntArray
+    breaks: IntArray
+    strays: FloatArray
+    lost: FloatArray
+
+    @property
+    def revolutions(self) -> FloatArray:
+        """Return the angle of each pulse (n,) in revolutions of the tach shaft."""
+        return np.asarray((self.numbers - self.pattern.origin) / self.pattern.teeth)
+
+    @property
+    def scatter(self) -> float:
+        """Return how far pulses stand from a smooth motion, in s; it holds some of the motion."""
+        in_a_row = np.convolve(np.diff(self.numbers) == 1, np.ones(3), 'valid') == 3.0
+        third = np.diff(self.true, 3)[in_a_row]
+        return max(float(np.std(third)) / math.sqrt(20.0), _LEAST_SCATTER) if third.size else (
+            _LEAST_SCATTER)
+
+    def once_a_revolution(self) -> NDArray[np.bool_]:
+        """Return the pulses (n,) of the mark that begins trigger cycles, all if there are few."""
+        first = self.pattern.tooth(self.numbers) == 0
+        return first if np.count_nonzero(first) >= _FEWEST_TURNS else np.ones_like(first)
+
+    @property
+    def mean_speed(self) -> float:
+        """Return the mean speed of the tach shaft in Hz, without standstills."""
+        turned, time = np.diff(self.revolutions), np.diff(self.true)
+        moving = np.ones(time.size, np.bool_)
+        moving[self.breaks - 1] = False
+        return float(turned[moving].sum() / time[moving].sum())
+
+    @property
+    def turns(self) -> float:
+        """Return the number of revolutions, without standstills."""
+        turned = np.diff(self.revolutions)
+        return float(turned.sum() - turned[self.breaks - 1].sum())
+
+    @property
+    def speed(self) -> FloatArray:
+        """Return the speed of the tach shaft (n - k,) in Hz, over about a revolution each."""
+        step = max(1, min(self.pattern.present, self.true.size // 2))
+        turned = (self.numbers[step:] - self.numbers[:-step]) / self.pattern.teeth
+        time = self.true[step:] - self.true[:-step]
+        inside = np.ones(time.size, np.bool_)
+        for begin in self.breaks:
+            inside[max(begin - step, 0):begin] = False
+        return np.asarray((turned / np.maximum(time, 1e-300))[inside & (time > 0.0)])
+
+
+def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> FittedPulses:
+    """
+    Return the pulses on a target of so many teeth; 1 for an even one of unknown marks.
+
+    `tick` is the period of the clock in s of which pulse times are multiples.
+    """
+    pattern = pattern_of(pulses, teeth)
+    if teeth == 1:
+        pattern = replace(pattern, marks=np.zeros(1), errors=np.full(1, np.nan))
+    parts = pulses.unbroken()
+    best = max(range(len(parts)), key=lambda k: parts[k].times.size)
+    pattern, parts[best] = _fitted(parts[best], pattern, tick)
+    for k, part in enumerate(parts):
+        if k != best:
+            aligned = _aligned(part, pattern)
+            parts[k] = _fitted(aligned, pattern, tick)[1] if (
+                part.times.size >= _NEIGHBOURS) else aligned
+    pulses = joined(parts, teeth)
+    late = pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
+    true = pulses.times - late
+    wanted = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
+    expected = wanted[~pattern.missing[pattern.tooth(wanted)]]
+    for begin in pulses.breaks:  # the count over a standstill means nothing
+        low, high = pulses.numbers[begin - 1], pulses.numbers[begin]
+        expected = expected[(expected <= low) | (expected >= high)]
+    absent = np.setdiff1d(expected, pulses.numbers)
+    pitch = np.interp(absent, pulses.numbers, pulses.pitch)
+    lost = np.interp(absent, pulses.numbers, true) + pattern.late()[pattern.tooth(absent)] * pitch
+    return FittedPulses(pattern, true, pulses.numbers, pulses.breaks, pulses.strays,
+                        np.asarray(lost))
+
+
+def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
+            ) -> tuple[Pattern, NumberedPulses]:
+    """Return the pattern with its marks measured, and the pulses on it."""
+    if pattern.teeth > 1:
+        pulses = _counted_again(pulses, pattern)
+    for _ in range(_ROUNDS):
+        on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
+        pulses = pulses.only(on_mark) if not on_mark.all() else pulses
+        if pattern.teeth > 1:
+            pulses = replace(pulses, pitch=_pitch(pulses, pattern.teeth))
+            pattern = _measured(pulses, pattern)
+            pulses = _chosen_again(pulses, pattern)
+        kept = ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick)
+        pulses = pulses.only(kept) if not kept.all() else pulses
+    if pattern.teeth > 1:
+        pulses = replace(pulses, pitch=_pitch(pulses, pattern.teeth))
+        pattern = _measured(pulses, pattern)
+    return pattern, pulses
+
+
+def _aligned(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
+    """Return pulses behind a standstill with numbers that fit the pattern in front of it."""
+    late = pattern.late()
+    costs = [np.mean(_away(pulses.places, pattern, late, pulses.numbers + shift))
+             for shift in range(pattern.teeth)]
+    return replace(pulses, numbers=pulses.numbers + int(np.argmin(costs)))
+
+
+def _away(places: FloatArray, pattern: Pattern, late: FloatArray, numbers: IntArray) -> FloatArray:
+    """Return how far (n,), in teeth, pulses are from the marks of these numbers, at most 0.5."""
+    tooth = pattern.tooth(numbers)
+    return np.asarray(np.where(pattern.missing[tooth], 0.5,
+                               np.minimum(np.abs(places - late[tooth]), 0.5)))
+
+
+def _counted_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
+    """Return the pulses with numbers that are right where strays shifted the count by a tooth."""
+    late, window = pattern.late(), 2 * max(pattern.present, _AROUND) + 1
+    costs = []
+    for shift in _SHIFTS:
+        cost = _away(pulses.places, pattern, late, pulses.numbers + shift)
+        costs.append(uniform_filter1d(cost, window, mode='nearest'))
+    best = np.array(_SHIFTS)[np.argmin(np.array(costs), axis=0)]
+    clear = 2.0 * np.min(costs, axis=0) < costs[0]
+    numbers = pulses.numbers + np.where(clear, best, 0)
+    # A whole revolution too many or too few shows in the time only.
+    usual = median_filter(pulses.pitch, window, mode='nearest')[1:]
+    turns = np.rint((np.diff(pulses.times) / usual - np.diff(numbers)) / pattern.teeth)
+    numbers[1:] += np.cumsum(turns).astype(np.int64) * pattern.teeth
+    kept = np.append(True, numbers[1:] > np.maximum.accumulate(numbers)[:-1])
+    return replace(pulses, numbers=numbers).only(kept)
+
+
+def _pitch(pulses: NumberedPulses, teeth: int) -> FloatArray:
+    """Return the time from tooth to tooth (n,) in s, over whole revolutions around each pulse."""
+    first, last = int(pulses.numbers[0]), int(pulses.numbers[-1])
+    turns = 2 * teeth * -(-_AROUND // (2 * teeth))
+    turns = turns if last - first >= turns else teeth
+    if last - first < turns:
+        return pulses.pitch
+    low = np.clip(pulses.numbers - turns // 2, first, last - turns)
+    times = (np.interp(at, pulses.numbers, pulses.times) for at in (low, low + turns))
+    before, after = times
+    return np.asarray(np.maximum((after - before) / turns, 1e-300))
+
+
+def _measured(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
+    """Return the pattern with the marks where the pulses show them."""
+    teeth = pattern.teeth
+    tooth = pattern.tooth(pulses.numbers)
+    true = pulses.times - pattern.late()[tooth] * pulses.pitch
+    grid = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
+    if grid.size < 4 * teeth:
+        return pattern
+    smooth = _smooth(pulses, pattern, grid)
+    place = pulses.numbers - grid[0]
+    left = (true - smooth[place]) / pulses.pitch
+    inside = (place >= 2 * teeth) & (place < grid.size - 2 * teeth)
+    if np.count_nonzero(inside) < 2 * teeth:
+        inside[:] = True
+    late, errors = pattern.late(), np.full(teeth, np.nan)
+    for each in np.flatnonzero(~pattern.missing):
+        own = left[inside & (tooth == each)]
+        if own.size < 2:
+            continue
+        middle = np.median(own)
+        spread = 1.4826 * np.median(np.abs(own - middle))
+        near = own[np.abs(own - middle) <= max(4.0 * spread, 1e-12)]
+        late[each] += near.mean()
+        errors[each] = near.std() / np.sqrt(max(near.size - 1, 1))
+    there = ~pattern.missing
+    return replace(pattern, marks=late[there] - late[there].mean(), errors=errors[there])
+
+
+def _smooth(pulses: NumberedPulses, pattern: Pattern, grid: IntArray) -> FloatArray:
+    """Return when even teeth of the numbers in `grid` (m,) would have passed, in s."""
+    true = pulses.times - pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
+    straight = np.linspace(true[0], true[-1], grid.size)
+    full = np.interp(grid, pulses.numbers, true) - straight
+    once = _over_revolution(full, pattern.teeth)
+    return np.asarray(2.0 * once - _over_revolution(once, pattern.teeth) + straight)
+
+
+def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
+    """Return the pulses and strays that stand nearest to the marks, which are known by now."""
+    grid = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
+    late = pattern.late()[pattern.tooth(grid)]
+    marks = np.flatnonzero(~pattern.missing[pattern.tooth(grid)])
+    pitch = np.interp(grid, pulses.numbers, pulses.pitch)
+    expected = np.maximum.accumulate((_smooth(pulses, pattern, grid) + late * pitch)[marks])
+    every = np.sort(np.append(pulses.times, pulses.strays))
+    after = np.clip(np.searchsorted(expected, every), 1, marks.size - 1)
+    near = after - (every - expected[after - 1] < expected[after] - every)
+    away = np.abs(every - expected[near]) / pitch[marks[near]]
+    order = np.lexsort((away, near))
+    kept = np.zeros(every.size, np.bool_)
+    kept[order[np.append(True, np.diff(near[order]) != 0)]] = True
+    # Where the speed is not known well, as at the ends and beside gaps, pulses keep their number.
+    fixed = np.isin(every, pulses.times) & (
+        (away > _NEAR) | (near < pattern.teeth) | (near >= marks.size - pattern.teeth))
+    kept &= ~fixed
+    kept &= away <= _NEAR
+    numbers = grid[marks[near]]
+    unused = np.isin(pulses.numbers, numbers[kept], invert=True)
+    known = np.searchsorted(every, pulses.times)
+    extra = np.zeros(every.size, np.bool_)
+    extra[known[unused]] = True
+    extra &= fixed
+    numbers[known[unused]] = pulses.numbers[unused]
+    kept |= extra
+    return NumberedPulses(every[kept], numbers[kept], np.zeros(int(kept.sum())),
+                          np.interp(numbers[kept], grid, pitch), every[~kept], pulses.breaks)
+
+
+def _over_revolution(values: FloatArray, teeth: int) -> FloatArray:
+    """Return the mean over a revolution on either side, to which no pattern contributes."""
+    room = min(2 * teeth, values.size - 1)
+    padded = np.pad(values, room, mode='reflect', reflect_type='odd')  # the speed goes on
+    once = uniform_filter1d(padded, teeth, mode='nearest')
+    twice = uniform_filter1d(once, teeth, mode='nearest', origin=-1 if teeth % 2 == 0 else 0)
+    return np.asarray(twice[room:room + values.size])
+
+
+def _outliers(pulses: NumberedPulses, late: FloatArray, tick: float) -> NDArray[np.bool_]:
+    """Return which pulses (n,) stand far from where their neighbours have them."""
+    found = np.zeros(pulses.times.size, np.bool_)
+    index = np.arange(pulses.times.size)
+    for _ in range(_MOST_AT_ONCE):
+        index = np.flatnonzero(~found)
+        if index.size < 6:
+            break
+        place = _beside(pulses.times[index] - late[index] * pulses.pitch[index],
+                        pulses.numbers[index], pulses.pitch[index])
+        size = np.abs(place)
+        limit = np.maximum(max(_OUTLIER * 1.4826 * float(np.median(size)), _LEAST),
+                           2.0 * tick / pulses.pitch[index])
+        before, after = np.append(0.0, size[:-1]), np.append(size[1:], 0.0)
+        wrong = (size > limit) & (size >= before) & (size >= after)
+        if not wrong.any():
+            break
+        found[index[wrong]] = True
+    return found
+
+
+def _beside(times: FloatArray, numbers: IntArray, pitch: FloatArray) -> FloatArray:
+    """Return how far (n,), in teeth, pulses stand behind the parabola through six neighbours."""
+    n = times.size
+    reach = min(_NEIGHBOURS, n)
+    low = np.clip(np.arange(n) - reach // 2, 0, n - reach)
+    around = low[:, None] + np.arange(reach)
+    at = np.sort(np.where(around == np.arange(n)[:, None], n, around), axis=1)[:, :-1]
+    x = (numbers[at] - numbers[:, None]).astype(np.float64)
+    y = (times[at] - times[:, None]) / pitch[:, None]
+    weight = 1.0 / np.maximum(np.abs(x), 1.0) ** 4
+    degree = 2 if reach == _NEIGHBOURS else 1
+    powers = np.stack([x**k for k in range(degree + 1)])
+    normal = np.einsum('ink,jnk,nk->nij', powers, powers, weight)
+    right = np.einsum('ink,nk->ni', powers, weight * y)
+    normal += 1e-12 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(degree + 1)
+    return np.asarray(-np.linalg.solve(normal, right[..., None])[:, 0, 0])

@@ -1,0 +1,133 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the vibration says of the pulses: their errors, and how phases turn with the speed.
+
+The chain that users start averages the vibration with what was found of the keyphasor. Pulse
+errors that it recovers contain slow jitter, which pulses alone do not show. A delay of the tach
+turns every order by the same time, a resonance does not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.averager import Averager
+from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.keyphasor_check.jitter import Jitter
+from scipy import stats
+
+FloatArray = NDArray[np.float64]
+
+_FEWEST_AVERAGES = 3
+_FEWEST_SPEEDS = 6
+_SPEED_RANGE = 0.02  # relative, below which phases say nothing of a delay
+_AGREE = 0.01  # p value below which orders disagree
+_CLEAR = 5.0  # amplitude over its noise
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Delay of the tach in s behind the vibration, its standard error, the orders that agree."""
+
+    delay: float
+    standard_error: float
+    orders: tuple[float, ...]
+
+
+def averages_of(samples: FloatArray, rate: float, start: float, pulses: FloatArray, *,
+                ratio: float, orders: Sequence[float], pulses_per_revolution: int,
+                missing_teeth: int, trigger_cycles: int, keyphasor_rate: float,
+                correct_jitter: bool = True) -> tuple[Average, ...]:
+    """
+    Return averages of samples (channel, sample) with corrected jitter; none if it fails.
+
+    Without the correction the angle law is the spline, which follows a changing speed.
+    """
+    try:
+        averager = Averager(
+            rate, start_time=start, ratio=ratio, orders=list(orders),
+            pulses_per_revolution=pulses_per_revolution, missing_teeth=missing_teeth,
+            trigger_cycles=trigger_cycles, correct_jitter=correct_jitter,
+            angle_law='linear' if correct_jitter else 'spline', keyphasor_rate=keyphasor_rate)
+        return averager.update(samples, pulses) + averager.flush()
+    except SaJitterError:
+        return ()
+
+
+def recovered_jitter(averages: Sequence[Average]) -> Jitter | None:
+    """Return the jitter that averages recovered; None where too few did."""
+    good = [item.correction for item in averages
+            if item.correction is not None and item.correction.accepted]
+    if len(good) < _FEWEST_AVERAGES or 2 * len(good) < len(averages):
+        return None
+    power, products, count = [], [], 0
+    for item in good:
+        errors, known = item.pulse_errors, item.standard_errors
+        n = errors.size
+        noise = float(np.mean(known**2))
+        # The mean of each average is not known.
+        power.append((float(np.mean(errors**2)) - noise) * n / (n - 1.0))
+        products.append(float(np.mean(errors[1:] * errors[:-1])) + power[-1] / n)
+        count += n
+    variance = float(np.mean(power))
+    noise = float(np.mean([np.mean(item.standard_errors**2) for item in good]))
+    if not variance > 0.25 * noise:
+        return None
+    std = math.sqrt(variance)
+    error = float(np.std(power, ddof=1)) / math.sqrt(len(power)) / (2.0 * std)
+    correlation = float(np.clip(np.mean(products) / variance, -1.0, 1.0))
+    return Jitter(std, max(error, std / math.sqrt(2.0 * count)), correlation,
+                  1.0 / math.sqrt(count))
+
+
+def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None, str]:
+    """
+    Return the delay of the tach from the phases of orders, and why there is none.
+
+    The phase of order g of a shaft that turns at frequency f advances by 2 pi g f times the delay.
+    """
+    if len(averages) < _FEWEST_SPEEDS:
+        return None, 'too few averages of the vibration: record longer'
+    speeds = np.array([item.trigger_speed for item in averages])
+    if np.ptp(speeds) < _SPEED_RANGE * speeds.mean():
+        return None, 'the speed hardly changes: record a run-up or several speeds'
+    amplitudes = np.array([item.amplitudes for item in averages])
+    noise = np.array([item.noise for item in averages])
+    with np.errstate(divide='ignore', invalid='ignore'):
+        clear = np.nanmin(np.abs(amplitudes) / noise, axis=0)
+    found, errors, orders = [], [], []
+    centred = speeds - speeds.mean()
+    for place, order in enumerate(averages[0].orders):
+        channel = int(np.argmax(np.nan_to_num(clear[:, place])))
+        if not clear[channel, place] > _CLEAR:
+            continue
+        phase = np.unwrap(np.angle(amplitudes[:, channel, place]))
+        turn = 2.0 * math.pi * order * ratio
+        slope = float(centred @ phase / (centred @ centred))
+        left = phase - phase.mean() - slope * centred
+        error = float(np.sqrt(left @ left / (speeds.size - 2) / (centred @ centred)))
+        if np.abs(left).max() < 0.5 * math.pi:
+            found.append(slope / turn)
+            errors.append(max(error, 1e-12) / turn)
+            orders.append(float(order))
+    if len(found) < 2:
+        return None, 'fewer than two orders stand clear of their noise at all speeds'
+    delays, weight = np.array(found), 1.0 / np.array(errors) ** 2
+    mean = float(delays @ weight / weight.sum())
+    chi2 = float(((delays - mean) ** 2) @ weight)
+    if stats.chi2.sf(chi2, len(found) - 1) < _AGREE:
+        return None, ('the orders turn differently with the speed, as resonances make them: tap '
+                      'the sensor, or compare with a second tach at the vibration input')
+    return Delay(mean, float(weight.sum() ** -0.5), tuple(orders)), ''

@@ -1,0 +1,188 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The pattern of a target: teeth in a revolution, which are missing, and how uneven the others are.
+
+A target of N teeth repeats after N numbers: the same numbers modulo N have no pulse, and the same
+pulses stand beside their places. Every N is compared with the even target by the likelihood of
+both, with a penalty for the number of its parameters (Schwarz 1978). An even target without gaps
+has no pattern: pulses alone do not show how many of its marks make a revolution. A pattern that
+repeats may also be a ripple of the speed with the revolution.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.keyphasor_check.teeth import NumberedPulses
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+_MOST_TEETH = 1200
+_FEWEST_REVOLUTIONS = 4
+_MOST_PULSES = 60_000
+# A tooth is missing if it has a pulse in fewer of the revolutions; strays fall into gaps, too.
+_MISSING = 0.3
+_ALWAYS = 0.98  # share of revolutions in which a missing tooth has no pulse
+_LOST = 0.4  # at most so many of the present teeth have no pulse
+_MOSTLY = 0.67  # at most so many teeth are missing
+# Likelihoods hold for independent errors; those of pulses and speeds are not.
+_TEMPER = 0.3
+_OUTLIER = 4.0
+_CLEAR, _MOST_PATTERNS = 3.0, 4
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """
+    A target of `teeth` positions.
+
+    `missing` (teeth,) are those without a tooth, tooth 0 the first behind the widest gap. `marks`
+    (present,) in teeth are how late each mark is, with mean 0, and `errors` (present,) their
+    standard errors. `origin` is a number of `NumberedPulses` that tooth 0 has. `evidence` is the
+    logarithm of the likelihood over that of an even target, less the penalty.
+    """
+
+    teeth: int
+    missing: BoolArray
+    marks: FloatArray
+    errors: FloatArray
+    origin: int
+    evidence: float
+
+    @property
+    def present(self) -> int:
+        """Return the number of marks."""
+        return int(np.count_nonzero(~self.missing))
+
+    def tooth(self, numbers: IntArray) -> IntArray:
+        """Return the tooth of each number."""
+        return np.asarray((numbers - self.origin) % self.teeth)
+
+    def late(self) -> FloatArray:
+        """Return how late each tooth is (teeth,), 0 where it is missing."""
+        full = np.zeros(self.teeth)
+        full[~self.missing] = self.marks
+        return full
+
+
+def patterns(pulses: NumberedPulses) -> list[Pattern]:
+    """
+    Return the patterns that the pulses support better than an even target, the best first.
+
+    Only the first in a row of multiples is listed unless the multiple says more.
+    """
+    part = _longest(pulses)
+    numbers, places = pulses.numbers[part], pulses.places[part]
+    span = int(numbers[-1] - numbers[0]) + 1
+    most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
+    even = _evidence(numbers, places, 1)
+    gains = np.array([_evidence(numbers, places, n) - even for n in range(2, most + 1)])
+    found: list[Pattern] = []
+    for index in np.argsort(-gains):
+        teeth, gain = int(index) + 2, float(gains[index])
+        if gain <= _CLEAR or len(found) == _MOST_PATTERNS:
+            break
+        if not any(teeth % item.teeth == 0 for item in found):
+            found.append(_once(pulses, pattern_of(pulses, teeth, gain)))
+    return found
+
+
+def _once(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
+    """
+    Return the pattern of a wheel whose gaps repeat as one of a single repetition.
+
+    The speed of an engine repeats after two revolutions, its wheel after one.
+    """
+    for teeth in range(2, pattern.teeth if pattern.missing.any() else 0):
+        if pattern.teeth % teeth == 0 and np.array_equal(
+                np.tile(pattern.missing[:teeth], pattern.teeth // teeth), pattern.missing):
+            return pattern_of(pulses, teeth, pattern.evidence)
+    return pattern
+
+
+def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Pattern:
+    """Return the pattern of a target of so many teeth."""
+    part = _longest(pulses)
+    numbers, places = pulses.numbers[part], pulses.places[part]
+    classes = numbers % teeth
+    span = np.bincount(np.arange(numbers[0], numbers[-1] + 1) % teeth, minlength=teeth)
+    seen = np.bincount(classes, minlength=teeth)
+    missing = _missing(seen, span)
+    origin = _index(missing)
+    late, errors = np.zeros(teeth), np.full(teeth, np.nan)
+    for tooth in np.flatnonzero(~missing):
+        own = places[classes == tooth]
+        middle = float(np.median(own))
+        spread = 1.4826 * float(np.median(np.abs(own - middle)))
+        near = own[np.abs(own - middle) <= max(_OUTLIER * spread, 1e-12)]
+        late[tooth] = near.mean()
+        errors[tooth] = near.std() / np.sqrt(max(near.size - 1, 1))
+    late, errors = np.roll(late, -origin), np.roll(errors, -origin)
+    missing = np.roll(missing, -origin)
+    # Where teeth are missing, those that are there need not have the mean place 0.
+    shift = late[~missing].mean() if not missing.all() else 0.0
+    return Pattern(teeth, missing, late[~missing] - shift, errors[~missing], origin, evidence)
+
+
+def _longest(pulses: NumberedPulses) -> slice:
+    """Return the longest part of the pulses without a standstill, of a bounded length."""
+    edges = [0, *pulses.breaks.tolist(), pulses.times.size]
+    start, stop = max(pairwise(edges), key=lambda edge: edge[1] - edge[0])
+    return slice(start, min(stop, start + _MOST_PULSES))
+
+
+def _index(missing: BoolArray) -> int:
+    """Return the first tooth behind the widest gap, as `pulses.target.ToothedWheel` has it."""
+    there = np.flatnonzero(~missing)
+    if there.size in (0, missing.size):
+        return 0
+    steps = np.diff(np.append(there, there[0] + missing.size))
+    best = max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
+    return int(there[best])
+
+
+def _missing(seen: IntArray, span: IntArray) -> BoolArray:
+    share = seen / np.maximum(span, 1)
+    usual = float(np.quantile(share, 0.75))
+    missing = share < _MISSING * usual
+    if usual < 1.0 - _LOST or np.mean(missing) > _MOSTLY:
+        return np.zeros(seen.size, np.bool_)
+    return np.asarray(missing)
+
+
+def _evidence(numbers: IntArray, places: FloatArray, teeth: int) -> float:
+    """Return the log likelihood of a target of so many teeth, less half a log n a parameter."""
+    classes = numbers % teeth
+    seen = np.bincount(classes, minlength=teeth).astype(np.float64)
+    total = int(numbers[-1] - numbers[0]) + 1
+    span = np.full(teeth, total // teeth, np.float64)
+    span[(numbers[0] + np.arange(total % teeth)) % teeth] += 1.0
+    missing = _missing(np.asarray(seen, np.int64), np.asarray(span, np.int64))
+    lost = float((span - seen)[~missing].sum())
+    positions = float(span[~missing].sum())
+    share = min(max(lost / positions, 0.5 / positions), 0.5)
+    absent = (span - seen)[missing]
+    occupancy = (lost * np.log(share) + (positions - lost) * np.log1p(-share)
+                 + float(absent.sum()) * np.log(_ALWAYS)
+                 + float(seen[missing].sum()) * np.log(1.0 - _ALWAYS))
+    kept = ~missing[classes]
+    own, place = classes[kept], places[kept]
+    mean = np.bincount(own, place, teeth) / np.maximum(np.bincount(own, minlength=teeth), 1)
+    left = np.abs(place - mean[own])
+    # Least absolute deviations: strays that pass for pulses say little.
+    scale = max(float(left.mean()), 1e-9)
+    count = np.count_nonzero(kept)
+    parameters = np.count_nonzero(~missing) - 1 + 2 * np.count_nonzero(missing)
+    return float(_TEMPER * (occupancy - count * np.log(scale)) - 0.5 * parameters * np.log(count))

@@ -1,0 +1,351 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Targets, strays, clocks and jitter of which nothing is declared are found as they are."""
+
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.errors import RecordingError, SignalError
+from sa_jitter_ros.keyphasor_check.check import check_keyphasor
+from sa_jitter_ros.keyphasor_check.clock import clock_of
+from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.marks import fit_pulses
+from sa_jitter_ros.keyphasor_check.teeth import number_pulses
+from sa_jitter_ros.keyphasor_check.wheel import patterns
+from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+
+RATE, SPEED, SECONDS = 6000.0, 25.0, 8.0
+ORDERS = ((1.0, 0.3), (19.0, 1.0), (20.0, 0.2), (38.0, 0.5))
+
+
+def motion(drift=0.01):
+    """Return times (s) and angles (revolutions) of a shaft whose speed grows by `drift`."""
+    time = np.linspace(0.0, SECONDS, 200_001)
+    speed = SPEED * (1.0 + drift * time / SECONDS) * (1.0 + 1e-3 * np.sin(2.3 * time))
+    return time, np.append(0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time)))
+
+
+def tach(rng, marks=1, *, missing=(), late=None, drift=0.01, jitter=5e-6, strays=0, lost=0.0,
+         clock=0.0, memory=0.0):
+    """Return pulse times (s) of a target, the true strays and the number of lost pulses."""
+    time, angle = motion(drift)
+    late = np.zeros(marks) if late is None else np.asarray(late)
+    number = np.arange(int(angle[-1] * marks) - 1)
+    place = (number / marks + late[number % marks] / (2.0 * np.pi))[
+        ~np.isin(number % marks, missing)] + 0.1
+    errors = rng.normal(0.0, jitter, place.size)
+    for k in range(1, errors.size if memory else 0):
+        errors[k] = memory * errors[k - 1] + np.sqrt(1.0 - memory**2) * errors[k]
+    pulses = np.interp(place, angle, time) + errors
+    gone = rng.random(pulses.size) < lost
+    extra = np.sort(rng.uniform(pulses[0], pulses[-1], strays))
+    times = np.sort(np.append(pulses[~gone], extra))
+    return (np.ceil(times * clock) / clock if clock else times), extra, int(gone.sum())
+
+
+def vibration(rng, *, ratio=1.0, drift=0.01, orders=ORDERS, noise=0.3):
+    """Return samples (channel, sample) of a gear on a shaft at `ratio`."""
+    turns = ratio * np.interp(np.arange(int(SECONDS * RATE)) / RATE, *motion(drift))
+    return (sum(size * np.cos(2.0 * np.pi * order * turns + order) for order, size in orders)
+            + rng.normal(0.0, noise, turns.size))[None]
+
+
+def checked(samples, times, *, rate=RATE, teeth=(), **fields):
+    """Check a recording."""
+    return check_keyphasor(Recording(ArraySource(samples), rate, pulse_times=times, **fields),
+                           teeth=teeth)
+
+
+def codes(check):
+    """Return the codes of the warnings."""
+    return {item.code for item in check.warnings}
+
+
+def values(check, *names):
+    """Return values of findings."""
+    return tuple(check.findings[name].value for name in names)
+
+
+# --- targets ------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('marks', 'missing', 'late', 'drift'), [
+    (1, (), None, 0.01), (1, (), None, 2.0), (2, (), (0.01, -0.01), 0.01),
+    (2, (), (0.3, -0.3), 0.01), (8, (), 3e-3, 2.0),
+    (36, (35,), None, 2.0), (36, (34, 35), None, 0.01), (36, (16, 31, 32), None, 0.5),
+    (60, (58, 59), 1e-3, 0.01), (4, (3,), None, 0.01), (4, (2, 3), None, 0.01),
+    (3, (2,), None, 1.0)])
+def test_target_strays_and_lost_pulses(rng, marks, missing, late, drift):
+    """Every stray is found, unless it stands as near to a mark as the pulse does."""
+    late = rng.normal(0.0, late, marks) if isinstance(late, float) else late
+    count = marks * SPEED * SECONDS
+    times, strays, lost = tach(rng, marks, missing=missing, late=late, drift=drift,
+                               strays=max(10, int(0.01 * count)), lost=0.01)
+    check = checked(np.full((1, 1), np.nan), times, rate=1.0)
+    found, gaps, spurious, missed = values(
+        check, 'pulses_per_revolution', 'missing_teeth', 'spurious', 'missing')
+    if late is not None or missing:
+        assert (found, gaps) == (marks, len(missing))
+    hit = np.isin(strays, spurious['times'])
+    assert hit.mean() > 0.94
+    assert spurious['count'] <= 1.15 * strays.size + 4
+    assert missed['count'] == pytest.approx(lost, abs=max(6, 0.15 * lost))
+
+
+def test_marks_have_their_places_and_errors(rng):
+    """The standard errors are those of the scatter over 20 drawn targets."""
+    misses = []
+    for _ in range(20):
+        late = rng.normal(0.0, 2e-3, 6)
+        late -= late.mean()
+        times, _, _ = tach(rng, 6, late=late)
+        pulses = number_pulses(times)
+        pattern = fit_pulses(pulses, 6).pattern
+        scale = 2.0 * np.pi / 6
+        shifts = [pattern.marks * scale - np.roll(late, -k) for k in range(6)]
+        miss = min(shifts, key=lambda each: np.sum(each**2))
+        misses.append(miss / (pattern.errors * scale))
+    size = np.sqrt(np.mean(np.square(misses)))
+    assert 0.7 < size < 1.4  # 120 values, of which those of a target sum to 0
+
+
+def test_even_marks_have_no_pattern(rng):
+    """Of 40 even targets at most one looks uneven."""
+    found = [len(patterns(number_pulses(tach(rng, int(marks))[0])))
+             for marks in rng.integers(1, 5, 40)]
+    assert np.count_nonzero(found) <= 1
+
+
+@pytest.mark.parametrize(('marks', 'orders'), [
+    (1, ORDERS), (2, ORDERS), (2, ((19.0, 1.0), (37.0, 0.5), (57.0, 0.4))), (8, ORDERS)])
+def test_lines_of_the_vibration_tell_even_marks(rng, marks, orders):
+    check = checked(vibration(rng, orders=orders), tach(rng, marks)[0])
+    count = check.findings['pulses_per_revolution']
+    assert count.value == marks
+    assert all(probability < 0.3 for _, probability in count.alternatives)
+    assert values(check, 'ratio', 'orders') == (1.0, [order for order, _ in orders])
+
+
+def test_even_marks_without_vibration_are_listed_with_what_would_decide(rng):
+    check = checked(rng.normal(0.0, 1.0, (1, int(SECONDS * RATE))), tach(rng, 2)[0])
+    count = check.findings['pulses_per_revolution']
+    probability = dict(count.alternatives)
+    assert 2 in {count.value, *probability}
+    assert sum(probability.values()) > 0.3
+    assert 'strobe' in count.decided_by
+    assert {'marks_ambiguous', 'no_orders'} <= codes(check)
+
+
+def test_stated_marks_count_unless_pulses_contradict(rng):
+    times = tach(rng, 8)[0]
+    check = checked(vibration(rng, orders=((16.0, 1.0),)), times, pulses_per_revolution=8)
+    assert values(check, 'pulses_per_revolution') == (8,)
+    times = tach(rng, 12, missing=(11,))[0]
+    check = checked(np.full((1, 1), np.nan), times, rate=1.0, pulses_per_revolution=50)
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (12, 1)
+    assert 'marks_contradict' in codes(check)
+
+
+@pytest.mark.parametrize('teeth', [(), (19, 183, 76)])
+def test_ratio_of_a_shaft_without_keyphasor(rng, teeth):
+    check = checked(vibration(rng, ratio=183 / 76), tach(rng)[0], teeth=teeth)
+    ratio = check.findings['ratio']
+    assert ratio.value == pytest.approx(183 / 76, abs=3.0 * ratio.standard_error)
+    assert values(check, 'pulses_per_revolution', 'orders') == (1, [1.0, 19.0, 20.0, 38.0])
+
+
+def test_target_that_changes_is_named(rng):
+    early, late = tach(rng)[0], tach(rng, 8, missing=(7,))[0]
+    middle = 0.5 * SECONDS
+    check = checked(np.full((1, 1), np.nan), np.append(early[early < middle],
+                                                       late[late > middle]), rate=1.0)
+    assert 'pattern_changes' in codes(check)
+
+
+def test_standstill_costs_nothing_else(rng):
+    times = tach(rng, 12, missing=(11,))[0]
+    check = checked(np.full((1, 1), np.nan), times[(times < 3.0) | (times > 6.0)], rate=1.0)
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (12, 1)
+    assert values(check, 'spurious')[0]['count'] == values(check, 'missing')[0]['count'] == 0
+    assert check.findings['speed'].value['mean'] == pytest.approx(SPEED, rel=0.01)
+
+
+# --- clock and jitter ---------------------------------------------------------------------------
+
+@pytest.mark.parametrize('clock', [5000.0, 51_200.0, 3.125e6])
+@pytest.mark.parametrize('drift', [0.0, 0.5])
+@pytest.mark.parametrize(('marks', 'strays'), [(1, 0), (12, 30)])
+def test_clock_at_a_steady_and_a_changing_speed(rng, clock, drift, marks, strays):
+    times = tach(rng, marks, drift=drift, clock=clock, strays=strays)[0]
+    assert clock_of(times).rate == pytest.approx(clock, rel=1e-9)
+    since_1970 = clock_of(times + 1.7e9)
+    assert since_1970.rate in (0.0, pytest.approx(clock, rel=1e-4))
+
+
+def test_no_clock_in_pulses_of_full_precision(rng):
+    assert not any(clock_of(tach(rng, marks, drift=drift)[0]).rate
+                   for marks in (1, 8) for drift in (0.0, 0.5) for _ in range(5))
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.6, -0.4])
+def test_jitter_of_pulses_has_its_size_memory_and_errors(rng, memory):
+    """At the speed of `motion`, over 30 drawn tachs: the errors are those of the scatter."""
+    std = 2e-5
+    found = []
+    for _ in range(30):
+        times = tach(rng, jitter=std, memory=memory)[0]
+        pulses = number_pulses(times)
+        jitter = measure_jitter(pulses.times, pulses.numbers)
+        if np.isfinite(jitter.correlation):
+            found.append(((jitter.std - std) / jitter.std_error,
+                          (jitter.correlation - memory) / jitter.correlation_error))
+    size, correlation = np.array(found).T
+    assert len(found) >= 24
+    assert abs(np.median(size)) < 1.2
+    assert abs(np.median(correlation)) < 1.2
+    assert np.mean(np.abs(size) < 3.0) > 0.8
+    assert np.mean(np.abs(correlation) < 3.0) > 0.8
+
+
+def test_slow_jitter_is_that_of_the_vibration(rng):
+    times = tach(rng, jitter=6e-5, memory=0.9)[0]
+    check = checked(vibration(rng, noise=0.1), times)
+    std = check.findings['jitter_std']
+    assert std.decided_by.startswith('pulse errors recovered from the vibration')
+    # Each average shows the errors without their mean.
+    assert 2.5e-5 < std.value < 7e-5
+    assert {'jitter', 'jitter_memory'} <= codes(check)
+
+
+def test_cost_of_a_coarse_clock_is_what_an_average_loses(rng):
+    clock = 3000.0
+    samples, times = vibration(rng), tach(rng, jitter=0.0, clock=clock)[0]
+    check = checked(samples, times)
+    cost = dict(next(item for item in check.warnings if item.code == 'quantised').cost)
+    average, = sa.average(samples, RATE, times, orders=[19.0, 38.0])
+    left = np.abs(average.amplitudes[0]) / (1.0, 0.5)
+    scatter = average.cycle_amplitudes[:, 0].std(axis=0) / np.sqrt(average.trigger_cycles)
+    np.testing.assert_array_less(
+        np.abs(100.0 * (1.0 - left) - (cost[19.0], cost[38.0])), 300.0 * scatter)
+    assert 8.0 < cost[38.0] < 12.0
+
+
+# --- what does not fit --------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('code', 'change', 'rate'), [
+    ('unit_ms', lambda times: 1e3 * times, RATE),
+    ('unit_samples', lambda times: np.rint(RATE * times), RATE),
+    ('unit_epoch', lambda times: times + 1.7e9, RATE),
+    ('unit_khz', lambda times: times, RATE / 1e3),
+])
+def test_unit_is_named_and_the_rest_found(rng, code, change, rate):
+    check = checked(vibration(rng), change(tach(rng, 8, missing=(7,))[0]), rate=rate)
+    assert code in codes(check)
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (8, 1)
+    assert check.findings['speed'].value['mean'] == pytest.approx(SPEED, rel=0.01)
+    assert check.sample_rate == RATE
+    assert values(check, 'orders') == ([1.0, 19.0, 20.0, 38.0],)
+
+
+def test_tach_waveform_in_khz(rng):
+    angle = np.interp(np.arange(int(SECONDS * RATE)) / RATE, *motion())
+    recording = Recording(ArraySource(vibration(rng)), RATE, tach_rate=RATE / 1e3,
+                          tach=ArraySource(np.sin(2.0 * np.pi * angle)[None]))
+    check = check_keyphasor(recording)
+    assert 'unit_khz' in codes(check)
+    assert values(check, 'pulses_per_revolution', 'clock_rate') == (1, RATE)
+    assert check.findings['speed'].value['mean'] == pytest.approx(SPEED, rel=0.01)
+
+
+def test_bad_channels_cost_themselves_only(rng):
+    good = vibration(rng)[0]
+    samples = np.array([np.full(good.size, np.nan), good, np.zeros(good.size),
+                        np.clip(good, -0.5, 0.5)])
+    check = checked(samples, tach(rng)[0], channel_names=('a', 'b', 'c', 'd'))
+    texts = [item.text for item in check.warnings if item.code == 'bad_channel']
+    assert [text[:20] for text in texts] == [
+        'channel a is NaN or ', 'channel c is constan', 'channel d is saturat']
+    assert values(check, 'orders') == ([1.0, 19.0, 20.0, 38.0],)
+
+
+def test_tach_shorter_than_the_vibration(rng):
+    times = tach(rng)[0]
+    assert 'span' in codes(checked(vibration(rng), times[times < 5.0]))
+    assert 'span' not in codes(checked(vibration(rng), times))
+
+
+@pytest.mark.parametrize(('times', 'error', 'message'), [
+    ([], SignalError, '0 pulses in 8 s: at least 6 are needed'),
+    ([1.0], SignalError, '1 pulses in 8 s'),
+    ([1.0] * 20, SignalError, 'all 20 pulses are at 1 s'),
+    (np.arange(20.0, 0.0, -1.0), RecordingError, 'time runs backwards at pulse 1'),
+])
+def test_pulses_that_show_nothing(times, error, message):
+    with pytest.raises(error, match=message):
+        checked(np.zeros((1, int(SECONDS * RATE))), np.array(times))
+
+
+def test_strays_alone_are_no_target(rng):
+    check = checked(vibration(rng), np.sort(rng.uniform(0.0, SECONDS, 300)))
+    assert {'spurious', 'no_orders', 'marks_ambiguous'} <= codes(check)
+    text = next(item.text for item in check.warnings if item.code == 'spurious')
+    assert 'So many were not understood' in text
+
+
+# --- delay --------------------------------------------------------------------------------------
+
+@pytest.mark.parametrize('delay', [0.0, 2e-4])
+def test_delay_of_the_tach_turns_all_orders_alike(rng, delay):
+    times = tach(rng, drift=1.0)[0] + delay
+    found = checked(vibration(rng, drift=1.0), times).findings['path_delay']
+    assert found.value == pytest.approx(delay, abs=max(4.0 * found.standard_error, 3e-6))
+
+
+def test_delay_is_not_given_where_orders_disagree(rng):
+    time, angle = motion(1.0)
+    turns = np.interp(np.arange(int(SECONDS * RATE)) / RATE, time, angle)
+    speed = np.gradient(turns) * RATE
+    samples = sum(np.cos(2.0 * np.pi * order * turns + turn * speed / SPEED)
+                  for order, turn in ((3.0, 0.5), (19.0, -0.8))) + rng.normal(0, 0.2, turns.size)
+    found = checked(samples[None], tach(rng, drift=1.0)[0]).findings['path_delay']
+    assert found.value is None
+    assert 'orders turn differently' in found.decided_by
+    found = checked(vibration(rng), tach(rng)[0]).findings['path_delay']
+    assert found.value is None
+    assert 'speed hardly changes' in found.decided_by
+
+
+# --- measured -----------------------------------------------------------------------------------
+
+@pytest.mark.parametrize(('name', 'marks', 'missing', 'clock', 'speed'), [
+    ('gear0_gearbox', 1, 0, None, 33.33),
+    ('motor_30V_100kHz', 8, 0, 100e3, 94.4),
+    ('motor_runup_20V_40kHz', 8, 0, 40e3, 39.5),
+    ('turbine_20130316', 2, 0, 1e8, 30.03),
+    ('turbine_20130415', 2, 0, 1e8, 27.78),
+])
+def test_measured_machines(shared_data, name, marks, missing, clock, speed):
+    """Nothing is declared: neither marks nor orders."""
+    check = check_keyphasor(read(shared_data / f'{name}.npz', pulses_per_revolution=1, orders=[]))
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (marks, missing)
+    assert check.findings['speed'].value['mean'] == pytest.approx(speed, rel=0.005)
+    assert check.findings['clock_rate'].value == (clock and pytest.approx(clock, rel=1e-6))
+
+
+@pytest.mark.parametrize(('name', 'missing'), [('4b11_running', 3), ('toyota_3_tooth_cam', 2)])
+def test_measured_engines(shared_data, name, missing):
+    """Wheels 36-2-1 and 36-2; sensors shift the teeth in front of a gap."""
+    check = check_keyphasor(read(shared_data / f'engine_edges_{name}.npz', pulse_times='edges_1',
+                                 pulses_suffice=True))
+    assert values(check, 'pulses_per_revolution', 'missing_teeth') == (36, missing)
+    assert values(check, 'spurious', 'missing') == (
+        {'count': 0, 'times': []}, {'count': 0, 'times': []})
+    assert 'uneven_marks' in codes(check)
