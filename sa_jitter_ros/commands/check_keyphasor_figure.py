@@ -102,6 +102,7 @@ def _draw_lines(axes: Axes, check: KeyphasorCheck) -> None:
                       ha='center', fontsize='x-small')
     axes.margins(y=0.15)
     axes.set_ylim(bottom=0.0)
+    axes.set_xlim(0.0, 1.05 * float(place.max()))
     shaft = '' if ratio == 1.0 else f' at ratio {ratio:.6g}'
     axes.set_xlabel(f'order of the shaft{shaft}')
     axes.set_ylabel('above the noise [dB]')

@@ -38,7 +38,7 @@ def clock_of(times: FloatArray, *, largest: float = 0.0) -> Clock:
 
     `largest` is the largest time in s before any shift, which decides how times are rounded.
 
-    >>> times = np.ceil(np.cumsum(np.linspace(0.03, 0.05, 150)) * 51200.0) / 51200.0
+    >>> times = np.ceil(np.linspace(1.0, 3.0, 200) ** 2 * 51200.0) / 51200.0
     >>> round(clock_of(times).rate, 3)
     51200.0
     """

@@ -89,7 +89,7 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
         first = math.floor(float(times.min()))
         if first > _EPOCH > end:
             return (Mistake('unit_epoch', f'{apart}they are counted since 1970; set start_time to '
-                            'the time of the first sample on the same clock', shift=first),)
+                            'the time of the first sample on the same clock', shift=float(first)),)
         return (Mistake('no_overlap', f'{apart}set start_time to the time of the first sample on '
                         'the clock of the pulses', shift=float(times.min()) - start),)
     return ()
