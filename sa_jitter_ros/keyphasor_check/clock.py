@@ -80,13 +80,14 @@ def _of_changing_speed(times: FloatArray, rounding: float) -> Clock:
     intervals = np.sort(np.diff(times))
     intervals = intervals[intervals < 1.5 * np.median(intervals)]
     gaps = np.sort(np.diff(intervals))
-    gaps = gaps[gaps > 2.0 * rounding][:_SMALL_GAPS]
+    gaps = gaps[gaps > 2.0 * rounding]
     if not gaps.size:
         return none
+    gaps = gaps[np.append(True, np.diff(gaps) > 2.0 * rounding)][:_SMALL_GAPS]
     for part in range(1, _PARTS + 1):
-        tick = float(gaps[0]) / part
-        left = np.abs(gaps / tick - np.rint(gaps / tick))
-        if np.all(left < 0.1 + 2.0 * rounding / tick):
+        tick = _refined(gaps, float(gaps[0]) / part) or np.inf
+        if np.all(np.abs(gaps / tick - np.rint(gaps / tick)) < 0.1 + 2.0 * rounding / tick) and (
+                np.isfinite(tick)):
             break
     else:
         return none
