@@ -83,17 +83,17 @@ class ViewBench(NodeBench):
             assert self.spin(asked.done)
         return asked.result()
 
-    def snapshot(self, since=0):
+    def snapshot(self, since=0, channel=0):
         """Return a snapshot once all that was sent is on the board."""
         self.settle()
-        status, headers, body = self.ask(f'/snapshot.json?since={since}')
+        status, headers, body = self.ask(f'/snapshot.json?since={since}&channel={channel}')
         assert status == 200
         assert headers['Content-Type'] == 'application/json'
         return json.loads(body)
 
-    def part(self, name):
+    def part(self, name, channel=0):
         """Return the content of one part."""
-        return self.snapshot()['parts'][name]['content']
+        return self.snapshot(channel=channel)['parts'][name]['content']
 
 
 @pytest.fixture
@@ -176,6 +176,7 @@ def test_snapshot_holds_what_was_published(bench):
     assert set(parts) == {
         'settings', 'shaft/synchronous_average', 'shaft/standard_error',
         'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
+        'shaft/synchronous_average_spectrum', 'shaft/corrected_average_spectrum',
         'shaft/condition_indicator', 'shaft/indicator_trend', 'shaft/raw_trend',
         'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
         '/diagnostics'}
@@ -185,13 +186,13 @@ def test_snapshot_holds_what_was_published(bench):
     for kind, factor in (('synchronous_average', 1.0), ('corrected_average', 1.1)):
         np.testing.assert_allclose(parts[f'shaft/{kind}']['channels'], factor * raw, atol=2e-5)
         assert parts[f'shaft/{kind}']['points'] == 512
-        found = np.array(parts[f'shaft/{kind}']['amplitude'])
-        assert found.shape == (2, 255)
-        np.testing.assert_allclose(found[[0, 1], [18, 37]], [factor, 0.5 * factor], rtol=1e-3)
-        assert np.delete(found[0], 18).max() < 1e-12
-        np.testing.assert_allclose(
-            parts[f'shaft/{kind}']['phase'][0][18], -np.pi / 2.0, atol=1e-3)
-    assert 'amplitude' not in parts['shaft/standard_error']
+        for channel, (order, amplitude) in enumerate(((19, 1.0), (38, 0.5))):
+            found = b.part(f'shaft/{kind}_spectrum', channel)
+            assert found['channel'] == channel
+            assert len(found['amplitude']) == 255
+            assert found['amplitude'][order - 1] == pytest.approx(factor * amplitude, rel=1e-3)
+            assert max(np.delete(found['amplitude'], order - 1)) < 1e-12
+            assert found['phase'][order - 1] == pytest.approx(-np.pi / 2.0, abs=1e-3)
     assert parts['shaft/standard_error']['channels'] == [[0.05] * 512] * 2
     assert parts['shaft/condition_indicator'] == {
         'header': vars(header()), 'names': ['rms', 'fm0'],
@@ -224,8 +225,8 @@ def test_trends_grow_and_begin_anew_where_time_runs_back(bench):
     assert (trend['averages'], trend['names']) == (3, ['19', '38', '57'])
     first = dict(zip(messages.AMPLITUDE_FIELDS, np.moveaxis(table, -1, 0)))
     np.testing.assert_allclose(trend['value'], np.multiply.outer(
-        [1.0, 2.0, 3.0], first['corrected_amplitude']), rtol=1e-4)
-    np.testing.assert_allclose(trend['error'][2], 3.0 * first['noise_standard_deviation'],
+        [1.0, 2.0, 3.0], first['corrected_amplitude'][0]), rtol=1e-4)
+    np.testing.assert_allclose(trend['error'][2], 3.0 * first['noise_standard_deviation'][0],
                                rtol=1e-2)
     b.send('shaft/order_amplitude', average(
         'order_amplitude', table, messages.AMPLITUDE_FIELDS, sequence=0))
@@ -237,9 +238,10 @@ def test_a_long_trend_is_bounded_in_memory_and_on_the_line():
     trend, values = board.Trend(), np.ones((4, 50))
     for number in range(board.TREND_AVERAGES):
         content = trend.add(float(number), ('a',) * 50, values, values)
-    assert content()['averages'] == board.TREND_NUMBERS // (2 * values.size)
-    shown = content()
-    assert len(shown['value']) * 2 * values.size <= board.TREND_SENT
+    shown = content(3)
+    assert shown['averages'] == board.TREND_NUMBERS // (2 * values.size)
+    assert 1 < len(shown['value']) * 2 * 50 <= board.TREND_SENT
+    assert content(4)['value'] == []  # no such channel
     assert shown['time'][-1] == board.TREND_AVERAGES - 1.0
 
 
@@ -421,6 +423,7 @@ def test_a_bad_version_is_refused(bench):
     b = bench()
     for since in ('-1', 'x', '1.5', '1' * 30, '%C2%B2'):
         assert b.ask(f'/snapshot.json?since={since}')[0] == 400
+        assert b.ask(f'/snapshot.json?channel={since}')[0] == 400
 
 
 def test_foreign_host_name_is_refused(bench):

@@ -24,7 +24,8 @@ from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, ru
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.live_view_board import (
     amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, ORDERS,
-    orders_content, PulseErrors, pulses_content, SPEEDS, table_content, Trend, waveform_content)
+    orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content, Trend,
+    waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
@@ -109,8 +110,10 @@ class LiveView(MonitoringNode):
 
         def on_waveform(kind: str, message: Float64MultiArray) -> None:
             average = decode_average(kind, message)
-            self._board.put(f'{shaft}/{kind}', partial(
-                waveform_content, average, with_spectrum=kind != 'standard_error'))
+            self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
+            if kind != 'standard_error':
+                self._board.put(f'{shaft}/{kind}_spectrum', partial(spectrum_content, average),
+                                by_channel=True)
 
         def on_indicators(message: Float64MultiArray) -> None:
             average = decode_average('condition_indicator', message)
@@ -119,7 +122,7 @@ class LiveView(MonitoringNode):
             if average.names:
                 self._board.put(f'{shaft}/indicator_trend', indicators.add(
                     average.header.end_time, average.names[:INDICATORS], values,
-                    values * math.nan))
+                    values * math.nan), by_channel=True)
 
         def on_orders(message: Float64MultiArray) -> None:
             average = decode_average('order_amplitude', message)
@@ -136,7 +139,7 @@ class LiveView(MonitoringNode):
             for kind, trend in amplitudes.items() if len(shown) else ():
                 self._board.put(f'{shaft}/{kind}_trend', trend.add(
                     average.header.end_time, tuple(f'{order:.6g}' for order in shown[0, :, 0]),
-                    *amplitude_rows(shown, average.names, kind)))
+                    *amplitude_rows(shown, average.names, kind)), by_channel=True)
 
         def on_pulses(message: Float64MultiArray) -> None:
             average = decode_average('pulse_error', message)

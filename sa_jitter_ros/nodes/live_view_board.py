@@ -38,7 +38,7 @@ CURVE_POINTS, ALL_POINTS = 1200, 16000  # points of one waveform, and of all cha
 HISTORY, HISTORY_NUMBERS = 30, 20000  # earlier averages, and attenuations in all of them
 PULSES = 1000
 SPEEDS = 200
-SPECTRUM_ORDERS, ALL_SPECTRUM = 2000, 32000  # orders of one spectrum, and of all channels
+SPECTRUM_ORDERS = 2000
 TREND_NUMBERS, TREND_AVERAGES = 400_000, 2000  # numbers that are kept, and averages
 TREND_SENT = 12_000  # numbers of one trend that are sent: of every n-th average
 
@@ -47,7 +47,12 @@ TREND_SENT = 12_000  # numbers of one trend that are sent: of every n-th average
 class _Item:
     version: int
     received: float
-    content: Callable[[], Json]
+    content: Callable[..., Json]
+    by_channel: bool
+
+    def made(self, channel: int) -> dict[str, Json]:
+        return {'received': self.received,
+                'content': self.content(channel) if self.by_channel else self.content()}
 
 
 class Board:
@@ -60,21 +65,28 @@ class Board:
         self._last_data = -math.inf  # s, time of the last data
         self._run = secrets.token_hex(4)
 
-    def put(self, name: str, content: Callable[[], Json], *, data: bool = True) -> None:
-        """Replace a content; `data` is true for results of measurements."""
+    def put(self, name: str, content: Callable[..., Json], *, data: bool = True,
+            by_channel: bool = False) -> None:
+        """
+        Replace a content; `data` is true for results of measurements.
+
+        A content `by_channel` is called with the number of the channel that a client shows.
+        """
         now = time.monotonic()
         with self._lock:
             self._version += 1
-            self._items[name] = _Item(self._version, now, content)
+            self._items[name] = _Item(self._version, now, content, by_channel)
             self._last_data = now if data else self._last_data
 
     def silence(self) -> float | None:
         """Return the time in s since the last data, None before the first."""
         return time.monotonic() - self._last_data if math.isfinite(self._last_data) else None
 
-    def since(self, version: int) -> dict[str, Json]:
+    def since(self, version: int, channel: int = 0) -> dict[str, Json]:
         """
         Return the contents that are newer than a version, and the present version.
+
+        Contents that are sent by channel are those of `channel`.
 
         `now` and `received` are times in s of one clock. `run` identifies the board: versions of
         different boards do not compare.
@@ -84,8 +96,7 @@ class Board:
             current = self._version
         return {'run': self._run, 'version': current, 'now': time.monotonic(),
                 'silence': self.silence(),
-                'parts': {name: {'received': item.received, 'content': item.content()}
-                          for name, item in items.items()}}
+                'parts': {name: item.made(channel) for name, item in items.items()}}
 
 
 class PulseErrors:
@@ -132,8 +143,12 @@ class Trend:
         self._rows: deque[tuple[float, FloatArray, FloatArray]] = deque()
 
     def add(self, time: float, names: tuple[str, ...], values: FloatArray, errors: FloatArray
-            ) -> Callable[[], Json]:
-        """Add values and errors (channel, name) of an average that ended at `time` (s)."""
+            ) -> Callable[[int], Json]:
+        """
+        Add values and errors (channel, name) of an average that ended at `time` (s).
+
+        Returns the content by channel.
+        """
         back = bool(self._rows) and time < self._rows[-1][0]
         if back or (names, values.shape) != (self._names, self._shape):
             self._names, self._shape = names, values.shape
@@ -141,18 +156,20 @@ class Trend:
                 TREND_NUMBERS // max(2 * values.size, 1), 1, TREND_AVERAGES)))
         self._rows.append((time, values, errors))
         rows = list(self._rows)  # a thread may be sending while the next average comes
-        return lambda: trend_content(names, rows)
+        return lambda channel: trend_content(names, rows, channel)
 
 
-def trend_content(names: tuple[str, ...], rows: list[tuple[float, FloatArray, FloatArray]]
-                  ) -> Json:
-    """Return a trend: names, times, values and errors (average, channel, name)."""
-    step = -(-2 * rows[0][1].size * len(rows) // TREND_SENT)
-    shown = rows[::-1][::step][::-1]
-    return {'names': names, 'averages': len(rows), 'time': json_values(
-                np.array([time for time, _, _ in shown])),
-            'value': [json_values(significant(values)) for _, values, _ in shown],
-            'error': [json_values(significant(errors, 3)) for _, _, errors in shown]}
+def trend_content(names: tuple[str, ...], rows: list[tuple[float, FloatArray, FloatArray]],
+                  channel: int) -> Json:
+    """Return a trend of one channel: names, times, values and errors (average, name)."""
+    step = -(-2 * len(names) * len(rows) // TREND_SENT)
+    shown = rows[::-1][::step][::-1] if channel < len(rows[0][1]) else []
+    values = np.array([row[channel] for _, row, _ in shown]).reshape(-1, len(names))
+    errors = np.array([row[channel] for _, _, row in shown]).reshape(-1, len(names))
+    return {'channel': channel, 'names': names, 'averages': len(rows),
+            'time': json_values(np.array([time for time, _, _ in shown])),
+            'value': json_values(significant(values)),
+            'error': json_values(significant(errors, 3))}
 
 
 def significant(values: FloatArray, digits: int = 5) -> FloatArray:
@@ -193,17 +210,19 @@ def rounded(values: FloatArray) -> FloatArray:
     return np.round(values, min(5 - math.floor(math.log10(peak)), 300)) if peak > 0.0 else values
 
 
-def waveform_content(average: AverageMessage, *, with_spectrum: bool = True) -> Json:
-    """Return a waveform: header, points per revolution, curves and spectra by channel."""
+def waveform_content(average: AverageMessage) -> Json:
+    """Return a waveform: header, points per revolution, curves by channel."""
     shown = average.values[:CHANNELS]
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
-    content = {'header': header_content(average.header), 'points': average.values.shape[1],
-               'channels': json_values(rounded(envelope(shown, points)))}
-    if with_spectrum:
-        amplitudes, phases = spectrum(shown)
-        content.update(amplitude=json_values(significant(amplitudes, 4)),
-                       phase=json_values(np.round(phases, 3)))
-    return content
+    return {'header': header_content(average.header), 'points': average.values.shape[1],
+            'channels': json_values(rounded(envelope(shown, points)))}
+
+
+def spectrum_content(average: AverageMessage, channel: int) -> Json:
+    """Return the order spectrum of one channel: amplitudes and phases of orders 1, 2, ...."""
+    amplitudes, phases = spectrum(average.values[channel:channel + 1])
+    return {'channel': channel, 'amplitude': json_values(significant(amplitudes.ravel(), 4)),
+            'phase': json_values(np.round(phases.ravel(), 3))}
 
 
 def spectrum(waveforms: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -219,7 +238,7 @@ def spectrum(waveforms: FloatArray) -> tuple[FloatArray, FloatArray]:
     ([0.0, 3.0, 0.0], 0.25)
     """
     points = waveforms.shape[1]
-    most = min((points - 1) // 2, SPECTRUM_ORDERS, ALL_SPECTRUM // max(len(waveforms), 1))
+    most = min((points - 1) // 2, SPECTRUM_ORDERS)
     lines = 2.0 / max(points, 1) * np.fft.rfft(waveforms, axis=1)[:, 1:most + 1]
     return np.abs(lines), np.angle(lines)
 

@@ -77,13 +77,14 @@ def is_name_of_this_machine(header: str) -> bool:
 
 class PageServer:
     """
-    Serves the page and the JSON object `snapshot(since)` from a separate thread.
+    Serves the page and the JSON object `snapshot(since, channel)` from a separate thread.
 
     It listens on `host` and the first free port from `port` on (0: any). Raises `ParameterError`
     where this is not possible. `requests` and `refused` are counts.
     """
 
-    def __init__(self, snapshot: Callable[[int], dict[str, Any]], *, host: str, port: int) -> None:
+    def __init__(self, snapshot: Callable[[int, int], dict[str, Any]], *, host: str, port: int
+                 ) -> None:
         folder = files('sa_jitter_ros.nodes').joinpath('live_view_page')
         pages = {f'/{item.name}': item.read_bytes() for item in folder.iterdir()
                  if item.name.rpartition('.')[2] in KINDS}
@@ -130,7 +131,7 @@ def _listen(host: str, port: int) -> '_Server':
 class _Server(ThreadingHTTPServer):
     daemon_threads = True
     pages: dict[str, bytes]
-    snapshot: Callable[[int], dict[str, Any]]
+    snapshot: Callable[[int, int], dict[str, Any]]
 
     def __init__(self, host: str, port: int) -> None:
         self.address_family = socket.AF_INET6 if ':' in host else socket.AF_INET
@@ -192,11 +193,13 @@ class _Handler(BaseHTTPRequestHandler):
         if not is_name_of_this_machine(self.headers.get('Host', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'open this page by its address or as localhost')
         elif path == '/snapshot.json':
-            since = parse_qs(query).get('since', ['0'])[0]
-            if not (since.isascii() and since.isdecimal() and len(since) < 20):
-                self._refuse(HTTPStatus.BAD_REQUEST, 'since must be the version of a snapshot')
+            given = parse_qs(query)
+            numbers = [given.get(name, ['0'])[0] for name in ('since', 'channel')]
+            if not all(item.isascii() and item.isdecimal() and len(item) < 20 for item in numbers):
+                self._refuse(HTTPStatus.BAD_REQUEST, 'since must be the version of a snapshot, '
+                             'channel the number of a channel')
                 return
-            content = json.dumps(self.server.snapshot(int(since)), allow_nan=False)
+            content = json.dumps(self.server.snapshot(*map(int, numbers)), allow_nan=False)
             self._send(HTTPStatus.OK, 'application/json', content.encode())
         elif path in self.server.pages:
             kind = KINDS['html' if path == '/' else path.rpartition('.')[2]]

@@ -66,7 +66,7 @@ const DRAWN = [
   [drawTiles, /speed|order_amplitude|pulse_error|prediction|residual|missing_effect/],
   [drawWaveforms, /average$|standard_error/],
   [charts.polar.render, /average$/],
-  [charts.spectrum.render, /average$/],
+  [charts.spectrum.render, /_spectrum$/],
   [drawTrendAndChoices, /_trend$/],
   [charts.amplitudes.render, /order_amplitude/],
   [charts.attenuation.render, /order_amplitude|prediction/],
@@ -98,7 +98,7 @@ const drawAll = () => draw(['settings']);
 
 async function ask() {
   try {
-    const answer = await fetch(`snapshot.json?since=${state.version}`,
+    const answer = await fetch(`snapshot.json?since=${state.version}&channel=${channel()}`,
                                {signal: AbortSignal.timeout(5000)});
     if (!answer.ok) throw new Error(`status ${answer.status}`);
     const news = await answer.json();
@@ -125,7 +125,11 @@ async function go() {
 
 find('trend-of').onchange = charts.trend.render;
 find('shaft').onchange = drawAll;
-find('channel').onchange = drawAll;
+find('channel').onchange = () => {
+  state.version = 0;  // spectra and trends are sent for one channel
+  drawAll();
+  if (!state.paused) ask();
+};
 find('pause').onclick = () => {
   state.paused = !state.paused;
   find('pause').textContent = state.paused ? 'Continue' : 'Pause';

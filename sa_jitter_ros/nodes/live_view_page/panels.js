@@ -1,7 +1,7 @@
 // The order spectrum, the trend, and the average over the circle.
 
 import {Chart, format, known, linear, logarithmic, range} from './charts.js';
-import {channel, channelName, find, finite, ofShaft, unit, unitOf} from './model.js';
+import {channel, channelName, find, finite, ofShaft, state, unit, unitOf} from './model.js';
 
 const FLOOR = 1e-6;  // of the largest amplitude: smaller ones are rounding errors
 const SPANS = [[3600, 'h'], [60, 'min'], [1, 's']];
@@ -9,16 +9,22 @@ const KINDS = [['raw', 'synchronous_average'], ['corrected', 'corrected_average'
 
 // --- order spectrum ------------------------------------------------------------------------------
 
-// [kind, amplitudes, phases] of the shown channel, of the averages that there are.
+// What was sent for the shown channel; the rest comes with the next answer.
+const shownPart = kind => ofShaft(kind)?.channel === channel() ? ofShaft(kind) : undefined;
+
+const missing = () => !ofShaft('synchronous_average') ? 'no synchronous average received yet'
+  : state.paused ? 'continue, to see this channel' : 'not received yet';
+
+// [kind, amplitudes, phases] of the averages that there are.
 function spectra() {
-  return KINDS.map(([kind, topic]) => [kind, ofShaft(topic)?.amplitude?.[channel()],
-                                       ofShaft(topic)?.phase?.[channel()]])
-    .filter(([, amplitudes]) => amplitudes?.length);
+  return KINDS.map(([kind, topic]) => [kind, shownPart(`${topic}_spectrum`)])
+    .filter(([, content]) => content?.amplitude.length)
+    .map(([kind, {amplitude, phase}]) => [kind, amplitude, phase]);
 }
 
 export function drawSpectrum(chart) {
   const shown = spectra();
-  if (!shown.length) { chart.empty('no synchronous average received yet'); return; }
+  if (!shown.length) { chart.empty(missing()); return; }
   const peak = Math.max(...shown.flatMap(([, amplitudes]) => finite(amplitudes)));
   const most = Math.max(...shown.map(([, amplitudes]) => amplitudes.length));
   const x = linear([0, most + 1], Math.max(4, Math.min(12, chart.inner / 70)));
@@ -64,11 +70,11 @@ export function trendChoices() {
 // {name, unit, curves: [kind, times, values, errors]} of what was chosen.
 function trend() {
   const [what, place] = (find('trend-of').value || 'order 0').split(' ');
-  const parts = what === 'order' ? KINDS.map(([kind]) => [kind, ofShaft(`${kind}_trend`)])
-    : [['corrected', ofShaft('indicator_trend')]];
+  const parts = what === 'order' ? KINDS.map(([kind]) => [kind, shownPart(`${kind}_trend`)])
+    : [['corrected', shownPart('indicator_trend')]];
   const curves = parts.filter(([, content]) => content).map(([kind, content]) => [
     kind, content.time, ...['value', 'error'].map(
-      key => content[key].map(average => average[channel()]?.[place] ?? null))]);
+      key => content[key].map(average => average[place] ?? null))]);
   const name = parts[0][1]?.names[place] ?? '';
   return {name: what === 'order' ? `order ${name}` : name.replaceAll('_', ' '),
           measure: what === 'order' ? unit() : unitOf(name),
@@ -77,7 +83,7 @@ function trend() {
 
 export function drawTrend(chart) {
   const {name, measure, curves} = trend();
-  if (!curves.length) { chart.empty('no average received yet'); return; }
+  if (!curves.length) { chart.empty(missing()); return; }
   const times = curves.flatMap(([, time]) => finite(time));
   const last = Math.max(...times), span = last - Math.min(...times);
   const [size, letter] = SPANS.find(([seconds]) => span >= 3 * seconds) ?? SPANS.at(-1);
