@@ -20,7 +20,7 @@ from machine import Machine
 import numpy as np
 import pytest
 from rclpy.parameter import Parameter
-from sa_jitter_ros.nodes import health, messages
+from sa_jitter_ros.nodes import base, health, messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, INPUT_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.health import Flow, Health, Level
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
@@ -276,6 +276,24 @@ def test_impossible_prediction_is_a_warning_until_it_is_possible(ros_graph):
         assert text.startswith('prediction: impossible at the measured 5000 Hz, ')
     b.send('shaft_speed', Float64(data=20.1))
     assert b.diagnostics()[0] == OK
+
+
+def test_log_has_one_line_of_each_kind_in_five_seconds(ros_graph, monkeypatch, capfd):
+    now = SteadyClock()
+    monkeypatch.setattr(base, 'time', now)
+    node = NodeBench(ros_graph, JitterPredictor, inputs={}, outputs={}).node
+    for number in range(50):
+        node.warn(f'sample {number} at {1.5e-3 * number} s is lost')
+        node.warn(f'pulse {number} is early')
+    for letter in 'abcdefghijklmnop':
+        node.warn(f'kind {letter}')
+    lines = [line for line in capfd.readouterr().err.splitlines() if 'WARN' in line]
+    assert len(lines) == base.WARNING_KINDS
+    assert 'sample 0' in lines[0]
+    assert 'pulse 0' in lines[1]
+    now.now += base.WARNING_PERIOD
+    node.warn('sample 99 at 3 s is lost')
+    assert 'sample 99' in capfd.readouterr().err
 
 
 def test_stale_after_can_be_changed_while_the_node_runs(averager, clock):

@@ -14,8 +14,10 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from itertools import pairwise
 from pathlib import Path
+import re
 import socket
 import sys
+import time
 import traceback
 from typing import Any
 
@@ -44,6 +46,7 @@ from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 DIAGNOSTIC_KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'gaps', 'restarts',
                    'clock_deviation', 'messages_rejected')
 WARNING_PERIOD = 5.0  # s between log lines of the same kind
+WARNING_KINDS = 10
 
 
 def _reliable(depth: int, durability: DurabilityPolicy) -> QoSProfile:
@@ -94,6 +97,7 @@ class MonitoringNode(Node):
         self._incompatible: dict[Subscription, str] = {}  # and the incompatible policy
         self._reported = dict(self.counts)
         self._last_warning = ''
+        self._logged: dict[str, float] = {}  # kinds of warnings, and when they were logged
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         self.create_steady_timer(1.0, self.publish_diagnostics)
@@ -153,9 +157,18 @@ class MonitoringNode(Node):
     # --- warnings and diagnostics ---
 
     def warn(self, text: str) -> None:
-        """Log a warning, at most every `WARNING_PERIOD`, and show it in the next diagnostics."""
+        """
+        Log a warning, and show it in the next diagnostics.
+
+        In each `WARNING_PERIOD` the log has one line of a kind, and lines of `WARNING_KINDS`.
+        Warnings that differ in their numbers only are of one kind.
+        """
         self.show_warning(text)
-        self.get_logger().warning(text, throttle_duration_sec=WARNING_PERIOD)
+        kind, now = re.sub(r'[-+]?\d[\d.]*(e[-+]?\d+)?', '#', text), time.monotonic()
+        self._logged = {key: at for key, at in self._logged.items() if now - at < WARNING_PERIOD}
+        if kind not in self._logged and len(self._logged) < WARNING_KINDS:
+            self._logged[kind] = now
+            self.get_logger().warning(text)
 
     def show_warning(self, text: str) -> None:
         """Show a warning in the next diagnostics, but not in the log."""
