@@ -73,9 +73,9 @@ class CorrectingAverager:
         """Trigger cycles up to the next average."""
         return self._shaft.room
 
-    def usable(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
-        """Return in which cycles of `periods` s the shaft turns slowly enough for `rate` Hz."""
-        return self._shaft.usable(periods, rate)
+    def shortest(self, rate: float) -> float:
+        """Return the period (s) of a trigger cycle that is too short for samples at `rate` Hz."""
+        return self._shaft.shortest(rate)
 
     def update(self, cycles: CycleSamples) -> Average | None:
         """Take cycles, not more than `room`; return the average and its correction when due."""

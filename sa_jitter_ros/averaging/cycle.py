@@ -85,7 +85,8 @@ class CycleSamples:
     @property
     def periods(self) -> FloatArray:
         """Return the lengths of the cycles in s."""
-        return np.diff(self.edges)
+        edges = self.edges
+        return edges[1:] - edges[:-1]
 
     def part(self, first: int, end: int) -> 'CycleSamples':
         """Return some of the cycles."""
@@ -229,6 +230,7 @@ def waveform_cutoff(points: int, cycles: float, periods: FloatArray | float, rat
     return np.where(cutoff < 1.0, np.exp2(np.floor(16.0 * np.log2(cutoff)) / 16.0), 1.0)
 
 
+@lru_cache(maxsize=64)
 def needed_margin(method: str, cutoff: float) -> int:
     """Return how many samples are needed on either side of a cycle."""
     return max(margin(method), margin(method, cutoff=cutoff)) + 1

@@ -27,6 +27,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+_CACHED = 1 << 15  # numbers
+
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
 
@@ -79,12 +81,20 @@ class BlockMean:
             self.count, values = 1, values[1:]
             if not len(values):
                 return
-        steps = values - self._mean
-        self.count += len(steps)
+        self.count += len(values)
+        # Piece by piece, so that what is computed of a piece stays in the cache.
+        size = max(_CACHED // (len(values) * self._mean[:1].size), 1)
+        for first in range(0, len(self._mean), size):
+            piece = slice(first, first + size)
+            self._take(values[:, piece], self._mean[piece], self._squares[piece])
+
+    def _take(self, values: Array, mean: Array, squares: FloatArray) -> None:
+        """Move the mean and the squares around it by arrays that are counted already."""
+        steps = values - mean
         moved = steps.sum(axis=0) if len(steps) > 1 else steps[0]
-        self._squares += _sum_of_powers(steps)
-        self._squares -= _power(moved) / self.count
-        self._mean += moved / self.count
+        squares += _sum_of_powers(steps)
+        squares -= _power(moved) / self.count
+        mean += moved / self.count
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""

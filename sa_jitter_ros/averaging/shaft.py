@@ -38,7 +38,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 #: Samples times channels that are averaged together.
-TOGETHER = 1 << 16
+TOGETHER = 1 << 18
 
 
 class ShaftAverager:
@@ -56,11 +56,6 @@ class ShaftAverager:
     def room(self) -> int:
         """Trigger cycles up to the next average."""
         return max(self.settings.trigger_cycles - self._taken, 1)
-
-    @property
-    def _taken(self) -> int:
-        """Trigger cycles since the start, those that wait included."""
-        return self._counted + sum(item.count for item in self._waiting)
 
     @property
     def _unfinished(self) -> bool:
@@ -96,8 +91,10 @@ class ShaftAverager:
     def margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s at `rate` Hz needs on either side."""
         points = self._points or self._chosen(period, rate)
-        return needed_margin(self.settings.interpolation, float(
-            waveform_cutoff(points, self.settings.cycle_length, period, rate)))
+        cutoff = 1.0
+        if points * self.settings.cycle_length < period * rate:
+            cutoff = float(waveform_cutoff(points, self.settings.cycle_length, period, rate))
+        return needed_margin(self.settings.interpolation, cutoff)
 
     def update(self, cycles: CycleSamples) -> Average | None:
         """
@@ -106,12 +103,19 @@ class ShaftAverager:
         Raises `SignalError`, and takes nothing, if the shaft frequency is not below half the
         sampling rate.
         """
-        self._check(cycles)
+        periods = cycles.periods
+        if not periods.min() > self.shortest(cycles.rate):
+            raise SignalError(
+                f'shaft frequency {self.settings.cycle_length / periods.min():.6g} Hz is not '
+                f'below half the sampling rate of {cycles.rate:.6g} Hz: check ratio and '
+                'pulses_per_revolution')
         if not self._taken:
-            self._choose_grid(float(cycles.periods[0]), cycles.rate)
+            self._choose_grid(float(periods[0]), cycles.rate)
         self._waiting.append(cycles)
+        self._taken += cycles.count
+        self._waiting_size += cycles.samples.size
         if self._taken < self.settings.trigger_cycles:
-            if sum(item.samples.size for item in self._waiting) >= TOGETHER:
+            if self._waiting_size >= TOGETHER:
                 self._average_waiting()
             return None
         self._average_waiting()
@@ -121,16 +125,9 @@ class ShaftAverager:
             self._start()
         return average
 
-    def usable(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
-        """Return in which cycles of `periods` s the shaft turns slowly enough for `rate` Hz."""
-        return np.asarray(self.settings.cycle_length / periods < rate / 2.0)
-
-    def _check(self, cycles: CycleSamples) -> None:
-        if not self.usable(cycles.periods, cycles.rate).all():
-            raise SignalError(
-                f'shaft frequency {self.settings.cycle_length / cycles.periods.min():.6g} Hz is '
-                f'not below half the sampling rate of {cycles.rate:.6g} Hz: check ratio and '
-                'pulses_per_revolution')
+    def shortest(self, rate: float) -> float:
+        """Return the period (s) of a trigger cycle that is too short for samples at `rate` Hz."""
+        return 2.0 * self.settings.cycle_length / rate
 
     def _average_waiting(self) -> None:
         """Average the cycles that wait."""
@@ -138,6 +135,7 @@ class ShaftAverager:
             for part in self._alike(run):
                 self._average(part)
         self._waiting.clear()
+        self._waiting_size = 0
 
     def _average(self, cycles: CycleSamples) -> None:
         """Average cycles that have grids of the same size."""
@@ -218,8 +216,9 @@ class ShaftAverager:
 
     def _start(self) -> None:
         settings = self.settings
-        self._counted = self._noise_due = 0
+        self._taken = self._counted = self._noise_due = 0  # those that wait are not yet counted
         self._waiting: list[CycleSamples] = []
+        self._waiting_size = 0  # samples times channels
         self._noise: FloatArray = np.empty((0, 0))
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))

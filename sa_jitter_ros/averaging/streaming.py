@@ -209,30 +209,32 @@ class StreamingAverager:
     # --- pulses ---
 
     def _queue(self, triggers: TriggerPulses) -> None:
-        if not triggers.times.size:
+        times = triggers.times
+        if not times.size:
             return
-        items = np.empty(triggers.times.size, TRIGGER)
+        items = np.empty(times.size, TRIGGER)
         epochs = self._epochs(triggers)
-        items['time'], items['epoch'] = triggers.times, epochs
-        items['starts_run'] = triggers.starts_run | (
-            np.diff(epochs, prepend=self._pulse_epoch) != 0)
+        items['time'], items['epoch'], items['starts_run'] = times, epochs, triggers.starts_run
+        items['starts_run'][0] |= epochs[0] != self._pulse_epoch
+        items['starts_run'][1:] |= epochs[1:] != epochs[:-1]
         self._pulse_epoch = int(epochs[-1])
-        before = self._triggers.items[-1:]
-        if not len(before):
-            items['starts_run'][0] = True
-            before = items[:1].copy()
-            before['elapsed'] = 0.0
-        steps = np.diff(triggers.times, prepend=before['time'][0])
-        items['elapsed'] = before['elapsed'][0] + np.cumsum(np.maximum(steps, 0.0))
+        steps = items['elapsed']
+        steps[1:] = times[1:] - times[:-1]
+        if len(self._triggers):
+            last = self._triggers.items[-1]
+            steps[0] = last['elapsed'] + max(times[0] - last['time'], 0.0)
+        else:
+            steps[0], items['starts_run'][0] = 0.0, True
+        np.maximum(steps[1:], 0.0, out=steps[1:])
+        np.cumsum(steps, out=steps)
         self._triggers.append(items)
 
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
         """Return the epoch of each pulse."""
         # If the pulse times ran back, those of the vibration did so, too, or will.
         earliest = self._pulse_epoch + np.cumsum(triggers.restarted)
-        if {item.epoch for item in self.timeline.segments} <= {self.timeline.epoch}:
-            reached = max(int(earliest[0]), self.timeline.epoch)
-            return np.asarray(reached + earliest - earliest[0])
+        if all(item.epoch == self.timeline.epoch for item in self.timeline.segments):
+            return np.asarray(earliest + max(self.timeline.epoch - int(earliest[0]), 0))
         epochs, epoch, times = [], self._pulse_epoch, triggers.times.tolist()
         for number, restarted in enumerate(triggers.restarted.tolist()):
             # The first pulses may lie before the vibration: the third one decides the epoch.
@@ -306,26 +308,24 @@ class StreamingAverager:
         return count - self._law.after
 
     def _together(self, segment: Segment, times: FloatArray) -> int:
-        """Return how many of the cycles between `times` can be handed over together."""
-        rate = segment.clock.rate
-        positions = (times[1:] - segment.clock.time) * rate + (segment.clock.index - segment.index)
-        last = len(segment.samples) - 1
-        if segment.closed:
-            inside = int(np.searchsorted(positions, last + 1e-6, 'right'))
-        else:
-            inside = int(np.searchsorted(positions, last, 'right'))
-            if inside > 1:
-                longest = float(np.diff(times[:inside + 1]).max())
-                inside = int(np.searchsorted(positions, last - self._margin(longest, rate),
-                                             'right'))
+        """Return how many of the cycles between `times`, at least one, can be taken together."""
+        rate, samples = segment.clock.rate, segment.samples
         room = min(item.room for item in self.shafts.values())
-        size = max(int(TOGETHER / segment.samples.shape[1]), 1)
-        reach = int(np.searchsorted(positions, segment.position(float(times[0])) + size, 'right'))
-        count = max(min(inside, room, reach), 1)
-        usable = np.ones(count, np.bool_)
-        for shaft in self.shafts.values():
-            usable &= shaft.usable(np.diff(times[:count + 1]), rate)
-        return count if usable.all() else max(int(np.argmin(usable)), 1)
+        times = times[:room + 1]
+        positions = (times - segment.clock.time) * rate + (segment.clock.index - segment.index)
+        last = len(samples) - (1.0 - 1e-6 if segment.closed else 1.0)
+        reach = min(last, positions[0] + 4 * TOGETHER / samples.shape[1])
+        count = int(np.searchsorted(positions, reach, 'right')) - 1
+        if count > 1 and not segment.closed:
+            longest = float((times[1:count + 1] - times[:count]).max())
+            reach = min(reach, last - self._margin(longest, rate))
+            count = int(np.searchsorted(positions, reach, 'right')) - 1
+        if count > 1:
+            short = (times[1:count + 1] - times[:count]
+                     <= max(item.shortest(rate) for item in self.shafts.values()))
+            if short.any():  # a cycle that a shaft refuses is taken alone
+                count = int(np.argmax(short))
+        return max(count, 1)
 
     def _margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s needs on either side, for any shaft."""
@@ -380,8 +380,8 @@ class StreamingAverager:
         low, high = (segment.position(float(pulses[i])) for i in (first, first + count))
         self.timeline.counts.samples_dropped += segment.use(low, high)
         failed, clock = '', segment.clock
-        longest = float(np.diff(pulses[first:first + count + 1]).max())
-        margin = self._margin(longest, clock.rate)
+        edges = pulses[first:first + count + 1]
+        margin = self._margin(float((edges[1:] - edges[:-1]).max()), clock.rate)
         self._lead = 1.5 * margin / clock.rate
         cycles = CycleSamples.cut(
             segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses, first=first,

@@ -40,7 +40,7 @@ _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
 _DEGREE = {'band_limited': 7, 'linear': 1, 'cubic': 3, 'spline': 3}
 METHODS = tuple(_HALF_WIDTH)
 _KAISER_BETA = 9.0
-_PIECE = 1 << 14  # positions whose weights are in memory at once
+_PIECE = 1 << 13  # positions whose weights are in memory at once
 
 
 def _kernel(method: str, x: FloatArray, half: int) -> FloatArray:
@@ -164,21 +164,19 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
     As `interpolate`, for positions whose whole part is known, which must lie within the samples.
     """
     polynomials = _polynomials(_known(method), cutoff)
-    taps = polynomials.shape[1]
-    values = np.empty((index.size, samples.shape[1]))
+    half = polynomials.shape[1] // 2
     if not index.size:
-        return values
-    half = taps // 2
+        return np.empty((0, samples.shape[1]))
     first, last = int(index.min()) - half + 1, int(index.max()) + half
     window = samples[max(first, 0):last + 1]
     if first < 0 or last >= len(samples):
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
                         mode='reflect', reflect_type='odd')
     begin = index - np.int32(first + half - 1)
-    for start in range(0, index.size, _PIECE):
-        piece = slice(start, start + _PIECE)
-        values[piece] = _operator(polynomials, begin[piece], fraction[piece], len(window)) @ window
-    return values
+    pieces = [slice(start, start + _PIECE) for start in range(0, index.size, _PIECE)]
+    values = [_operator(polynomials, begin[piece], fraction[piece], len(window)) @ window
+              for piece in pieces]
+    return np.concatenate(values) if len(values) > 1 else np.asarray(values[0])
 
 
 def _operator(polynomials: FloatArray, begin: NDArray[np.int32], fraction: FloatArray,
