@@ -36,6 +36,7 @@ LINES = {1: {16.0: 1.0}, 3: {8.0: 0.5, 16.0: 1.0, 32.0: 0.3},
 STRONGEST = 16.0
 SNRS = (-10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 JITTERS = (0.1, 0.3, 0.6)
+_SPARE = 3  # pulses that the validation may take to learn the interval
 #: dB of an order above the noise of the average from which its bias counts.
 CLEAR = 20.0
 
@@ -108,11 +109,11 @@ def trials(case: Case, count: int, seed: int) -> Outcome:
     orders, size = np.array(list(lines)), np.array(list(lines.values()))
     speed, rate = case.ratio / PERIOD, case.points / PERIOD
     std = case.jitter / (2.0 * np.pi * STRONGEST * speed)
-    length = (case.cycles + 4) * PERIOD
+    length = (case.cycles + 4 + _SPARE) * PERIOD
     times = np.arange(round(length * rate)) / rate
     found: dict[str, list[NDArray[np.complex128]]] = {'raw': [], 'corrected': [], 'true': []}
     accepted = 0
-    pulses = 2.0 * PERIOD + PERIOD * np.arange(case.cycles + 1.0)
+    pulses = 2.0 * PERIOD + PERIOD * np.arange(case.cycles + 1.0 + _SPARE)
     wave = np.exp(2j * np.pi * np.outer(orders, speed * (times - pulses[0])))
     for _ in range(count):
         phase = np.exp(2j * np.pi * rng.uniform(size=orders.size))
@@ -121,19 +122,22 @@ def trials(case: Case, count: int, seed: int) -> Outcome:
         late = pulses + rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0) * std
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')
-            average, = sa.average(
+            average, *_ = sa.average(
                 samples, rate, late, ratio=case.ratio, orders=orders, trigger_cycles=case.cycles,
                 correct_jitter=True, keyphasor_rate=case.scale / (np.sqrt(12.0) * std),
                 interval_tolerance=0.45)
-            exact, = sa.average(samples, rate, pulses, ratio=case.ratio, orders=orders,
-                                trigger_cycles=case.cycles, interval_tolerance=0.45)
+            first = int(np.argmin(np.abs(late - average.pulses[0])))
+            exact, *_ = sa.average(
+                samples, rate, pulses[first:], ratio=case.ratio, orders=orders,
+                trigger_cycles=case.cycles, interval_tolerance=0.45)
         assert average.correction is not None
         accepted += average.correction.accepted
         raw, corrected = average.amplitudes[0], average.correction.amplitudes[0]
         corrected = np.where(np.isfinite(corrected), corrected, raw)
         shown = {'raw': raw, 'corrected': corrected, 'true': exact.amplitudes[0]}
         for name, values in shown.items():
-            found[name].append(values / (size * phase))
+            found[name].append(values / (size * phase * np.exp(
+                2j * np.pi * orders * case.ratio * first)))
     above = case.snr + 20.0 * np.log10(size) + 10.0 * np.log10(case.cycles)
     return Outcome(**{name: np.array(rows) for name, rows in found.items()}, above=above,
                    accepted=accepted / count)

@@ -12,6 +12,7 @@
 
 import numpy as np
 import pytest
+import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -85,6 +86,34 @@ def test_attenuation_is_that_of_the_noiseless_machine_within_its_error():
     assert len(z) == 14
     # 56 values; pulse errors that are not known exactly add some to the stated error
     assert 0.6 < np.std(z) < 1.6
+
+
+def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds():
+    """Order 24 is not there, 27 stands 6 dB above the noise of the average, 19 20 dB."""
+    orders, size = np.array([19.0, 24.0, 27.0]), np.array([1.0, 0.0, 0.2])
+    rng, rate = np.random.default_rng(6), 3200.0
+    times, true = np.arange(round(44 / SPEED * rate)) / rate, (2.0 + np.arange(41)) / SPEED
+    wave = np.exp(2j * np.pi * SPEED * np.outer(orders, times - true[0]))
+    u, z, raised = (np.arange(8) + 0.5) / 8.0, [], []
+    for _ in range(80):
+        phase = np.exp(2j * np.pi * rng.uniform(size=3))
+        samples = ((size * phase) @ wave).real + 2.0 * rng.standard_normal(times.size)
+        errors = rng.uniform(-0.5, 0.5, 41) / 1100.0
+        average, = sa.average(samples, rate, true + errors, orders=orders, trigger_cycles=40,
+                              correct_jitter=True, keyphasor_rate=1100.0)
+        path = SPEED * (np.outer(errors[:-1], 1.0 - u) + np.outer(errors[1:], u))
+        turned = np.exp(2j * np.pi * orders[:, None, None] * path).mean(axis=(1, 2))
+        correction = average.correction
+        assert correction.accepted
+        z.append((correction.attenuation[0] - np.abs(turned))
+                 / correction.attenuation_standard_error[0])
+        raised.append(np.abs([correction.amplitudes[0], average.amplitudes[0]]) ** 2)
+    inside = np.mean(np.abs(z) < 1.96, axis=0)
+    assert np.all(inside > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / 80))
+    # noise is not aligned to itself
+    corrected, raw = np.array(raised)[:, :, 1].T
+    change = corrected - raw
+    assert change.mean() < 0.02 * raw.mean() + 3.0 * change.std() / np.sqrt(80.0)
 
 
 def test_noise_does_not_raise_what_errors_leave_uncertain():

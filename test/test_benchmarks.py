@@ -54,6 +54,24 @@ def test_core_is_as_accurate_as_its_page_says(benchmark):
             np.testing.assert_allclose(gain[name], expected, rtol=0.05)
 
 
+@pytest.mark.machines
+@pytest.mark.parametrize('values', [
+    {'snr': 0.0}, {'snr': 10.0}, {'snr': 10.0, 'scale': 5.0}, {'snr': 20.0, 'ratio': 0.25},
+    {'snr': 15.0, 'cycles': 10}])
+def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
+    campaign = benchmark('correction_campaign')
+    outcome = campaign.trials(campaign.Case(**values), 24, 11)
+    ratio, spread = outcome.mean_square_ratio()
+    assert ratio < 1.02 + 3.0 * spread
+    bias, error = outcome.bias()
+    if values['snr'] >= 10.0:
+        assert abs(bias) < 5e-3 + 3.0 * error
+        assert error < 5e-3
+        assert outcome.accepted == 1.0
+        raw = np.abs(outcome.raw).mean(axis=0) - np.abs(outcome.true).mean(axis=0)
+        assert raw[1] < -0.01
+
+
 def test_methods_are_timed_in_turns(benchmark):
     calls = []
     timings = benchmark('timing').interleaved(
