@@ -168,7 +168,7 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     evident = recovery.evidence > _EVIDENT
     noise = noise / (np.fmax(size, np.abs(whole)) if evident else size) ** 2
     unsure = np.clip((noise - _CLEAR) / (_WEAK - _CLEAR), 0.0, 1.0)
-    doubt = _CAUTION * np.where(unsure > 0.0, unsure * noise, 0.0)
+    doubt = _CAUTION * np.where((unsure > 0.0) & ~(told & evident), unsure * noise, 0.0)
     gained = np.where(told, np.abs(whole) / size - 1.0, lost)
     share = np.maximum(gained - doubt, 0.0) / np.maximum(gained + doubt, _TINY)
     ambiguous = np.clip((1.0 - left - _SURE) / (_AMBIGUOUS - _SURE), 0.0, 1.0)

@@ -101,15 +101,14 @@ class LineSearch:
         level = np.median(background, axis=0)
         contrast = np.max(power / background, axis=1)
         telling = np.max((g**2)[:, None] * power / level, axis=1)
-        best = np.lexsort((-contrast, -np.where(contrast > _CLEAR, telling, 0.0)))
-        best = best[:_TOGETHER * most]
+        telling = np.where(contrast > _CLEAR, telling, 0.0)
+        best = np.lexsort((-contrast, -telling))[:_TOGETHER * most]
         # What a strong order shows at its neighbours must not take the room of weaker orders.
         own = np.abs(np.linalg.lstsq(self._shown(errors, g[best]), lines[best], rcond=_APART)[0])
         share = np.minimum(1.0, np.max(
             own**2 / np.maximum(power[best], np.finfo(float).tiny), axis=1))
-        contrast, telling = contrast[best] * share, telling[best] * share
-        order = np.lexsort((-contrast, -np.where(contrast > _CLEAR, telling, 0.0)))[:most]
-        return g[best[order]], g[best[order[contrast[order] > _CLEAR]]]
+        best = best[np.lexsort((-contrast[best] * share, -telling[best] * share))[:most]]
+        return g[best], g[best[contrast[best] > _CLEAR]]
 
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
         """Return what (row) orders show of unit lines at each order (column)."""
