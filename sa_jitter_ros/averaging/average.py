@@ -156,9 +156,12 @@ class Correction:
     `waveform` (channel, angle) and `amplitudes` (channel, order), with their standard deviation
     `noise`, are those between corrected pulses. Where the correction is not `accepted` they are
     the raw ones, and `reason` says why. `pulse_errors` and `standard_errors` (N_t + 1,) in s are
-    measured minus true times with mean 0. `attenuation` (channel, order) is the raw over the
-    corrected amplitude. Both contain the same noise, and `attenuation_standard_error` accounts for
-    this correlation. `cycle_amplitudes` (cycle, channel, order) are those of the single trigger
+    measured minus true times with mean 0, as the vibration alone tells them; NaN where it leaves
+    an error ambiguous. `jitter_std` in s is the standard deviation of the true jitter that the
+    vibration shows, the declared one where it shows too little, NaN where the correction is not
+    accepted. `amplitudes` are NaN where the phase of an order stays unknown. `attenuation`
+    (channel, order) is the raw over the corrected amplitude. Both contain the same noise, and
+    `attenuation_standard_error` accounts for this correlation. `cycle_amplitudes` (cycle, channel, order) are those of the single trigger
     cycles between corrected pulses.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
@@ -191,12 +194,14 @@ class Correction:
     attenuation: FloatArray
     attenuation_standard_error: FloatArray
     cycle_amplitudes: ComplexArray
+    jitter_std: float = math.nan
 
     def __repr__(self) -> str:
         """Return one line: whether it was accepted, the size of the errors, what is left."""
         if not self.accepted:
             return f'Correction(refused: {self.reason})'
-        size = 1e6 * math.sqrt(np.mean(self.pulse_errors**2))
+        known = self.pulse_errors[np.isfinite(self.pulse_errors)]
+        size = 1e6 * math.sqrt(np.mean(known**2)) if known.size else math.nan
         return (f'Correction(accepted, {self.pulse_errors.size} pulse errors of {size:.3g} us '
                 f'RMS, attenuation {listed(self.attenuation.ravel(), 3)})')
 

@@ -132,7 +132,8 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         corrected.waveform, corrected.amplitudes, corrected.noise,
         np.where(recovery.resolved | (not recovery.accepted), recovery.errors, np.nan),
         recovery.standard_errors, recovery.accepted, recovery.reason, ratio,
-        np.hypot(error, ratio * unsure), corrected.cycle_amplitudes)
+        np.hypot(error, ratio * unsure), corrected.cycle_amplitudes,
+        recovery.std if recovery.accepted else math.nan)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery

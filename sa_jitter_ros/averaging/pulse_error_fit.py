@@ -320,13 +320,14 @@ class PulseErrorProblem:
                 break
         evidence = 0.5 * (self._misfit_without_errors(weight) - np.sum(residual**2)
                           - np.sum(errors**2) / std**2) - _occam(information, std)
-        alone = information.plus(_SINGULAR * float(information.diagonal.max()))
+        alone = information.plus(_SINGULAR * (float(information.diagonal.max()) + std**-2))
         unshrunk = errors - step + alone.solve(pull)
         unit = np.mean(np.sum(response.signal[:, :, :len(orders)] ** 2, axis=1), axis=0)
         noise = np.sqrt(2.0 * variance[self.chosen] / unit[:, None])
         plain = np.abs(least_squares(response.signal, model.coefficients))
-        aligned = np.divide(plain, np.abs(amplitudes), out=np.full(plain.shape, np.nan),
-                            where=self.significant)
+        size = np.abs(amplitudes)
+        aligned = np.divide(plain, size, out=np.full(plain.shape, np.nan),
+                            where=self.significant & (size > 0.0))
         return PulseErrorFit(
             errors, covariance, unshrunk - unshrunk.mean(), np.sqrt(alone.covariance()[0]), std,
             evidence, shown, ripple, orders, amplitudes, aligned, noise)
