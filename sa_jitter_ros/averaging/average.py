@@ -161,8 +161,8 @@ class Correction:
     vibration shows, the declared one where it shows too little, NaN where the correction is not
     accepted. `amplitudes` are NaN where the phase of an order stays unknown. `attenuation`
     (channel, order) is the raw over the corrected amplitude. Both contain the same noise, and
-    `attenuation_standard_error` accounts for this correlation. `cycle_amplitudes` (cycle, channel, order) are those of the single trigger
-    cycles between corrected pulses.
+    `attenuation_standard_error` accounts for this correlation. `cycle_amplitudes` (cycle, channel,
+    order) are those of the single trigger cycles between corrected pulses.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
     20.3 Hz. The correction recovers these errors except for their mean:
