@@ -25,7 +25,11 @@ import tracemalloc
 from typing import Any
 
 import numpy as np
-from peers import gains, make_record, METHODS, Package, PACKAGES, Record, stream
+from peers import blocks, gains, make_record, METHODS, Package, PACKAGES, Record, stream
+from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
+from sa_jitter_ros.pulses.validation import PulseValidator
 from timing import interleaved, machine, memory_bandwidth, multiply_adds, Timing
 
 TAPS = 16  # of the band-limited kernel: multiply-adds in a resampled value
@@ -116,6 +120,46 @@ def memory(scale: float) -> dict[str, float]:
     return peaks
 
 
+def shares(scale: float, rounds: int) -> dict[str, float]:
+    """Return the CPU time of settings that ask much, in seconds for a second of data."""
+    seconds = max(4.0 * scale, 1.0)
+    rate, speed, marks = 100e3, 50.0, 1024
+    angle = speed * np.arange(round(seconds * rate)) / rate
+    pulses = np.arange(1.0, np.floor(angle[-1] * marks)) / (speed * marks)
+    encoder = Record((np.cos(40.0 * np.pi * angle))[None], np.empty((0, 1)), pulses,
+                     np.empty(0), rate, 1.0, (20.0,))
+    gearbox = make_record(seconds=seconds)
+    ratios = [0.37 + 0.231 * k + 0.00013 * (k % 2) for k in range(20)]
+
+    def of_encoder() -> None:
+        keyphasor = KeyphasorParameters(pulses_per_revolution=marks, pulses_per_trigger=1)
+        _exhaust_stream(encoder, keyphasor.validator(), {'shaft': keyphasor.average(
+            orders=encoder.orders, trigger_cycles=marks)})
+
+    def of_shafts() -> None:
+        _exhaust_stream(gearbox, PulseValidator(), {
+            f'shaft{k}': AverageSettings(cycle_length=ratio, trigger_cycles=10,
+                                         orders=(1.0, 19.0, 38.0))
+            for k, ratio in enumerate(ratios)})
+
+    timings = interleaved({
+        f'encoder of {marks} pulses at {speed:g} Hz, each a trigger cycle; 1 channel at '
+        f'{rate / 1e3:g} kHz': of_encoder,
+        f'{len(ratios)} shafts of different ratios; 8 channels at {gearbox.rate / 1e3:g} kHz':
+            of_shafts}, rounds=rounds)
+    return {name: timing.best / seconds for name, timing in timings.items()}
+
+
+def _exhaust_stream(record: Record, validator: PulseValidator,
+                    shafts: dict[str, AverageSettings]) -> None:
+    """Average a record on line for some shafts."""
+    averager = StreamingAverager(shafts, validator=validator, timeline=VibrationTimeline())
+    averages = 0
+    for block, pulses in blocks(record):
+        averages += len(averager.add_samples(block)) + len(averager.add_pulses(pulses))
+    assert averages
+
+
 def limits() -> dict[str, float]:
     """Nanoseconds per sample and channel that this machine needs at the very least."""
     bandwidth, products = memory_bandwidth(), multiply_adds()
@@ -133,13 +177,14 @@ def main() -> int:
         parser.error('set OMP_NUM_THREADS=1: CPU time is compared, threads that wait would count')
     seconds, rounds = 10.0 * options.scale, options.rounds
     found: dict[str, Any] = {'machine': machine(), 'limits': limits(), 'comparisons': []}
-    for channels, ratio in ((8, 1.0), (8, 2.40789), (64, 1.0)):
+    for channels, ratio in ((8, 1.0), (8, 2.40789), (1, 1.0), (64, 1.0)):
         print(f'core: {channels} channels, ratio {ratio:g}', file=sys.stderr, flush=True)
         found['comparisons'].append(compare(channels, seconds, ratio, packages=channels == 8,
                                             rounds=rounds if channels == 8 else min(rounds, 3)))
     print('core: growth', file=sys.stderr, flush=True)
     found['growth'] = growth(options.scale, rounds)
     found['memory'] = memory(options.scale)
+    found['shares'] = shares(options.scale, rounds)
     found['load'] = f'{os.getloadavg()[0]:.1f}'
     print(json.dumps(found))
     return 0

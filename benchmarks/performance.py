@@ -94,6 +94,8 @@ def sections(found: Mapping[str, Any]) -> dict[str, str]:
     return {
         'machine': _machine(core, loop, graph), 'core': _comparisons(core['comparisons']),
         'limits': _limits(core), 'growth': _growth(core), 'loop': _loop(loop),
+        'shares': table(('on line', 'CPU share of one core'),
+                        [(name, f'{share:.0%}') for name, share in core['shares'].items()]),
         'threads': table(('threads of linear algebra', 'recovery of 100 trigger cycles x 8 '
                           'channels, on the clock'),
                          [(name, f'{value:.0f} ms') for name, value in loop['threads'].items()]),
