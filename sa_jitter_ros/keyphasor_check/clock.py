@@ -48,12 +48,12 @@ def clock_of(times: FloatArray, *, largest: float = 0.0) -> Clock:
     rounding = 4.0 * float(np.spacing(max(np.max(np.abs(times)), largest)))
     times = _repeating(times, rounding)
     found = find_clock(times)
-    if found.rate and 1.0 / found.rate < rounding:
-        return Clock(0.0, 0.0)
     found = found if found.rate else _of_changing_speed(times, rounding)
     if is_decimal(found):  # a coarser grid may be behind the decimals
         coarser = _of_changing_speed(times, 1.0 / found.rate)
         found = coarser if coarser.rate else found
+    if found.rate * rounding > 1.0:  # the last digit of the times themselves
+        return Clock(0.0, 0.0)
     return found
 
 
