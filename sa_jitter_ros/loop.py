@@ -27,12 +27,14 @@ import warnings
 
 from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.effects import declared_effects
-from sa_jitter_ros.errors import ModelError, SaJitterError
+from sa_jitter_ros.errors import DataWarning, ModelError, SaJitterError
 from sa_jitter_ros.inference.observation import Observation, observe
 from sa_jitter_ros.inference.trace import Trace, trace
+from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
 from sa_jitter_ros.report.report import report, summary
 
 Source = str | os.PathLike[str] | Recording
@@ -180,6 +182,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     names = tuple(names) or tuple(_name(*item) for item in enumerate(recordings, 1))
     opened = [item if isinstance(item, Recording) else read(item)
               for item in recordings]
+    opened, faults = _usable(opened, names)
     declaration = _declaration(declared, opened[0].sample_rate)
     models = declaration.models
     if len(models) > 1:
@@ -191,6 +194,12 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
         observations: list[Observation] = []
         for name, recording in zip(names, opened):
             show(f'reading {name}')
+            for doubt in doubts(recording, recording.pulse_times, orders=model.orders,
+                                ratio=model.ratio,
+                                pulses_per_revolution=model.pulses_per_revolution,
+                                pulses_per_trigger=model.pulses_per_trigger or None,
+                                missing_teeth=recording.missing_teeth):
+                faults.append(f'{name}: {doubt}')
             try:
                 observations.append(observe(
                     recording, model,
@@ -201,7 +210,22 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                  'trigger cycles')
         traces[shaft] = trace(observations, opened, declared=declaration.effects,
                               progress=progress)
+    for fault in dict.fromkeys(faults):
+        warnings.warn(fault, DataWarning, stacklevel=2)
     return Loop(traces, names)
+
+
+def _usable(recordings: Sequence[Recording], names: Sequence[str]
+            ) -> tuple[list[Recording], list[str]]:
+    """Return the recordings without channels that hold nothing in one of them; what is wrong."""
+    lost: set[int] = set()
+    faults = []
+    for name, recording in zip(names, recordings):
+        for channel, reason in channel_faults(recording).items():
+            lost |= {channel} if is_lost(reason) else set()
+            faults.append(f'{name}: {recording.channel_names[channel]} {reason}'
+                          + (' and is left out' if is_lost(reason) else ''))
+    return [without_channels(recording, lost) for recording in recordings], faults
 
 
 def _mistake(recording: Recording) -> str:

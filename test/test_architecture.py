@@ -45,8 +45,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib', 'prediction',
         'pulses', 'recordings'},
     'loop': {
-        'declaration', 'effects', 'errors', 'inference', 'prediction', 'pulses', 'recordings',
-        'report'},
+        'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
+        'pulses', 'recordings', 'report'},
 }
 ROOMS = {
     **CORE,

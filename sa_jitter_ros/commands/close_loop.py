@@ -23,7 +23,7 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, Parser, read_options, require_writable, show)
+    add_recording_options, Parser, plain_warnings, read_options, require_writable, show)
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop
@@ -79,7 +79,8 @@ def main(args: Sequence[str] | None = None) -> int:
     options = make_parser().parse_args(args)
     try:
         require_writable(options.output)
-        found = run(options)
+        with plain_warnings('close_loop'):
+            found = run(options)
         found.write(options.output)
     except (SaJitterError, OSError) as error:
         print(f'close_loop: {" ".join(str(error).split())}', file=sys.stderr)

@@ -11,14 +11,16 @@
 """Command lines: a parser with errors of one line, and the options of commands for recordings."""
 
 import argparse
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from io import UnsupportedOperation
 import os
 from pathlib import Path
 import sys
 from typing import Any, NoReturn
+import warnings
 
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
@@ -54,6 +56,19 @@ def discard_output() -> None:
     """Discard what could not be printed, which Python would try to print once more at its end."""
     with suppress(UnsupportedOperation):  # a test has replaced it by a buffer
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def plain_warnings(program: str) -> Iterator[None]:
+    """Print warnings as lines of a program, without the place in its source."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter('always', DataWarning)
+        try:
+            yield
+        finally:
+            for item in caught:
+                print(f'{program}: warning: {" ".join(str(item.message).split())}',
+                      file=sys.stderr)
 
 
 def require_writable(folder: Path) -> None:

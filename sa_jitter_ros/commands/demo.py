@@ -34,7 +34,7 @@ from rclpy.parameter_client import AsyncParameterClient
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, discard_output, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import (
-    Plan, plan_recording, plan_simulation, with_machine)
+    Plan, plan_doubts, plan_recording, plan_simulation, with_machine)
 from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
@@ -42,6 +42,7 @@ from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, PredictionMessage)
 from sa_jitter_ros.parameter_file import shipped
 from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.channel_check import usable_channels
 from std_msgs.msg import Float64, Float64MultiArray
 
 # The timeouts end a demo that hangs; a busy computer needs tens of seconds to start the nodes.
@@ -300,11 +301,15 @@ def main(args: Sequence[str] | None = None) -> int:
         signal.signal(number, signal.default_int_handler)
     try:
         if options.recording:
+            recording, remarks = usable_channels(
+                read(options.recording, **read_options(options)))
             plan = plan_recording(
-                options.recording, read(options.recording, **read_options(options)),
-                keyphasor_rate=options.keyphasor_rate, parameters=player_options(options))
+                options.recording, recording, keyphasor_rate=options.keyphasor_rate,
+                parameters=player_options(options))
             if options.params:
                 plan = with_machine(plan, options.params)
+            for remark in (*remarks, *plan_doubts(plan, recording)):
+                print(f'warning: {remark}', flush=True)
         else:
             plan = plan_simulation(options.params or shipped('machine.yaml'))
         options.output.mkdir(parents=True, exist_ok=True)  # fails before the run, not after it

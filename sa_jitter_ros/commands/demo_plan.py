@@ -12,6 +12,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+import math
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from sa_jitter_ros.averaging.average import KeyphasorParameters
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.parameter_file import read_parameters
+from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
 
 FloatArray = NDArray[np.float64]
@@ -104,8 +107,11 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
     triggers = _keyphasor(recording).validator().update(pulses)
     cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
     if len(cycles) < 4:
-        raise RecordingError(f'{len(pulses)} pulses give {len(cycles)} trigger cycles in '
-                             f'the first {FIRST_SECONDS:g} s: at least 4 are needed; check '
+        mistake = likely_mistake(
+            recording.keyphasor_pulses(), recording.start_time,
+            recording.start_time + recording.duration, recording.sample_rate)
+        raise RecordingError(mistake or f'{len(pulses)} pulses give {len(cycles)} trigger cycles '
+                             f'in the first {FIRST_SECONDS:g} s: at least 4 are needed; check '
                              'pulses_per_revolution, or the threshold of the tach waveform')
     period = float(np.median(cycles))
     trigger_cycles = int(np.clip(recording.duration / period // AVERAGES, 2, 100))
@@ -129,6 +135,18 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
         orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
         waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0,
         missing_teeth=recording.missing_teeth, note=note)
+
+
+def plan_doubts(plan: Plan, recording: Recording) -> tuple[str, ...]:
+    """Return what contradicts each other in a recording and its plan, a sentence each."""
+    declared = plan.params is not None or recording.tach_rate is not None
+    return doubts(
+        recording, recording.keyphasor_pulses(), orders=plan.orders, ratio=plan.ratio,
+        pulses_per_revolution=plan.pulses_per_revolution,
+        pulses_per_trigger=plan.pulses_per_trigger or None, missing_teeth=plan.missing_teeth,
+        jitter_std=1.0 / math.sqrt(12.0) / plan.keyphasor_rate
+        if declared and not plan.waveform and not plan.source_parameters.get('keyphasor_rate')
+        else None)
 
 
 def _keyphasor(recording: Recording) -> KeyphasorParameters:

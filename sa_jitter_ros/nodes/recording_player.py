@@ -19,11 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import Parameter
 from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.channel_check import usable_channels
 from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.samples import SampleBlock
 
@@ -68,13 +70,21 @@ class RecordingPlayer(PlaybackNode):
                                  'as in --ros-args -p recording:=rig.npz')
         fields: Values = {'sample_rate': values['sample_rate'] or None,
                           **fields_of(values['fields'])}
-        self._recording = recording = read(
+        recording = read(
             values['recording'], keyphasor=values['recorded_keyphasor'], **fields,
             **{name: values[name] for name in (
                 'acquisition', 'vibration_channels', 'tach_channel', 'time_column')})
         for remark in recording.remarks:
             self.warn(remark)
+        recording, remarks = usable_channels(recording)
+        self._recording = recording
         self._pulse_times, self._with_waveform = keyphasor_of(recording, values['tach'])
+        for remark in (*remarks, *doubts(
+                recording, self._pulse_times, orders=recording.orders, ratio=recording.ratio,
+                pulses_per_revolution=recording.pulses_per_revolution,
+                pulses_per_trigger=recording.pulses_per_trigger,
+                missing_teeth=recording.missing_teeth)):
+            self.warn(remark)
         if self._pulse_times is not None and values['keyphasor_rate'] > 0.0:
             self._pulse_times = (np.ceil(self._pulse_times * values['keyphasor_rate'])
                                  / values['keyphasor_rate'])

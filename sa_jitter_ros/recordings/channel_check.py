@@ -10,14 +10,21 @@
 
 """Channels that hold no vibration: NaN, constant, or at the end of their range."""
 
+from collections.abc import Collection
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.channel_map import ChannelSelection
+from sa_jitter_ros.recordings.recording import Recording
 
 FloatArray = NDArray[np.float64]
 
 _MOST_LOST = 0.5  # of the samples
 _AT_END = 0.02  # of the samples, at the very same largest or smallest value
 _FEWEST = 16
+_FIRST_VALUES = 4_000_000  # of a recording, in which its channels are judged
 
 
 def bad_channels(samples: FloatArray) -> dict[int, str]:
@@ -46,3 +53,48 @@ def bad_channels(samples: FloatArray) -> dict[int, str]:
                     np.unique(finite[:4096]).size > 8):
                 found[channel] = f'is saturated in {top + bottom:.0%} of its samples'
     return found
+
+
+def channel_faults(recording: Recording) -> dict[int, str]:
+    """Return the bad channels of a recording with the reason, from its first samples."""
+    count = min(recording.samples, max(_FIRST_VALUES // recording.channels, 1))
+    try:
+        return bad_channels(next(recording.blocks(count)))
+    except RecordingError:  # it is told to who reads up to the defect
+        return {}
+
+
+def without_channels(recording: Recording, bad: Collection[int]) -> Recording:
+    """Return a recording without some channels, the recording itself if none would be left."""
+    rows = tuple(row for row in range(recording.channels) if row not in bad)
+    if not bad or not rows:
+        return recording
+    return replace(recording, vibration=ChannelSelection(recording.vibration, rows),
+                   channel_names=tuple(recording.channel_names[row] for row in rows),
+                   units=tuple(recording.units[row] for row in rows))
+
+
+def is_lost(reason: str) -> bool:
+    """Return whether a bad channel holds nothing at all; a saturated one still holds something."""
+    return not reason.startswith('is saturated')
+
+
+def usable_channels(recording: Recording) -> tuple[Recording, tuple[str, ...]]:
+    """
+    Return a recording without its channels that hold nothing, and a sentence for each bad one.
+
+    >>> from sa_jitter_ros.recordings.recording import ArraySource
+    >>> rng = np.random.default_rng(1)
+    >>> rig = Recording(ArraySource(np.array([rng.normal(size=900), np.zeros(900)])), 1e3)
+    >>> rig, remarks = usable_channels(rig)
+    >>> rig.channel_names, remarks
+    (('channel 0',), ('channel 1 is constant and is left out: check its sensor and cable',))
+    """
+    faults = channel_faults(recording)
+    lost = {channel for channel, reason in faults.items() if is_lost(reason)}
+    remarks = tuple(
+        f'{recording.channel_names[channel]} {reason}'
+        + (' and is left out: check its sensor and cable' if channel in lost else
+           ': lower its gain, or choose a larger range')
+        for channel, reason in faults.items())
+    return without_channels(recording, lost), remarks

@@ -1,0 +1,150 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Pulses, vibration and declaration that contradict each other get one plain sentence each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sa_jitter_ros.commands import close_loop
+from sa_jitter_ros.commands.demo_plan import plan_doubts, plan_recording
+from sa_jitter_ros.errors import DataWarning, RecordingError
+from sa_jitter_ros.keyphasor_check.plausibility import doubts
+from sa_jitter_ros.loop import close_loop as loop
+from sa_jitter_ros.nodes.recording_player import RecordingPlayer
+from sa_jitter_ros.recordings import write_npz
+from sa_jitter_ros.recordings.channel_check import bad_channels, usable_channels
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+
+RATE, SPEED, SECONDS, CLOCK = 5000.0, 25.0, 10.0, 4000.0
+DECLARED = {'keyphasor_rate': CLOCK, 'trigger_speed': SPEED, 'trigger_cycles': 20,
+            'orders': [8, 16]}
+
+
+@pytest.fixture
+def recording(rng):
+    """Return a machine whose pulses are timed by a slow clock, as declared."""
+    time = np.arange(int(RATE * SECONDS)) / RATE
+    turns = SPEED * time + 0.01 * time**2
+    true = np.interp(np.arange(1, int(SPEED * SECONDS) - 1), turns, time)
+    samples = np.cos(16.0 * np.pi * turns) + 0.8 * np.cos(32.0 * np.pi * turns + 1.0)
+    return Recording(ArraySource((samples + rng.normal(0.0, 0.1, time.size))[None]), RATE,
+                     pulse_times=np.ceil(true * CLOCK) / CLOCK, tach_rate=CLOCK,
+                     orders=(8.0, 16.0), channel_names=('bearing',))
+
+
+def with_bad_channels(recording):
+    """Return a recording with a NaN, a dead and a saturated channel beside the good one."""
+    good = recording.read()[0]
+    return replace(recording, units=(), channel_names=('loose', 'bearing', 'dead', 'clipped'),
+                   vibration=ArraySource(np.array([
+                       np.full(good.size, np.nan), good, np.zeros(good.size),
+                       np.clip(good, -0.5, 0.5)])))
+
+
+def of(recording, **declared):
+    """Return the doubts about a recording."""
+    return doubts(recording, recording.pulse_times, **{
+        'orders': recording.orders, 'jitter_std': 1.0 / CLOCK / np.sqrt(12.0), **declared})
+
+
+def test_nothing_is_doubted_where_all_fits(recording):
+    assert of(recording) == ()
+    assert of(replace(recording, tach_rate=None)) == ()
+
+
+@pytest.mark.parametrize(('change', 'declared', 'text'), [
+    (lambda r: {'pulse_times': 1e3 * r.pulse_times}, {}, 'look like milliseconds'),
+    (lambda r: {'sample_rate': RATE / 1e3}, {}, 'looks like kHz'),
+    (lambda r: {'pulse_times': r.pulse_times[:60]}, {}, 'the pulses span 2.3'),
+    (lambda r: {'pulse_times': r.pulse_times[r.pulse_times < 9.0],
+                'sample_rate': RATE / 1.03}, {}, 'none of the orders 8, 16 stands above'),
+    (lambda r: {}, {'ratio': 1.37}, 'Hz and ratio 1.37'),
+    (lambda r: {}, {'pulses_per_revolution': 7}, 'none of the orders 8, 16 stands above'),
+    (lambda r: {}, {'jitter_std': 2e-6}, 'but 2 us are declared'),
+])
+def test_what_does_not_fit_is_said_once(recording, change, declared, text):
+    found = of(replace(recording, **change(recording)), **declared)
+    assert text in ' '.join(found)
+    assert len(found) == 1
+
+
+def test_noise_alone_is_seldom_taken_for_an_order(rng):
+    """Of 30 recordings of noise at most one has an order above it, by chance."""
+    time, missed = np.arange(20_000) / 2e3, 0
+    for _ in range(30):
+        noise = Recording(ArraySource(rng.normal(size=(1, time.size))), 2e3)
+        missed += not doubts(noise, np.arange(200) / 20.0, orders=(3.0, 7.0, 19.0))
+    assert missed <= 1
+
+
+def test_bad_channels_are_left_out_and_named(recording):
+    found, remarks = usable_channels(with_bad_channels(recording))
+    assert found.channel_names == ('bearing', 'clipped')
+    assert [text.split(':')[0] for text in remarks] == [
+        'loose is NaN or infinite in 100% of its samples and is left out',
+        'dead is constant and is left out', remarks[2].split(':')[0]]
+    assert remarks[2].startswith('clipped is saturated in')
+
+
+def test_counts_of_a_converter_are_not_saturated(rng):
+    counts = np.rint(rng.normal(0.0, 20.0, (3, 5000)))
+    switch = (rng.random(5000) > 0.5).astype(float)
+    assert bad_channels(np.vstack([counts, switch])) == {}
+
+
+# --- where users meet it ------------------------------------------------------------------------
+
+def test_demo_plans_with_the_good_channels_and_says_what_is_doubtful(recording, tmp_path):
+    good, _ = usable_channels(with_bad_channels(recording))
+    plan = plan_recording(tmp_path / 'rig.npz', good)
+    assert plan.channels == ('bearing', 'clipped')
+    assert plan_doubts(plan, good) == ()
+    wrong = replace(good, ratio=1.37)
+    doubt, = plan_doubts(plan_recording(tmp_path / 'rig.npz', wrong), wrong)
+    assert 'ratio 1.37' in doubt
+    with pytest.raises(RecordingError, match='look like milliseconds'):
+        plan_recording(tmp_path / 'rig.npz', replace(
+            good, pulse_times=1e3 * recording.pulse_times))
+
+
+def test_player_plays_the_good_channels_and_warns(recording, tmp_path, ros_graph):
+    write_npz(tmp_path / 'rig.npz', replace(with_bad_channels(recording), ratio=1.37))
+    node = ros_graph.add(RecordingPlayer, cli_args=[
+        '--ros-args', '-p', f'recording:={tmp_path / "rig.npz"}', '-p', 'playing:=false'])
+    assert node._recording.channel_names == ('bearing', 'clipped')
+    assert 'ratio 1.37' in node._last_warning
+
+
+def test_loop_uses_the_good_channels_and_warns(recording):
+    with pytest.warns(DataWarning) as caught:
+        found = loop(with_bad_channels(recording), DECLARED)
+    with pytest.warns(DataWarning, match='clipped is saturated'):
+        assert found.report == loop(usable_channels(with_bad_channels(recording))[0],
+                                    DECLARED).report
+    assert [str(item.message).split(': ', 1)[1][:12] for item in caught] == [
+        'loose is NaN', 'dead is cons', 'clipped is s']
+
+
+def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
+    write_npz(tmp_path / 'rig.npz', with_bad_channels(recording))
+    (tmp_path / 'model.yaml').write_text('jitter_predictor:\n  ros__parameters:\n' + ''.join(
+        f'    {key}: {value}\n' for key, value in DECLARED.items()))
+    assert close_loop.main([str(tmp_path / 'rig.npz'), '--declared', str(tmp_path / 'model.yaml'),
+                            '--output', str(tmp_path / 'out'), '--quiet']) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert f'close_loop: warning: {tmp_path / "rig.npz"}: dead is constant and is left out' in said
+    assert len(said) == 3
+
+
+def test_loop_names_orders_that_are_not_there(recording):
+    with pytest.warns(DataWarning, match='none of the orders 5, 11 stands above'):
+        loop(recording, {**DECLARED, 'orders': [5, 11]})
