@@ -89,7 +89,7 @@ def plan_simulation(params: Path) -> Plan:
 def with_machine(plan: Plan, params: Path) -> Plan:
     """Return a plan for the first shaft of a machine file; raises SaJitterError."""
     shaft, model = next(iter(read_declaration(params).models.items()))
-    return replace(plan, params=params, shaft=shaft, **{name: getattr(model, name) for name in (
+    return replace(plan, params=params, shaft=shaft, note='', **{name: getattr(model, name) for name in (
         'keyphasor_rate', 'pulses_per_revolution', 'pulses_per_trigger', 'ratio',
         'trigger_cycles', 'orders')})
 

@@ -170,9 +170,9 @@ class ResidualAnalyser(MonitoringNode):
     def _ask(self, averages: Sequence[ReceivedAverage], prediction: Published) -> None:
         """Trace with the predictor's declared model, or with one made of its prediction."""
         def without() -> None:
-            self.warn(f'{self._predictor_name} does not answer: independent jitter without '
-                      'effects is assumed; start the node, or set the parameter predictor to its '
-                      'name')
+            self.set_missing('declared model', f'{self._predictor_name} does not answer: '
+                             'independent jitter without effects is assumed; start the node, or '
+                             'set the parameter predictor to its name')
             self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
 
         def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
@@ -185,6 +185,7 @@ class ResidualAnalyser(MonitoringNode):
                         without()  # the node is no predictor
                     return
                 model, effects = self._declared(parameters, response)
+                self.set_missing('declared model', '')
                 self._trace(lambda: trace_averages(averages, model, declared=effects))
             names = [item.name for item in parameters]
             self._request(lambda: self._predictor.get_parameters(names), answered, without)
@@ -249,13 +250,16 @@ class ResidualAnalyser(MonitoringNode):
         def answered(response: Any) -> None:
             if response.result.successful:
                 self._added, self._step = set(found), wait
+                self.set_missing('closed loop', '')
             else:
-                self.warn(f'{self._predictor_name} refuses the effects: {response.result.reason}')
+                self.set_missing('closed loop', f'{self._predictor_name} refuses the effects: '
+                                 f'{response.result.reason}')
                 self._step = self._compare
 
         def without() -> None:
-            self.warn(f'{self._predictor_name} does not answer: its effects cannot be set; start '
-                      'the node, or set the parameter predictor to its name')
+            self.set_missing('closed loop', f'{self._predictor_name} does not answer: its effects '
+                             'cannot be set; start the node, or set the parameter predictor to '
+                             'its name')
             self._step = self._compare
         changes = [as_ros_parameter(name, value) for name, value in wanted.items()]
         self._request(lambda: self._predictor.set_parameters_atomically(changes),
