@@ -177,6 +177,7 @@ def test_snapshot_holds_what_was_published(bench):
         'settings', 'shaft/synchronous_average', 'shaft/standard_error',
         'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
         'shaft/synchronous_average_spectrum', 'shaft/corrected_average_spectrum',
+        'shaft/synchronous_average_map', 'shaft/corrected_average_map',
         'shaft/condition_indicator', 'shaft/indicator_trend', 'shaft/raw_trend',
         'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
         '/diagnostics'}
@@ -243,6 +244,31 @@ def test_a_long_trend_is_bounded_in_memory_and_on_the_line():
     assert 1 < len(shown['value']) * 2 * 50 <= board.TREND_SENT
     assert content(4)['value'] == []  # no such channel
     assert shown['time'][-1] == board.TREND_AVERAGES - 1.0
+
+
+def test_order_map_shows_amplitudes_in_decibels_and_is_bounded():
+    angle, orders = 2.0 * np.pi * np.arange(4096) / 4096, board.OrderMap()
+    wave = np.cos(19.0 * angle) + 0.02 * np.cos(1500.0 * angle)
+    for factor in (1.0, 0.1):
+        content = orders.add(factor * np.stack((0.0 * wave, wave)))
+    found = content(1)
+    assert (found['pool'], found['step'], found['span']) == (7, 1, 80.0)  # 2000 orders
+    assert found['peak'] == pytest.approx(1.0)
+    level = np.array([[ord(item) - ord('0') for item in row] for row in found['rows']])
+    assert level.shape == (2, 286)
+    # order 19 is in column 2; 63 levels are 80 dB
+    assert level[:, 2].tolist() == [63, round(63 * (1.0 - 20.0 / 80.0))]
+    weak = -20.0 * np.log10(0.02)
+    assert level[:, 1499 // 7].tolist() == [
+        round(63 * (1.0 - (weak + more) / 80.0)) for more in (0.0, 20.0)]
+    assert np.delete(level[0], [2, 1499 // 7]).max() == 0
+    assert content(0)['peak'] == 0.0
+    assert content(7)['rows'] == []
+    for _ in range(board.MAP_AVERAGES + 5):
+        content = orders.add(np.stack((wave, wave)))
+    found = content(0)
+    assert len(found['rows']) <= board.MAP_ROWS
+    assert found['step'] * len(found['rows']) <= board.MAP_NUMBERS // (2 * 2000) + found['step']
 
 
 def test_each_shaft_has_its_prediction_and_residual(bench):
@@ -597,6 +623,7 @@ def test_the_browser_shows_the_numbers(bench):
     assert text_of(page, 'spectrum-note') == 'point at an order, or click to keep it'
     assert text_of(page, 'attention').strip() == 'rig/averager: pulses_dropped increased'
     assert 'order 19, casing' in page  # the trend
+    assert page.count('<image href="data:image/png') == 1
     assert page.count('class="mark measured"') == 6  # attenuations and residuals of 3 orders
     assert page.count('class="mark corrected"') == 3 + 31 + 1 + 1
     assert page.count('<rect class="band"') == 3 + 1

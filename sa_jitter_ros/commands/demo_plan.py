@@ -89,9 +89,10 @@ def plan_simulation(params: Path) -> Plan:
 def with_machine(plan: Plan, params: Path) -> Plan:
     """Return a plan for the first shaft of a machine file; raises SaJitterError."""
     shaft, model = next(iter(read_declaration(params).models.items()))
-    return replace(plan, params=params, shaft=shaft, note='', **{name: getattr(model, name) for name in (
+    declared = {name: getattr(model, name) for name in (
         'keyphasor_rate', 'pulses_per_revolution', 'pulses_per_trigger', 'ratio',
-        'trigger_cycles', 'orders')})
+        'trigger_cycles', 'orders')}
+    return replace(plan, params=params, shaft=shaft, note='', **declared)
 
 
 def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,

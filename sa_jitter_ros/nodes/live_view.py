@@ -23,9 +23,9 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.live_view_board import (
-    amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, ORDERS,
-    orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content, Trend,
-    waveform_content)
+    amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, OrderMap,
+    ORDERS, orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content,
+    Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
@@ -107,12 +107,15 @@ class LiveView(MonitoringNode):
         """Subscribe to the results of one shaft."""
         errors, attenuations, indicators = PulseErrors(), Attenuations(), Trend()
         amplitudes = {'raw': Trend(), 'corrected': Trend()}
+        maps = {'synchronous_average': OrderMap(), 'corrected_average': OrderMap()}
 
         def on_waveform(kind: str, message: Float64MultiArray) -> None:
             average = decode_average(kind, message)
             self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
-            if kind != 'standard_error':
+            if kind in maps:
                 self._board.put(f'{shaft}/{kind}_spectrum', partial(spectrum_content, average),
+                                by_channel=True)
+                self._board.put(f'{shaft}/{kind}_map', maps[kind].add(average.values[:CHANNELS]),
                                 by_channel=True)
 
         def on_indicators(message: Float64MultiArray) -> None:

@@ -40,6 +40,10 @@ PULSES = 1000
 SPEEDS = 200
 SPECTRUM_ORDERS = 2000
 TREND_NUMBERS, TREND_AVERAGES = 400_000, 2000  # numbers that are kept, and averages
+MAP_NUMBERS, MAP_AVERAGES = 1_000_000, 300  # amplitudes that are kept, and averages
+MAP_ROWS, MAP_COLUMNS = 100, 300  # of a map that is sent
+MAP_SPAN = 80.0  # dB from the largest amplitude of a map down to the smallest that is told apart
+MAP_LEVELS = 64  # steps of this span, each a character from '0' on
 TREND_SENT = 12_000  # numbers of one trend that are sent: of every n-th average
 
 
@@ -157,6 +161,45 @@ class Trend:
         self._rows.append((time, values, errors))
         rows = list(self._rows)  # a thread may be sending while the next average comes
         return lambda channel: trend_content(names, rows, channel)
+
+
+class OrderMap:
+    """The order spectra of the latest averages of one shaft, for a picture."""
+
+    def __init__(self) -> None:
+        self._rows: deque[NDArray[np.float32]] = deque()
+
+    def add(self, waveforms: FloatArray) -> Callable[[int], Json]:
+        """Add an average (channel, angle); others of another shape start a new map."""
+        amplitudes = spectrum(waveforms)[0].astype(np.float32)
+        if not self._rows or self._rows[-1].shape != amplitudes.shape:
+            self._rows = deque(maxlen=int(np.clip(
+                MAP_NUMBERS // max(amplitudes.size, 1), 1, MAP_AVERAGES)))
+        self._rows.append(amplitudes)
+        rows = list(self._rows)
+        return lambda channel: map_content(rows, channel)
+
+
+def map_content(rows: list[NDArray[np.float32]], channel: int) -> Json:
+    """
+    Return the map of one channel: the latest average last, a character for each amplitude.
+
+    A row stands for `step` averages and a column for `pool` orders, of which it shows the largest
+    amplitude.
+    """
+    step = -(-len(rows) // MAP_ROWS)
+    shown = np.array([row[channel] for row in rows[::-1][::step][::-1]
+                      if channel < len(row)]).reshape(-1, rows[0].shape[1])
+    pool = -(-shown.shape[1] // MAP_COLUMNS)
+    if not shown.size:
+        return {'channel': channel, 'rows': [], 'step': step, 'pool': 1, 'peak': None}
+    largest = np.fmax.reduceat(shown, np.arange(0, shown.shape[1], pool), axis=1)
+    peak = float(np.max(largest, where=np.isfinite(largest), initial=0.0))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        level = 1.0 + 20.0 * np.log10(largest / peak) / MAP_SPAN
+    code = np.rint(np.clip(np.nan_to_num(level), 0.0, 1.0) * (MAP_LEVELS - 1)).astype(np.uint8)
+    return {'channel': channel, 'rows': [bytes(row + ord('0')).decode() for row in code],
+            'step': step, 'pool': pool, 'peak': json_values(peak), 'span': MAP_SPAN}
 
 
 def trend_content(names: tuple[str, ...], rows: list[tuple[float, FloatArray, FloatArray]],

@@ -37,14 +37,15 @@ export function range(values, {margin = 0.06, include = []} = {}) {
 
 // Scales: `at(value)` from 0 to 1, `ticks` as [value, label].
 
-export function linear([low, high], count = 5) {
+export function linear([first, second], count = 5) {
+  const [low, high] = first < second ? [first, second] : [second, first];
   const rough = (high - low) / count, power = 10 ** Math.floor(Math.log10(rough));
   const step = [1, 2, 5, 10].find(item => item * power >= rough * 0.999) * power;
   const ticks = [];
   for (let k = Math.ceil(low / step); k * step <= high * (1 + 1e-12); ++k) ticks.push(k * step);
   const digits = Math.max(1, 1 + Math.ceil(Math.log10(
     Math.max(Math.abs(low), Math.abs(high)) / step)));
-  return {at: value => (value - low) / (high - low),
+  return {at: value => (value - first) / (second - first),
           ticks: ticks.map(value => [value, format(value, digits)])};
 }
 
@@ -169,6 +170,13 @@ export class Chart {
     const points = values.flatMap((value, i) => known(value)
       ? [this.polar(i / values.length, value)] : []);
     this.add('path', {class: `curve ${style}`, d: `M${points.join('L')}Z`});
+  }
+
+  // A picture that fills the axes.
+  picture(address) {
+    this.add('image', {href: address, x: MARGIN.left, y: MARGIN.top, width: this.inner,
+                       height: this.height - MARGIN.top - MARGIN.bottom, class: 'picture',
+                       preserveAspectRatio: 'none'});
   }
 
   // Area between two curves over the same places; nothing where one is unknown.

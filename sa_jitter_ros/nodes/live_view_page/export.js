@@ -2,7 +2,8 @@
 
 const SCALE = 2;  // pixels of a picture over those of the page
 const DRAWN_BY = ['fill', 'fill-opacity', 'stroke', 'stroke-width', 'stroke-dasharray',
-                  'stroke-linejoin', 'opacity', 'visibility', 'font-size', 'font-family'];
+                  'stroke-linejoin', 'image-rendering', 'opacity', 'visibility', 'font-size',
+                  'font-family'];
 
 // Lines of a table {columns: [text], rows: [[value]]}; an unknown value is an empty field.
 export function csv({columns, rows}) {

@@ -5,8 +5,8 @@ import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms
         ordersTable, residualTable, waveformTable} from './drawings.js';
 import {addButtons} from './export.js';
 import {channel, channelName, find, ofShaft, settings, state} from './model.js';
-import {drawPolar, drawSpectrum, drawTrend, spectrumTable, trendChoices, trendTable}
-  from './panels.js';
+import {drawMap, drawPolar, drawSpectrum, drawTrend, mapTable, spectrumTable, trendChoices,
+        trendTable} from './panels.js';
 import {drawAttention, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles}
   from './words.js';
 
@@ -40,10 +40,11 @@ const charts = {
   errors: new Chart(find('errors'), 280, drawErrors),
   residual: new Chart(find('residual'), 280, drawResidual),
   spectrum: new Chart(find('spectrum'), 280, drawSpectrum),
+  map: new Chart(find('map'), 280, drawMap),
   trend: new Chart(find('trend'), 280, drawTrend),
   polar: new Chart(find('polar'), 280, drawPolar),
 };
-const TABLES = {waveforms: waveformTable, polar: waveformTable, spectrum: spectrumTable,
+const TABLES = {waveforms: waveformTable, polar: waveformTable, spectrum: spectrumTable, map: mapTable,
                 amplitudes: ordersTable, attenuation: ordersTable, trend: trendTable,
                 errors: errorsTable, residual: residualTable};
 for (const [name, table] of Object.entries(TABLES)) {
@@ -67,6 +68,7 @@ const DRAWN = [
   [drawWaveforms, /average$|standard_error/],
   [charts.polar.render, /average$/],
   [charts.spectrum.render, /_spectrum$/],
+  [charts.map.render, /_map$/],
   [drawTrendAndChoices, /_trend$/],
   [charts.amplitudes.render, /order_amplitude/],
   [charts.attenuation.render, /order_amplitude|prediction/],

@@ -114,6 +114,51 @@ export function trendTable() {
       ([, , values, errors]) => [values[i] ?? null, errors[i] ?? null])])};
 }
 
+// --- order map -----------------------------------------------------------------------------------
+
+// Colours from small to large amplitudes, which also differ in lightness.
+const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+
+function colour(level) {
+  const place = level * (COLOURS.length - 1), low = Math.min(Math.floor(place), COLOURS.length - 2);
+  return COLOURS[low].map((value, i) => value + (place - low) * (COLOURS[low + 1][i] - value));
+}
+
+const orderMap = () => [...KINDS].reverse().map(([kind, topic]) => [
+  kind, shownPart(`${topic}_map`)]).find(([, content]) => content?.rows.length);
+
+export function drawMap(chart) {
+  const [kind, map] = orderMap() ?? [];
+  if (!map) { chart.empty(missing()); return; }
+  const width = map.rows[0].length, height = map.rows.length;
+  const canvas = document.createElement('canvas');
+  Object.assign(canvas, {width, height});
+  const context = canvas.getContext('2d'), image = context.createImageData(width, height);
+  map.rows.forEach((row, y) => {
+    for (let x = 0; x < width; ++x) {
+      image.data.set([...colour((row.charCodeAt(x) - 48) / 63), 255],
+                     4 * ((height - 1 - y) * width + x));  // the latest at the top
+    }
+  });
+  context.putImageData(image, 0, 0);
+  chart.axes({
+    x: linear([0.5, map.pool * width + 0.5], Math.max(4, Math.min(12, chart.inner / 70))),
+    y: linear([map.step * (height - 0.5), -0.5 * map.step]), xLabel:
+      `order of ${find('shaft').value}`, yLabel: 'averages before the last one',
+    title: `${kind}, ${channelName(channel())}: yellow ${format(map.peak, 3)} ${unit()}, `
+      + `violet ${map.span} dB less`});
+  chart.picture(canvas.toDataURL());
+}
+
+export function mapTable() {
+  const [, map] = orderMap() ?? [];
+  return map && {
+    columns: ['averages before the last one', ...Array.from(map.rows[0], (_, i) =>
+      `amplitude of order ${map.pool * i + 1} [dB re ${format(map.peak)} ${unit()}]`)],
+    rows: map.rows.map((row, y) => [map.step * (map.rows.length - 1 - y), ...Array.from(
+      row, item => ((item.charCodeAt(0) - 48) / 63 - 1) * map.span)])};
+}
+
 // --- the average over the circle -----------------------------------------------------------------
 
 export function drawPolar(chart) {
