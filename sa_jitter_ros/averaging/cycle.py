@@ -109,10 +109,11 @@ class CycleSamples:
             positions = positions - self.rate * self.ripple * u * (1.0 - u)
         before = origins - self.first_index
         # The position of a pulse on the first or last sample may round to just outside.
-        lowest = -before[:, None]
-        positions = np.clip(positions, lowest, lowest + (len(self.samples) - 1))
+        np.maximum(positions[0], -before[0], out=positions[0])
+        np.minimum(positions[-1], len(self.samples) - 1.0 - before[-1], out=positions[-1])
         whole = np.floor(positions)
-        index, fraction = whole - lowest, positions - whole
+        fraction = positions - whole
+        index = np.add(whole, before[:, None], out=whole)
         if u.ndim == 2:
             index, fraction = index[~np.isnan(u)], fraction[~np.isnan(u)]
         index, fraction = index.ravel(), fraction.ravel()

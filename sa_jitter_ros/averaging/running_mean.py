@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-_CACHED = 1 << 15  # numbers
+_CACHED = 1 << 16  # numbers
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
