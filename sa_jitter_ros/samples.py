@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _RESOLUTION = 1e-3  # of a sample: to what times must be known
-_ABSOLUTE = 2.0**31  # s: the range of ROS times, and of times since 1970 until 2038
+_ABSOLUTE = 2.0**32  # s: the range of times since 1970, until 2106
 
 
 def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
@@ -38,7 +38,7 @@ def unresolved(time: float, sample_rate: float) -> str:
     """
     Say why a float64 cannot hold the times around `time` (s) of samples at a rate (Hz), or ''.
 
-    It must resolve a thousandth of a sample. ROS times are admitted at every rate: they are
+    It must resolve a thousandth of a sample. Times since 1970 are admitted at every rate: they are
     rounded to 0.24 us.
 
     >>> unresolved(1.8e9, 1e5)
