@@ -183,7 +183,7 @@ def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArra
     channels, size = samples.shape[1], min(begin.size, _PIECE)
     values = np.zeros((begin.size, channels))
     powers, weights = np.ones((order, size)), np.empty((size, taps))
-    columns, steps = np.empty((size, taps), np.int32), np.arange(taps, dtype=np.int32)
+    steps = np.tile(np.arange(taps, dtype=np.int32), size)
     rows = np.arange(0, taps * size + 1, taps, dtype=np.int32)
     for start in range(0, begin.size, size):
         count = min(size, begin.size - start)
@@ -193,9 +193,10 @@ def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArra
         for k in range(2, order):
             np.multiply(power[k - 1], power[1], out=power[k])
         np.matmul(power.T, polynomials, out=weights[:count])
-        np.add(begin[start:start + count, None], steps, out=columns[:count])
+        columns = np.repeat(begin[start:start + count], taps)
+        columns += steps[:columns.size]
         # What csr_matrix calls for a product, without its checks, which take as long here.
-        matrix = count, len(samples), rows, columns.reshape(-1), weights.reshape(-1)
+        matrix = count, len(samples), rows, columns, weights.reshape(-1)
         found = values[start:start + count].reshape(-1)
         if channels == 1:
             _sparsetools.csr_matvec(*matrix, samples.reshape(-1), found)
