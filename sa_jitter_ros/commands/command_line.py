@@ -17,6 +17,7 @@ from io import UnsupportedOperation
 import os
 from pathlib import Path
 import sys
+import tempfile
 from typing import Any, NoReturn
 import warnings
 
@@ -78,9 +79,12 @@ def require_writable(folder: Path) -> None:
         place = place.parent
     if not place.is_dir():
         raise ParameterError(f'--output {folder}: {place} is a file: give a folder')
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise ParameterError(f'--output {folder}: no permission to write in {place}: give another '
-                             'folder')
+    try:
+        with tempfile.TemporaryDirectory(dir=place):
+            pass
+    except OSError as error:
+        raise ParameterError(f'--output {folder}: cannot write in {place} ({error.strerror}): '
+                             'give another folder') from None
 
 
 def add_recording_options(parser: argparse.ArgumentParser) -> None:
