@@ -134,7 +134,8 @@ def prediction():
 def pulse_errors(first=70.0, count=31):
     """Return a table (pulse, field) of pulse errors."""
     number = np.arange(count)
-    return np.stack([first + number / 15.0, 1e-5 * np.cos(number), np.full(count, 1e-6)], axis=1)
+    return np.stack([first + number / 15.0, 1e-5 * np.cos(number), np.full(count, 1e-6),
+                     np.append(np.ones(count - 1), 0.0)], axis=1)
 
 
 def publish_all(b):

@@ -263,7 +263,7 @@ def test_pulse_arrays_travel_unchanged(times):
 
 RESULTS = arrays(np.float64, (2, 3, 8), elements=st.floats(allow_infinity=False))
 HEADER = st.builds(AverageHeader, FINITE, FINITE, st.integers(0, 2**53), st.integers(1, 10**6),
-                   st.integers(0, 10**6), FINITE)
+                   st.integers(0, 10**6), FINITE, st.integers(0, 10**6))
 
 
 @given(RESULTS, HEADER)
@@ -272,7 +272,7 @@ def test_order_amplitudes_travel_unchanged(values, header):
         'order_amplitude', AverageMessage(header, values, messages.AMPLITUDE_FIELDS))
     assert [dim.label for dim in message.layout.dim] == [
         'channel', 'order', f'field:{",".join(messages.AMPLITUDE_FIELDS)}']
-    assert message.layout.data_offset == 6
+    assert message.layout.data_offset == 7
     got = messages.decode_average('order_amplitude', message)
     assert (got.header, got.names) == (header, messages.AMPLITUDE_FIELDS)
     np.testing.assert_array_equal(got.values, values)
@@ -321,9 +321,43 @@ def test_result_with_an_impossible_count_is_refused(position, value):
         messages.decode_average('synchronous_average', message)
 
 
-@pytest.mark.parametrize(('decode', 'header'), [
-    (messages.decode_prediction, 6), (messages.decode_residual, 4)])
-def test_result_with_other_fields_is_refused(decode, header):
-    message = messages.encode_array(np.zeros((2, 3)), ('order', 'field'), (1.0,) * header)
+@pytest.mark.parametrize(('decode', 'fields', 'header'), [
+    (messages.decode_prediction, messages.PREDICTION_FIELDS, 6),
+    (messages.decode_residual, messages.RESIDUAL_FIELDS, 4)])
+def test_fields_that_are_missing_are_not_known(decode, fields, header):
+    message = messages.encode_array(
+        np.ones((2, 3)), ('order', f'field:{",".join(fields[:3])}'), (1.0,) * header)
+    values = decode(message).values
+    assert np.all(values[:, :3] == 1.0)
+    assert np.isnan(values[:, 3:]).all()
+    message.layout.dim[-1].label = 'field'
     with pytest.raises(MessageError, match='3 fields received'):
         decode(message)
+
+
+@pytest.mark.parametrize('elements', [6, 7, 9])
+@pytest.mark.parametrize('fields', [8, 13])
+def test_averages_of_older_and_newer_versions_are_read(elements, fields):
+    """Old bags have six header elements; newer versions append elements and fields."""
+    names = [*messages.AMPLITUDE_FIELDS, 'one', 'two', 'three', 'four', 'five'][:fields]
+    values = np.arange(2.0 * 3 * fields).reshape(2, 3, fields)
+    header = (0.5, 2.1, 4.0, 40.0, 96.0, 25.0, 3.0, 7.0, 8.0)[:elements]
+    message = messages.encode_array(
+        values, ('channel', 'order', f'field:{",".join(names)}'), header)
+    got = messages.decode_average('order_amplitude', message)
+    assert got.header == AverageHeader(0.5, 2.1, 4, 40, 96, 25.0, 3 if elements > 6 else 0)
+    assert got.names == messages.AMPLITUDE_FIELDS
+    np.testing.assert_array_equal(got.values, values[..., [
+        names.index(name) for name in messages.AMPLITUDE_FIELDS]])
+    swapped = messages.encode_array(
+        values[..., ::-1], ('channel', 'order', f'field:{",".join(names[::-1])}'), header)
+    np.testing.assert_array_equal(
+        messages.decode_average('order_amplitude', swapped).values, got.values)
+
+
+def test_pulse_errors_without_the_field_used_are_read():
+    message = messages.encode_array(
+        np.ones((5, 3)), ('pulse', 'field:time,error,standard_error'), (0.0, 1.0, 0, 4, 4, 4.0))
+    got = messages.decode_average('pulse_error', message)
+    assert np.isnan(got.values[:, 3]).all()
+    assert np.all(got.values[:, :3] == 1.0)

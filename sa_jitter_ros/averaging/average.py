@@ -39,7 +39,9 @@ class AverageSettings:
     shaft speed; `samples_per_revolution` 0 chooses the number of points of the waveform. With
     `correct_jitter` the pulse errors are recovered from the vibration (block averages only). They
     are expected to be of the size that a keyphasor sampled at `keyphasor_rate` (Hz) causes; 0 is
-    the sampling rate of the vibration. Raises `ParameterError` for values that cannot be used.
+    the sampling rate of the vibration. Up to `maximum_discarded` times N_t discarded trigger
+    cycles may lie between those of an average, if their number is known. Raises `ParameterError`
+    for values that cannot be used.
     """
 
     cycle_length: float = 1.0
@@ -52,10 +54,12 @@ class AverageSettings:
     interpolation: str = 'band_limited'
     correct_jitter: bool = False
     keyphasor_rate: float = 0.0
+    maximum_discarded: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every value."""
-        for name in ('cycle_length', 'revolutions_per_trigger', 'keyphasor_rate'):
+        for name in ('cycle_length', 'revolutions_per_trigger', 'keyphasor_rate',
+                     'maximum_discarded'):
             object.__setattr__(self, name, number(name, getattr(self, name)))
         for name in ('trigger_cycles', 'samples_per_revolution'):
             object.__setattr__(self, name, whole_number(name, getattr(self, name)))
@@ -75,6 +79,10 @@ class AverageSettings:
         if not (math.isfinite(self.keyphasor_rate) and self.keyphasor_rate >= 0.0):
             raise ParameterError(f'keyphasor_rate is {self.keyphasor_rate} Hz: give a positive '
                                  "rate, or 0 for the vibration's")
+        if not 0.0 <= self.maximum_discarded <= 1.0:
+            raise ParameterError(f'maximum_discarded is {self.maximum_discarded}: give the share '
+                                 'of trigger_cycles, 0 to 1, that may be discarded between those '
+                                 'of an average')
         if self.correct_jitter and self.trigger_cycles < 2:
             raise ParameterError('correct_jitter with trigger_cycles 1: pulse errors follow from '
                                  'the difference between cycles; give at least 2')
@@ -218,7 +226,10 @@ class Average:
     cosine whose maximum is at angle 0 has phase 0. `noise` (channel, order) is their standard
     deviation along the radius. `first_angle` is the angle of the first pulse in revolutions of the
     shaft since the start, `pulses` (N_t + 1,) are in s. `discarded_cycles` trigger cycles between
-    the first and the last pulse are not in the average. `cycle_amplitudes` (cycle, channel, order)
+    the first and the last pulse are not in the average: then there are more pulses, those at both
+    ends of every run of consecutive cycles, and `used` (pulse,) says which of them begin a cycle
+    of the average. `cycle_numbers` (N_t,) count from the first cycle, discarded ones included.
+    `cycle_amplitudes` (cycle, channel, order)
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
     angle as those of their mean. `correction` is None unless `correct_jitter` was set.
 
@@ -252,8 +263,16 @@ class Average:
     noise: FloatArray
     first_angle: float
     pulses: FloatArray
+    used: NDArray[np.bool_]
+    cycle_numbers: NDArray[np.int64]
     cycle_amplitudes: ComplexArray
     correction: Correction | None = None
+
+    @property
+    def periods(self) -> FloatArray:
+        """Return the lengths (N_t,) of the trigger cycles in s."""
+        begins = np.flatnonzero(self.used)
+        return np.asarray(self.pulses[begins + 1] - self.pulses[begins])
 
     def __repr__(self) -> str:
         """Return one line: cycles, speed, times, shape of the waveform, orders."""

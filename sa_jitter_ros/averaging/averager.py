@@ -53,12 +53,12 @@ class Averager:
     `synchronous_averager`.
 
     The averages depend on the data only: not on the sizes of the blocks, and not on whether pulses
-    come before or after their samples. An average contains consecutive trigger cycles only, so
-    that `maximum_discarded`, the share of discarded cycles among them, can only be 0. NaN and
-    infinite samples are a gap; double pulses are dropped; cycles with early, late or missing
-    pulses are discarded. `messages` describes what was discarded, `counts` counts it. Samples wait
-    for their pulses, and pulses for their samples, up to `buffer_seconds`: set a limit if one of
-    the two may fail. Raises `ParameterError` for parameters that cannot be used.
+    come before or after their samples. An average contains consecutive trigger cycles only, unless
+    `maximum_discarded` (0 to 1) lets up to this share of N_t discarded ones lie between them.
+    NaN and infinite samples are a gap; stray pulses are dropped; cycles with displaced, late or
+    missing pulses are discarded. `messages` describes what was discarded, `counts` counts it.
+    Samples wait for their pulses, and pulses for their samples, up to `buffer_seconds`: set a
+    limit if one of the two may fail. Raises `ParameterError` for parameters that cannot be used.
 
     A shaft at 25 Hz whose 8th order has an amplitude of 2 m/s^2, in blocks of a second:
 
@@ -97,10 +97,6 @@ class Averager:
         if not np.isfinite(start_time):
             raise ParameterError(f'start_time is {start_time} s: give the time of the first '
                                  'sample on the clock of the pulses')
-        if number('maximum_discarded', maximum_discarded) != 0.0:
-            raise ParameterError(
-                f'maximum_discarded is {maximum_discarded}: an average holds consecutive trigger '
-                "cycles only, give 0; missing_pulses 'bridge' puts in single missing pulses")
         if not buffer_seconds > 0.0:
             raise ParameterError(f'buffer_seconds is {buffer_seconds} s: give a positive time')
         if trigger_cycles is None and averaging != 'block':
@@ -115,7 +111,8 @@ class Averager:
             ratio=ratio, orders=orders, averaging=averaging, angle_law=angle_law,
             trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
             samples_per_revolution=samples_per_revolution, interpolation=interpolation,
-            correct_jitter=correct_jitter, keyphasor_rate=keyphasor_rate or 0.0)
+            correct_jitter=correct_jitter, keyphasor_rate=keyphasor_rate or 0.0,
+            maximum_discarded=maximum_discarded)
         self._stream = StreamingAverager(
             {_SHAFT: settings}, validator=keyphasor.validator(),
             timeline=VibrationTimeline(

@@ -10,8 +10,9 @@
 
 """The corrected average: pulse errors are recovered from the vibration and removed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 import math
 
 import numpy as np
@@ -22,11 +23,14 @@ from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.noise import attenuation
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
-from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
+from sa_jitter_ros.averaging.shaft import ShaftAverager
+from scipy.signal import resample
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_REPETITIONS = 4  # of the recovery where cycles were discarded
+_FINE = 8  # points of a waveform between two of its own, where it is interpolated
 _REACH = 0.06  # largest correction of a pulse, a fraction of a trigger cycle
 # Largest uncertainty of the phase (rad) of an order by that of the expected errors.
 _UNCERTAIN = 1.0
@@ -57,6 +61,10 @@ class CorrectingAverager:
         """Begin again at angle 0; return whether an unfinished average was lost."""
         self._cycles.clear()
         return self._shaft.reset()
+
+    def skip(self, count: int) -> bool:
+        """Leave out discarded cycles; return whether the average goes on (`ShaftAverager`)."""
+        return self._shaft.skip(count)
 
     def change(self, settings: AverageSettings) -> bool:
         """Continue at the same angle with other settings; return whether an average was lost."""
@@ -107,15 +115,13 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     if len(cycles) < 2:
         return _uncorrected(raw, 'pulse errors follow from the difference between trigger cycles '
                                  'and there is one cycle: average more')
-    # The recovery is a model of the linear law, whatever law the settings have.
-    grid = cycle_grid(cycles, method=settings.interpolation)
-    clock = settings.keyphasor_rate or cycles[0].rate
-    recovery = recover_pulse_errors(
-        grid, periods=np.diff(raw.pulses), cycle_length=settings.cycle_length,
-        first_angle=raw.first_angle, additional_orders=settings.orders,
-        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+    if raw.discarded_cycles and not np.isfinite(raw.waveform).all():
+        return _uncorrected(raw, 'cycles were discarded, and what is left has no whole '
+                                 'fundamental cycle that tells what they were: average more')
+    recovery = _recovered(raw, cycles, settings)
+    periods = raw.periods
     corrected, unsure = raw, np.zeros(raw.amplitudes.shape)
-    largest, reach = np.abs(recovery.expected).max(), _REACH * np.diff(raw.pulses).min()
+    largest, reach = np.abs(recovery.expected).max(), _REACH * periods.min()
     if largest > reach:
         none = np.zeros_like(recovery.errors)
         recovery = replace(recovery, accepted=False, errors=none, expected=none,
@@ -125,8 +131,9 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
         amplitudes, unsure = _amplitudes(raw, corrected, recovery)
         corrected = replace(corrected, amplitudes=amplitudes)
-    turned = _mean_phasor(raw.orders, recovery.expected * settings.cycle_length / np.mean(
-        np.diff(raw.pulses)))
+    begins = np.flatnonzero(raw.used)
+    errors = recovery.expected * settings.cycle_length / np.mean(periods)
+    turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
     ratio, error = attenuation(raw.amplitudes, corrected.amplitudes, corrected.noise, turned)
     return Correction(
         corrected.waveform, corrected.amplitudes, corrected.noise,
@@ -184,9 +191,80 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     return np.where(known, amplitudes, np.nan), np.hypot(withheld, unsure_factor)
 
 
-def _mean_phasor(orders: FloatArray, errors: FloatArray) -> FloatArray:
-    """Return the length (order,) of the mean phasor that pulse `errors` (cycles) make."""
-    path = errors[:-1, None] * (1.0 - _U) + errors[1:, None] * _U
+def _recovered(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
+               ) -> PulseErrorRecovery:
+    """Recover the errors of the pulses of `raw` from its trigger `cycles`."""
+    # The recovery is a model of the linear law, whatever law the settings have.
+    grid = cycle_grid(cycles, method=settings.interpolation)
+    clock = settings.keyphasor_rate or cycles[0].rate
+    recover = partial(
+        recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
+        additional_orders=settings.orders,
+        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+    if not raw.discarded_cycles:
+        return recover(grid, periods=raw.periods)
+    return _recovered_over_gaps(raw, grid, recover, settings.cycle_length)
+
+
+def _recovered_over_gaps(raw: Average, grid: FloatArray,
+                         recover: Callable[..., PulseErrorRecovery], cycle_length: float
+                         ) -> PulseErrorRecovery:
+    """
+    Recover the errors where trigger cycles between those of `grid` were discarded.
+
+    The recovery takes consecutive cycles. In the place of the discarded ones it gets what the
+    waveform says of them with the pulse errors on either side. These count half from there: they
+    are found by repetition, so that the made-up cycles tell nothing in the end.
+    """
+    numbers = raw.cycle_numbers
+    every = np.arange(numbers[-1] + 1)
+    lost = np.setdiff1d(every, numbers)
+    periods = np.interp(every, numbers, raw.periods)
+    periods[numbers] = raw.periods
+    whole = np.empty((every.size, *grid.shape[1:]))
+    whole[numbers] = grid
+    known = np.zeros(every.size + 1, np.bool_)
+    known[numbers] = known[numbers + 1] = True
+    pulses = np.flatnonzero(known)
+    errors = np.zeros(every.size + 1)
+    beside = np.zeros(every.size + 1, np.bool_)
+    beside[lost] = beside[lost + 1] = True
+    beside &= known
+    to_cycles = cycle_length / float(np.mean(raw.periods))
+    for _ in range(_REPETITIONS):
+        whole[lost] = _expected_cycles(raw, lost, grid.shape[1], cycle_length, errors * to_cycles)
+        recovery = recover(whole, periods=periods)
+        if not recovery.accepted:
+            break
+        errors[beside] = 2.0 * recovery.errors[beside] - errors[beside]
+        errors[~known] = np.interp(np.flatnonzero(~known), np.flatnonzero(beside), errors[beside])
+    half = np.where(beside[pulses], 2.0, 1.0)
+    found, expected = recovery.errors[pulses], recovery.expected[pulses]
+    return replace(
+        recovery, errors=found - found.mean(), expected=expected - expected.mean(),
+        standard_errors=recovery.standard_errors[pulses] * np.sqrt(half),
+        resolved=recovery.resolved[pulses], covariance=recovery.covariance[:, pulses] * half)
+
+
+def _expected_cycles(raw: Average, numbers: NDArray[np.int64], samples: int, cycle_length: float,
+                     errors: FloatArray) -> FloatArray:
+    """
+    Return what the waveform says of cycles of these numbers, (cycle, sample, channel).
+
+    `errors` (pulse,) are those of all pulses in fundamental cycles.
+    """
+    fine = resample(raw.waveform, _FINE * raw.waveform.shape[1], axis=1)
+    u = np.arange(samples) / samples
+    turns = (raw.first_angle + cycle_length * (numbers[:, None] + u)
+             + errors[numbers, None] * (1.0 - u) + errors[numbers + 1, None] * u)
+    points = np.arange(fine.shape[1] + 1) / fine.shape[1]
+    return np.stack([np.interp(np.mod(turns, 1.0), points, np.append(row, row[0]))
+                     for row in fine], axis=-1)
+
+
+def _mean_phasor(orders: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
+    """Return the length (order,) of the mean phasor of cycles with these errors (cycles)."""
+    path = begin[:, None] * (1.0 - _U) + end[:, None] * _U
     phasors = np.exp(2j * np.pi * orders[:, None, None] * path) @ _U_WEIGHT
     return np.asarray(np.abs(phasors.mean(axis=1)))
 
@@ -203,8 +281,16 @@ def _average_again(raw: Average, cycles: Sequence[CycleSamples],
                    settings: AverageSettings, pulses: FloatArray) -> Average:
     """Return the average of the same cycles between corrected pulses."""
     again = replace(settings, samples_per_revolution=raw.waveform.shape[1],
-                    trigger_cycles=raw.trigger_cycles)
-    average = average_cycles(
-        (replace(cycle, pulses=pulses, first=index) for index, cycle in enumerate(cycles)),
-        again, first_cycle=round(raw.first_angle / settings.cycle_length))
+                    trigger_cycles=raw.trigger_cycles, maximum_discarded=1.0)
+    begins = np.flatnonzero(raw.used)
+    first = round(raw.first_angle / settings.cycle_length)
+    shaft, average, run = ShaftAverager(again, first_cycle=first), None, 0
+    for index, cycle in enumerate(cycles):
+        if index and begins[index] != begins[index - 1] + 1:
+            shaft.skip(int(raw.cycle_numbers[index] - raw.cycle_numbers[index - 1]) - 1)
+            run = begins[index]
+        stop = run + int(np.argmin(raw.used[run:])) + 1
+        average = shaft.update(replace(
+            cycle, pulses=pulses[run:stop], first=int(begins[index] - run)))
+    assert average is not None
     return replace(average, sequence=raw.sequence)

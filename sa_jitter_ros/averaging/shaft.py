@@ -68,6 +68,24 @@ class ShaftAverager:
         self._start()
         return lost
 
+    def skip(self, count: int) -> bool:
+        """
+        Leave out `count` trigger cycles that were discarded; the angle runs on over them.
+
+        Returns False, and does nothing, if they are more than the average may lack.
+        """
+        most = self.settings.trigger_cycles
+        begun = self._cycle + self._taken - self._counted  # that of the next cycle
+        numbers = [*self._numbers, *range(self._cycle, begun), begun + count][-most:]
+        if (not self.settings.maximum_discarded or numbers[-1] - numbers[0] + 1 - len(numbers)
+                > self.settings.maximum_discarded * most):
+            return False
+        self._average_waiting()
+        self._cycle += count
+        self._full = False
+        self._expect_from(self._angle(self._cycle))
+        return True
+
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
         if not self._unfinished:
@@ -148,11 +166,13 @@ class ShaftAverager:
             amplitudes = np.where(beyond[:, None], np.nan, amplitudes)
         if not self._counted:
             self._expect_from(self._angle(self._cycle))
-            self._pulses.append(float(cycles.edges[0]))
         self._add_points(first, points, self._angle(self._cycle + count))
         self._amplitude_mean.update(amplitudes)
         self._remember(amplitudes)
-        self._pulses.extend(cycles.edges[1:].tolist())
+        edges = cycles.edges.tolist()
+        self._begins.extend(edges[:-1])
+        self._ends.extend(edges[1:])
+        self._numbers.extend(range(self._cycle, self._cycle + count))
         self._counted += count
         self._cycle += count
 
@@ -224,11 +244,14 @@ class ShaftAverager:
         self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))
         self._amplitudes: ComplexArray = np.empty((0, 0, 0), np.complex128)
         self._end = 0  # of those of cycles in `_amplitudes`
-        self._pulses: deque[float] = deque(maxlen=settings.trigger_cycles + 1)
+        # Of the latest N_t cycles: their pulses, and their numbers since the angle was 0.
+        self._begins: deque[float] = deque(maxlen=settings.trigger_cycles)
+        self._ends: deque[float] = deque(maxlen=settings.trigger_cycles)
+        self._numbers: deque[int] = deque(maxlen=settings.trigger_cycles)
         self._wave: FloatArray = np.empty((0, 0))
         self._next_point = 0
         self._full = False  # the waveform has all points, but its end is not reached
-        self._first_whole = 0
+        self._whole: deque[int] = deque()  # numbers of the fundamental cycles in a sliding mean
 
     def _remember(self, amplitudes: ComplexArray) -> None:
         """Append the amplitudes of cycles to those of the window, in memory never reused."""
@@ -293,8 +316,9 @@ class ShaftAverager:
 
     def _add_waves(self, waves: FloatArray) -> None:
         """Add whole fundamental cycles (cycle, angle, channel) to the mean."""
-        if not self._wave_mean.count:
-            self._first_whole = self._next_point // self._points - len(waves)
+        if self.settings.averaging == 'sliding':
+            end = self._next_point // self._points
+            self._whole.extend(range(end - len(waves), end))
         self._wave_mean.update(waves)
 
     def _slide(self) -> None:
@@ -303,10 +327,10 @@ class ShaftAverager:
             return
         assert isinstance(self._amplitude_mean, SlidingMean)
         self._amplitude_mean.forget(self._amplitude_mean.count - self.settings.trigger_cycles)
-        whole = math.ceil(self._angle(self._cycle - self.settings.trigger_cycles))
-        outside = min(max(whole - self._first_whole, 0), self._wave_mean.count)
-        self._wave_mean.forget(outside)
-        self._first_whole += outside
+        whole = math.ceil(self._angle(self._numbers[0]))
+        while self._whole and self._whole[0] < whole:
+            self._whole.popleft()
+        self._wave_mean.forget(self._wave_mean.count - len(self._whole))
 
     def _result(self) -> Average:
         settings = self.settings
@@ -318,26 +342,36 @@ class ShaftAverager:
         if settings.averaging == 'exponential':
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
-        pulses, cycles = np.array(self._pulses), self._window()
+        pulses, used, seconds = self._edges()
+        cycles, numbers = self._window(), np.array(self._numbers)
         average = Average(
-            start_time=self._pulses[0], end_time=self._pulses[-1], sequence=self._sequence,
-            trigger_cycles=len(cycles), fundamental_cycles=count, discarded_cycles=0,
-            trigger_speed=((pulses.size - 1) * settings.revolutions_per_trigger
-                           / (self._pulses[-1] - self._pulses[0])),
+            start_time=float(pulses[0]), end_time=float(pulses[-1]), sequence=self._sequence,
+            trigger_cycles=len(cycles), fundamental_cycles=count,
+            discarded_cycles=int(numbers[-1] - numbers[0]) + 1 - numbers.size,
+            trigger_speed=numbers.size * settings.revolutions_per_trigger / seconds,
             angle=np.arange(shape[0]) / max(shape[0], 1), waveform=waveform.T,
             standard_error=error.T, orders=np.array(settings.orders),
             amplitudes=self._amplitude_mean.mean, noise=self._estimated_noise(),
-            first_angle=float(self._angle(self._cycle - len(cycles))), pulses=pulses,
-            cycle_amplitudes=cycles)
+            first_angle=float(self._angle(self._numbers[0])), pulses=pulses, used=used,
+            cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles)
         self._sequence += 1
         return average
+
+    def _edges(self) -> tuple[FloatArray, NDArray[np.bool_], float]:
+        """Return the pulses (s), which of them begin a cycle, and the time of all cycles."""
+        begins, ends = np.array(self._begins), np.array(self._ends)
+        breaks = np.flatnonzero(begins[1:] != ends[:-1])
+        pulses = np.insert(np.append(begins, ends[-1]), breaks + 1, ends[breaks])
+        used = np.insert(np.append(np.ones(begins.size, np.bool_), False), breaks + 1, False)
+        gaps = float(np.sum(begins[breaks + 1] - ends[breaks]))
+        return pulses, used, float(pulses[-1] - pulses[0]) - gaps
 
     def _estimated_noise(self) -> FloatArray:
         """Return the noise of the mean; a sliding window renews it after every eighth of it."""
         if self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
             amplitudes = self._window()
-            angles = cycle_length * (self._cycle - np.arange(len(amplitudes), 0, -1))
+            angles = cycle_length * np.array(self._numbers)
             self._noise = radial_noise(without_leakage(amplitudes, orders, cycle_length, angles))
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise

@@ -35,10 +35,11 @@ from sa_jitter_ros.samples import SampleBlock
 FloatArray = NDArray[np.float64]
 
 
-#: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here. `epoch` is how often
-#: time ran back before; `elapsed` the time (s) since the first pulse, without the steps back.
+#: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here; `skipped` are the
+#: discarded ones since the pulse before, 0 if their number is not known. `epoch` is how often time
+#: ran back before; `elapsed` the time (s) since the first pulse, without the steps back.
 TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.int64),
-                    ('starts_run', np.bool_)])
+                    ('skipped', np.int64), ('starts_run', np.bool_)])
 
 
 class TriggerQueue:
@@ -90,7 +91,8 @@ class StreamingAverager:
     `take_messages` returns a line of text for each problem since its last call. Samples wait for
     their pulses, and pulses for their samples, for `timeline.buffer_seconds`. Where the trigger
     cycles are interrupted, an unfinished block average is dropped and counted, or returned with
-    `keep_unfinished`.
+    `keep_unfinished`; or it goes on behind the discarded cycles, as `maximum_discarded` of its
+    settings allows.
 
     Two shafts from one keyphasor, with 100 cycles at 10 Hz:
 
@@ -122,6 +124,7 @@ class StreamingAverager:
         self._next = 0
         self._run = 0  # where the run of the next cycle begins
         self._pulse_epoch = 0
+        self._last_count = 0  # of the trigger cycles at the last pulse
         self._lead = np.inf  # s of samples before a cycle that its interpolation reads
         self._speed = 0, 0.0  # cycles and seconds since the last take_speed
         self._messages: list[str] = []
@@ -217,6 +220,13 @@ class StreamingAverager:
         items['time'], items['epoch'], items['starts_run'] = times, epochs, triggers.starts_run
         items['starts_run'][0] |= epochs[0] != self._pulse_epoch
         items['starts_run'][1:] |= epochs[1:] != epochs[:-1]
+        items['skipped'] = 0
+        if items['starts_run'].any():
+            # Behind a gap of unknown length the count begins at 0 again.
+            skipped = np.diff(triggers.count, prepend=self._last_count)
+            skipped[(np.diff(epochs, prepend=self._pulse_epoch) != 0) | triggers.restarted] = 0
+            items['skipped'] = np.maximum(skipped, 0)
+        self._last_count = int(triggers.count[-1])
         self._pulse_epoch = int(epochs[-1])
         steps = items['elapsed']
         steps[1:] = times[1:] - times[:-1]
@@ -224,7 +234,7 @@ class StreamingAverager:
             last = self._triggers.items[-1]
             steps[0] = last['elapsed'] + max(times[0] - last['time'], 0.0)
         else:
-            steps[0], items['starts_run'][0] = 0.0, True
+            steps[0], items['starts_run'][0], items['skipped'][0] = 0.0, True, 0
         np.maximum(steps[1:], 0.0, out=steps[1:])
         np.cumsum(steps, out=steps)
         self._triggers.append(items)
@@ -403,21 +413,24 @@ class StreamingAverager:
                        self._speed[1] + float(pulses[first + count] - pulses[first]))
 
     def _discard(self, count: int, why: str) -> None:
-        """Discard the next `count` cycles; the angle begins at 0 behind them."""
+        """Discard the next `count` cycles."""
         self.counts.cycles_dropped += count
         self._messages.append(f'{why}: {count} trigger cycle{"s" if count > 1 else ""} discarded')
         self._next += count
         self._triggers.items['starts_run'][self._next:self._next + 1] = True
-        self._begin_run()
+        self._begin_run(count)
 
     def _break_run(self) -> None:
         """Begin a run at the next pulse, where no trigger cycle ends."""
         self._next += 1
-        self._begin_run()
+        self._begin_run(int(self._triggers.items['skipped'][self._next]))
 
-    def _begin_run(self) -> None:
+    def _begin_run(self, skipped: int = 0) -> None:
+        """Begin a run at the next pulse, behind so many discarded cycles if it is known."""
         self._run, self._lead = self._next, np.inf
         for name, shaft in self.shafts.items():
+            if skipped and shaft.skip(skipped):
+                continue
             average = shaft.finish() if self._keep_unfinished else None
             if average is not None:
                 self._due.append((name, average))

@@ -139,7 +139,8 @@ def processes(plan: Plan, *, live: bool = False) -> dict[str, dict[str, object]]
                      'pulses_per_revolution': plan.pulses_per_revolution,
                      'pulses_per_trigger': plan.pulses_per_trigger}
         nodes['synchronous_averager'] = {
-            **keyphasor, 'missing_teeth': plan.missing_teeth, f'{plan.shaft}.ratio': plan.ratio,
+            **keyphasor, 'missing_teeth': plan.missing_teeth, 'maximum_discarded': 0.5,
+            f'{plan.shaft}.ratio': plan.ratio,
             f'{plan.shaft}.orders': plan.orders, 'correct_jitter': True}
         nodes['jitter_predictor'] = {
             **keyphasor, 'trigger_speed': plan.speed, 'ratio': plan.ratio, 'orders': plan.orders,

@@ -51,7 +51,7 @@ class ShaftOutput:
         """Publish one average."""
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
-            average.fundamental_cycles, average.trigger_speed)
+            average.fundamental_cycles, average.trigger_speed, average.discarded_cycles)
         self._send('synchronous_average', header, average.waveform)
         self._send('standard_error', header, average.standard_error)
         self._send('order_amplitude', header, amplitude_table(average), AMPLITUDE_FIELDS)
@@ -71,8 +71,8 @@ class ShaftOutput:
         elif correction is not None:
             self._send('corrected_average', header, correction.waveform)
             self._send('pulse_error', header, np.stack(
-                (average.pulses, correction.pulse_errors, correction.standard_errors), axis=1),
-                PULSE_ERROR_FIELDS)
+                (average.pulses, correction.pulse_errors, correction.standard_errors,
+                 average.used), axis=1), PULSE_ERROR_FIELDS)
         waveform = average.waveform if correction is None else correction.waveform
         if np.isfinite(waveform).all():
             self._indicate(header, waveform)

@@ -48,6 +48,9 @@ PARAMETERS = (
     Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
               unit='s', minimum=0.0),
     TRIGGER_CYCLES,
+    Parameter('maximum_discarded', 0.0, 'largest number of discarded trigger cycles between those '
+              'of an average, as a share of trigger_cycles; 0: a discarded cycle ends the average',
+              minimum=0.0, maximum=1.0),
     Parameter('averaging', 'block', 'block: an average of every trigger_cycles cycles; sliding, '
               'exponential: an average after each cycle', choices=AVERAGING),
     Parameter('angle_law', 'linear', 'how the angle runs between pulses', choices=ANGLE_LAWS),
@@ -95,7 +98,7 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
             samples_per_revolution=values[f'{name}.samples_per_revolution'],
             **{key: values[key] for key in (
                 'trigger_cycles', 'averaging', 'angle_law', 'interpolation', 'correct_jitter',
-                'keyphasor_rate')})
+                'keyphasor_rate', 'maximum_discarded')})
     except ParameterError as error:
         raise ParameterError(f'{name}: {error}') from None
 

@@ -27,7 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.json_values import json_values
-from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage, ResidualMessage
+from sa_jitter_ros.nodes.messages import (
+    AverageMessage, PredictionMessage, PULSE_ERROR_FIELDS, ResidualMessage)
 
 FloatArray = NDArray[np.float64]
 Json = Any
@@ -107,7 +108,7 @@ class PulseErrors:
     """The latest pulse errors (pulse, `PULSE_ERROR_FIELDS`) of one shaft."""
 
     def __init__(self) -> None:
-        self.values: FloatArray = np.empty((0, 3))
+        self.values: FloatArray = np.empty((0, len(PULSE_ERROR_FIELDS)))
 
     def add(self, values: FloatArray) -> FloatArray:
         """Add those of an average, which replace earlier ones of the same time; return all."""

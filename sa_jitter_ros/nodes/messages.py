@@ -40,7 +40,7 @@ ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 AMPLITUDE_FIELDS = (
     'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',
     'attenuation', 'attenuation_standard_error', 'noise_standard_deviation')
-PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error')
+PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
 PREDICTION_FIELDS = (
     'order', 'mean_attenuation', 'variance', 'standard_deviation',
     'quantile_05', 'quantile_50', 'quantile_95')
@@ -58,7 +58,11 @@ PULSE_TYPES: dict[str, type] = {
 
 @dataclass(frozen=True)
 class AverageHeader:
-    """Times (s), numbers of cycles and `mean_trigger_speed` (Hz, tach shaft) of an average."""
+    """
+    Times (s), numbers of cycles and `mean_trigger_speed` (Hz, tach shaft) of an average.
+
+    `discarded_cycles` trigger cycles between the first and the last one are not in it.
+    """
 
     start_time: float
     end_time: float
@@ -66,6 +70,7 @@ class AverageHeader:
     trigger_cycles: int
     fundamental_cycles: int
     mean_trigger_speed: float
+    discarded_cycles: int = 0
 
 
 @dataclass(frozen=True)
@@ -196,22 +201,49 @@ def encode_average(kind: str, average: AverageMessage) -> Float64MultiArray:
 _AVERAGE_FIELDS = {'order_amplitude': AMPLITUDE_FIELDS, 'pulse_error': PULSE_ERROR_FIELDS}
 
 
-def _with_fields(values: FloatArray, fields: tuple[str, ...]) -> FloatArray:
-    if values.shape[-1] != len(fields):
+# Fields of the first version, by the last one of this version.
+_FIRST_FIELDS = {AMPLITUDE_FIELDS[-1]: 8, PULSE_ERROR_FIELDS[-1]: 3, PREDICTION_FIELDS[-1]: 7,
+                 RESIDUAL_FIELDS[-1]: 6}
+
+
+def _decode_result(message: Any, labels: tuple[str, ...], header_size: int
+                   ) -> tuple[list[float], FloatArray, tuple[str, ...]]:
+    """Return header elements, NaN for those that an older writer lacks, values and names."""
+    header, values, names = decode_array(message, labels, None)
+    missing = [math.nan] * max(header_size - header.size, 0)
+    return header.tolist()[:header_size] + missing, values, names
+
+
+def _with_fields(values: FloatArray, names: tuple[str, ...], fields: tuple[str, ...]
+                 ) -> FloatArray:
+    """
+    Return the known fields, by name where there are names, NaN for those that are missing.
+
+    Without names there have to be those of the first version.
+    """
+    if names == fields:
+        return values
+    if not names and values.shape[-1] < _FIRST_FIELDS[fields[-1]]:
         raise MessageError(f'{values.shape[-1]} fields received, {len(fields)} expected: '
                            f'{", ".join(fields)}')
-    return values
+    found = np.full((*values.shape[:-1], len(fields)), np.nan)
+    for place, name in enumerate(names or fields[:values.shape[-1]]):
+        if name in fields:
+            found[..., fields.index(name)] = values[..., place]
+    return found
 
 
 def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
-    """Decode an average's array; `kind` is the topic's name."""
-    header, values, names = decode_array(message, _AVERAGE_LABELS[kind], 6)
+    """Decode an average's array, of this or another version; `kind` is the topic's name."""
+    header, values, names = _decode_result(message, _AVERAGE_LABELS[kind], 7)
     if kind in _AVERAGE_FIELDS:
-        values, names = _with_fields(values, _AVERAGE_FIELDS[kind]), _AVERAGE_FIELDS[kind]
-    start, end, sequence, cycles, fundamental, speed = (float(item) for item in header)
+        values = _with_fields(values, names, _AVERAGE_FIELDS[kind])
+        names = _AVERAGE_FIELDS[kind]
+    start, end, sequence, cycles, fundamental, speed, discarded = header
     return AverageMessage(
         AverageHeader(start, end, whole('sequence', sequence), whole('trigger cycles', cycles),
-                      whole('fundamental cycles', fundamental), speed),
+                      whole('fundamental cycles', fundamental), speed,
+                      0 if math.isnan(discarded) else whole('discarded cycles', discarded)),
         values, names)
 
 
@@ -223,9 +255,9 @@ def encode_prediction(prediction: PredictionMessage) -> Float64MultiArray:
 
 def decode_prediction(message: Float64MultiArray) -> PredictionMessage:
     """Decode a prediction."""
-    header, values, _ = decode_array(message, ('order', 'field'), 6)
-    speed, rate, cycles, ratio, pulse_error, noise = (float(item) for item in header)
-    return PredictionMessage(_with_fields(values, PREDICTION_FIELDS), speed, rate,
+    header, values, names = _decode_result(message, ('order', 'field'), 6)
+    speed, rate, cycles, ratio, pulse_error, noise = header
+    return PredictionMessage(_with_fields(values, names, PREDICTION_FIELDS), speed, rate,
                              whole('trigger cycles', cycles), ratio, pulse_error, noise)
 
 
@@ -237,7 +269,7 @@ def encode_residual(residual: ResidualMessage) -> Float64MultiArray:
 
 def decode_residual(message: Float64MultiArray) -> ResidualMessage:
     """Decode a residual."""
-    header, values, _ = decode_array(message, ('order', 'field'), 4)
-    count, chi2, p_value, rms = (float(item) for item in header)
-    return ResidualMessage(_with_fields(values, RESIDUAL_FIELDS), whole('acquisitions', count),
-                           chi2, p_value, rms)
+    header, values, names = _decode_result(message, ('order', 'field'), 4)
+    count, chi2, p_value, rms = header
+    return ResidualMessage(_with_fields(values, names, RESIDUAL_FIELDS),
+                           whole('acquisitions', count), chi2, p_value, rms)

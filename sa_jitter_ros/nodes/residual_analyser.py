@@ -73,7 +73,7 @@ class ResidualAnalyser(MonitoringNode):
         self._step: Callable[[], None] = self._compare
         self._added: set[str] = set()  # names of the effects that were set in the predictor
         self._verdict = self._activity = ''
-        self._batches = self._uncorrected = 0
+        self._batches = self._uncorrected = self._interrupted = 0
         self._predictor_name = self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
         shaft = self._values['shaft']
@@ -100,10 +100,14 @@ class ResidualAnalyser(MonitoringNode):
     # --- messages ---
 
     def _on_average(self, message: Float64MultiArray) -> None:
-        average = average_of(decode_average('order_amplitude', message))
+        decoded = decode_average('order_amplitude', message)
+        average = average_of(decoded)
         self._average_flow.came()
         self._average_flow.allowance = average.end_time - average.start_time
         corrected = bool(np.isfinite(average.attenuation).any())
+        if decoded.header.discarded_cycles:  # the prediction is that of consecutive cycles
+            self._interrupted += 1
+            return
         if corrected:
             self._batch.add(average)
         else:
@@ -115,13 +119,16 @@ class ResidualAnalyser(MonitoringNode):
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)
-        count, cycles = len(received.values), received.header.trigger_cycles
-        if count != cycles + 1 or not np.isfinite(received.values[:, 0]).all():
+        if received.header.discarded_cycles:
+            return
+        values = received.values[:, :3]  # time, error and its standard error
+        count, cycles = len(values), received.header.trigger_cycles
+        if count != cycles + 1 or not np.isfinite(values[:, 0]).all():
             raise MessageError(f'{count} pulses for {cycles} trigger cycles: send finite times, '
                                'for one pulse more than cycles')
-        if not np.isfinite(received.values).all():  # the vibration did not resolve all pulses
+        if not np.isfinite(values).all():  # the vibration did not resolve all pulses
             return
-        self._pulses[received.header.start_time] = received.values
+        self._pulses[received.header.start_time] = values
         while len(self._pulses) > 2 * self._batch.size + 10:
             del self._pulses[next(iter(self._pulses))]
 
@@ -305,10 +312,11 @@ class ResidualAnalyser(MonitoringNode):
         values = {'shaft': self._values['shaft'], 'averages': str(count),
                   'batches': str(self._batches), 'verdict': self._verdict,
                   'uncorrected': str(self._uncorrected),
+                  'averages_with_discarded_cycles': str(self._interrupted),
                   'effects_set': ', '.join(sorted(self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
-        if not (count or self._batches or self._uncorrected):
+        if not (count or self._batches or self._uncorrected or self._interrupted):
             topic = self.resolve_topic_name(f"{self._values['shaft']}/order_amplitude")
             return (f'nothing received on {topic} yet: is the parameter shaft one of the '
                     'averager?', values)

@@ -54,6 +54,7 @@ _FEW_MARKS = 12
 _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
 _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
+_LONGEST_GAP = 1000.0  # revolutions
 _FITS = 0.1  # tolerance with which a pulse after a step of time fits
 _NEVER = 1 << 62
 _NONE: FloatArray = np.empty(0)
@@ -364,12 +365,17 @@ class IntervalJudge:
             self._learn_marks()
             return
         self.counts['late'] += 1
+        if not known and mark == 1 and after is not None:
+            passed = self._slots_in(gap, model.level)
+            if passed and passed == self._slots_in(gap, after):
+                slots, steps = self._passed(passed)
+                known = True
         if not known and (self._rehearses or not self._lock_is_plain):
             self._lose()
             return
         if after is not None and abs(after - model.level) > tolerance:
             self.counts['relearnt'] += 1
-        pulse = self._next(slots, level if mark == 1 and known else math.nan)
+        pulse = self._next(slots, level if len(slots) == 1 and known else math.nan)
         if after is not None:
             model.jump(after)
         self._counter.begin(pulse, 0, passed=steps if known else None)
@@ -400,10 +406,27 @@ class IntervalJudge:
         self._remember(pulse)
         self.counts['accepted'] += 1
         self.confirmed = pulse
-        self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
-                   [pulse] * len(slots))
+        if len(slots) > self._lock.steps.size:  # a gap of more than a revolution
+            self._marks, self._levels, self._times = [], [], []
+        else:
+            self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
+                       [pulse] * len(slots))
         self._slot = (slots[-1] + 1) % self._lock.steps.size
         return pulse
+
+    def _slots_in(self, gap: float, level: float) -> int:
+        """Return how many slots a gap (s) of intervals of this level has, 0 if not a whole one."""
+        assert self._lock is not None
+        widths = np.roll(self._lock.widths, -self._slot)
+        revolution = float(widths.sum())
+        turns, rest = divmod(gap / math.exp(level), revolution)
+        if turns > _LONGEST_GAP:
+            return 0
+        ends = np.append(0.0, np.cumsum(widths))
+        nearest = int(np.argmin(np.abs(ends - rest)))
+        if abs(float(ends[nearest]) - rest) > _NEAR_WHOLE:
+            return 0
+        return int(turns) * widths.size + nearest
 
     def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
         """Whether intervals of this level make the gap (s) the whole number of teeth."""

@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 # Logarithms of how unlikely they are.
-STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 2.0, 12.0
+STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
 _DROPPED = 16.0
@@ -159,7 +159,7 @@ class PathRules:
 
 def likely(paths: list[Path]) -> list[Path]:
     """Return the paths that are not out of the question, of those sorted by cost."""
-    return [path for path in paths if path.cost <= paths[0].cost + MARGIN]
+    return [path for path in paths if path.cost < paths[0].cost + MARGIN]
 
 
 def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRAY_OF_ONE

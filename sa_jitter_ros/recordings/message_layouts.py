@@ -44,12 +44,13 @@ _FOLLOW = 0.05
 _EVIDENCE = 13.0
 
 
-def decode_array(message: Any, labels: tuple[str, ...],
-                 header_size: int) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
+def decode_array(message: Any, labels: tuple[str, ...], header_size: int | None
+                 ) -> tuple[FloatArray, FloatArray, tuple[str, ...]]:
     """
     Decode a MultiArray.
 
-    Returns header elements, values in the shape of the layout, names of the last dimension.
+    Returns header elements, values in the shape of the layout, names of the last dimension. With
+    `header_size` None there may be any number of header elements.
     Raises `MessageError` if labels, number of dimensions, size or offset do not fit.
 
     >>> from types import SimpleNamespace as Message
@@ -64,6 +65,8 @@ def decode_array(message: Any, labels: tuple[str, ...],
         raise MessageError(f'dimensions {list(got)} received, {list(labels)} expected: '
                            'label layout.dim with the expected names')
     shape = tuple(dim.size for dim in layout.dim)
+    if header_size is None:
+        header_size = layout.data_offset
     if layout.data_offset != header_size:
         raise MessageError(f'data_offset {layout.data_offset} received, {header_size} expected: '
                            'put exactly that many header elements in front of the array')
