@@ -329,7 +329,7 @@ def main(args: Sequence[str] | None = None) -> int:
         report(plan, watcher, options.output)
         if options.live:
             watcher.destroy_node()  # it would keep all results
-            print('machine and page stay until Ctrl-C', flush=True)
+            print('the machine runs on and the page stays until Ctrl-C', flush=True)
             ended = stay(children)
             if ended:
                 raise SaJitterError(f'a node ended with status {ended}')
