@@ -47,6 +47,8 @@ from sa_jitter_ros.commands import design
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS
+from sa_jitter_ros.nodes.tach_detector import JOINT_TYPE
+from sa_jitter_ros.pulses.sampled_angle import AngleState
 from sa_jitter_ros.recordings.fields import FIELDS
 from scipy.io import wavfile
 import yaml
@@ -465,7 +467,8 @@ def known_words():
     known = {*NODES, *COMMANDS, *INDICATORS, *FIELDS, *messages.AMPLITUDE_FIELDS,
              *messages.PULSE_ERROR_FIELDS, *messages.PREDICTION_FIELDS,
              *messages.RESIDUAL_FIELDS,
-             *messages.SAMPLE_TYPES, *messages.PULSE_TYPES, *diagnostic_keys()}
+             *messages.SAMPLE_TYPES, *messages.PULSE_TYPES, *diagnostic_keys(),
+             *AngleState.__dataclass_fields__, JOINT_TYPE}
     for name in NODES:
         for key, (descriptor, _) in parameters_of(name).items():
             known |= {key, key.removeprefix('<shaft>.')}
@@ -493,7 +496,7 @@ def diagnostic_keys():
 
 # Other words in backticks: ROS's own, and the dimensions of arrays.
 ORDINARY = {
-    'ros2', 'foxglove_bridge', 'nan', 'diagnostic_aggregator', 'diagnostics_agg',
+    'ros2', 'foxglove_bridge', 'joint_states', 'nan', 'diagnostic_aggregator', 'diagnostics_agg',
     *(f'config/{path.name}' for path in (ROOT / 'config').iterdir()),
     'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'indicator', 'time_ref', 'source',
     'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',

@@ -11,15 +11,21 @@
 """The tach detector node publishes the pulses that the library finds, in spite of faults."""
 
 from bench import NodeBench
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import numpy as np
 import pytest
+from rclpy.parameter import Parameter
+import sa_jitter_ros as sa
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS
+from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sa_jitter_ros.recordings.message_layouts import encode_time
 from sa_jitter_ros.samples import SampleBlock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 
 RATE = 5000.0
 SPEED = 21.3
@@ -246,3 +252,86 @@ def test_times_too_large_for_a_reference_are_counted_and_named(bench):
     assert 'std_msgs/Float64MultiArray' in text
     found = KeyphasorDetector().update(waveform(1.0), 0.0, RATE)
     assert int(values['pulses_dropped']) == len(found)
+
+
+TURN = 2.0 * np.pi
+
+
+# --- joints -------------------------------------------------------------------------------------
+
+def joint_state(time, **positions):
+    """Return a message with the positions (rad) of joints."""
+    message = JointState(name=list(positions), position=list(positions.values()))
+    message.header.stamp.sec, message.header.stamp.nanosec = encode_time(time)
+    return message
+
+
+def test_joint_gives_corrected_orders(ros_graph, rng):
+    """From positions at 1 kHz, of 14 bits and with noisy stamps, to the true amplitudes."""
+    speed, rate, seconds, stamp = 20.0, 4000.0, 2.6, 1e-4
+    ros_graph.add(TachDetector, parameter_overrides=[
+        Parameter('tach_waveform_type', value='sensor_msgs/JointState'),
+        Parameter('joint', value='wrist')])
+    ros_graph.add(SynchronousAverager, parameter_overrides=[
+        Parameter('trigger_cycles', value=48), Parameter('shaft.orders', value=[19.0, 38.0]),
+        Parameter('correct_jitter', value=True),
+        Parameter('keyphasor_rate', value=1.0 / (np.sqrt(12.0) * stamp))])
+    amplitudes = ros_graph.capture('shaft/order_amplitude', Float64MultiArray)
+    status = ros_graph.capture('/diagnostics', DiagnosticArray)
+    joints = ros_graph.publisher('tach_waveform', JointState)
+    vibration = ros_graph.publisher('vibration', Float64MultiArray)
+    for start in np.arange(0.0, seconds, 0.1):
+        time = start + np.arange(round(0.1 * rate)) / rate
+        samples = (np.cos(TURN * 19.0 * speed * time) + 0.5 * np.cos(TURN * 38.0 * speed * time)
+                   + rng.normal(0.0, 0.1, time.size))
+        vibration.publish(messages.encode_samples(SampleBlock(
+            samples[None], start, rate, round(start * rate))))
+        for instant in start + np.arange(100) / 1e3:
+            angle = TURN * np.rint(speed * instant * 2.0**14) / 2.0**14
+            joints.publish(joint_state(instant + rng.normal(0.0, stamp), elbow=0.3,
+                                       wrist=(angle + np.pi) % TURN - np.pi))
+        ros_graph.settle()
+    assert ros_graph.spin(lambda: amplitudes)
+    table = messages.decode_average('order_amplitude', amplitudes[0]).values[0]
+    np.testing.assert_allclose(table[:, 3], (1.0, 0.5), rtol=0.02)
+    status.clear()
+    assert ros_graph.spin(lambda: any(
+        item.status[0].name == 'tach_detector' for item in status))
+    values = {item.key: item.value for item in next(
+        each.status[0] for each in status if each.status[0].name == 'tach_detector').values}
+    assert float(values['stamp_noise_std']) == pytest.approx(stamp, rel=0.3)
+    assert values['joint'] == 'wrist'
+    # Declared as the node shows it, the error predicts what the raw amplitudes lose.
+    predicted = sa.predict(
+        keyphasor_rate=1e3, trigger_speed=speed, trigger_cycles=48, orders=[19.0, 38.0],
+        jitter_distribution='normal', jitter_std=float(values['pulse_error_std']))
+    scatter = np.hypot(predicted.standard_deviation, table[:, 6])
+    assert np.all(np.abs(table[:, 5] - predicted.mean_attenuation) < 3.0 * scatter)
+    assert predicted.mean_attenuation[1] < 0.98
+
+
+def test_joint_is_named_where_it_is_missing(ros_graph):
+    node = ros_graph.add(TachDetector, parameter_overrides=[
+        Parameter('tach_waveform_type', value='sensor_msgs/msg/JointState')])
+    publisher = ros_graph.publisher('tach_waveform', JointState)
+    publisher.publish(joint_state(0.0, elbow=0.3, wrist=0.2))
+    assert ros_graph.spin(lambda: node.counts['messages_rejected'] == 1)
+    assert 'joint is empty, and the message has 2 joints (elbow, wrist)' in node._last_warning
+    publisher.publish(joint_state(0.0, wrist=0.2))
+    assert ros_graph.spin(lambda: node._joint.joint == 'wrist')
+    publisher.publish(joint_state(0.1, elbow=0.3))
+    assert ros_graph.spin(lambda: node._joint.others == 1)
+    assert node.summary()[0] == 'joint wrist has not passed a mark yet: does it turn?'
+    publisher.publish(JointState(name=['wrist']))
+    assert ros_graph.spin(lambda: node.counts['messages_rejected'] == 2)
+    assert '0 positions for 1 joints' in node._last_warning
+
+
+def test_waveform_type_replaces_that_of_the_vibration(ros_graph):
+    node = ros_graph.add(TachDetector, parameter_overrides=[
+        Parameter('tach_waveform_type', value='std_msgs/Float32MultiArray'),
+        Parameter('sample_rate', value=1e3)])
+    assert node._samples.message_type.__name__ == 'Float32MultiArray'
+    with pytest.raises(ParameterError, match=r'tach_waveform_type is .sensor_msgs/Joy.'):
+        ros_graph.add(TachDetector, parameter_overrides=[
+            Parameter('tach_waveform_type', value='sensor_msgs/Joy')])

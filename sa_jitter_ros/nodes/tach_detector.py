@@ -8,10 +8,11 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Node `tach_detector`: the sampled keyphasor signal in, tach pulses out."""
+"""Node `tach_detector`: the sampled keyphasor signal, or the angle of a joint, in; pulses out."""
 
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import replace
 import math
 from typing import Any
 
@@ -21,10 +22,13 @@ from sa_jitter_ros.averaging.timeline import SAME_RATE, VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
+from sa_jitter_ros.nodes.joint_input import JointInput
+from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
 from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.signals import PulseOutput, sample_parameters, SampleInput, TACH_TYPE
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import Parameter, PULSES_PER_REVOLUTION
 from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sensor_msgs.msg import JointState
 
 FloatArray = NDArray[np.float64]
 
@@ -33,9 +37,19 @@ FloatArray = NDArray[np.float64]
 BURST = 10
 BURST_PERIOD = 0.01  # s
 
+_KNOWN = 20  # pulses after which the error of those of a joint is known
+
+JOINT_TYPE = 'sensor_msgs/JointState'
 PARAMETERS = (
     *sample_parameters('tach_waveform'),
     TACH_TYPE,
+    Parameter('tach_waveform_type', '', 'message type of tach_waveform: empty for that of '
+              f'vibration_type, or {JOINT_TYPE}, whose positions (rad) give the pulses',
+              read_only=True),
+    Parameter('joint', '', f'joint whose position is the angle of the shaft, of {JOINT_TYPE}; '
+              'empty: the only one', read_only=True),
+    replace(PULSES_PER_REVOLUTION, read_only=True, description='marks on a revolution of the '
+            'joint, one at angle 0'),
     Parameter('imu_axis', 'z', 'axis of linear acceleration that is the waveform',
               choices=('x', 'y', 'z'), read_only=True),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the published pulses'),
@@ -79,7 +93,14 @@ class TachDetector(MonitoringNode):
         super().__init__('tach_detector', PARAMETERS, **node_kwargs)
         values = self.parameters.values()
         self._values, self._keyphasor = values, values['keyphasor']
-        self._samples = SampleInput(self, values)
+        kind = values['tach_waveform_type'].replace('/msg/', '/')
+        self._joint = JointInput(
+            values['joint'], marks=values['pulses_per_revolution'],
+            time_tolerance=values['time_tolerance']) if kind == JOINT_TYPE else None
+        self._declared = False  # whether the error of the pulses was logged
+        self._samples = SampleInput(self, values if self._joint or not kind else {
+            **values, 'vibration_type': known_type('tach_waveform_type', kind, {
+                **SAMPLE_TYPES, JOINT_TYPE: JointState})})
         self._timeline = VibrationTimeline(time_tolerance=values['time_tolerance'])
         self._detector = detector_of(values)
         self._rate = 0.0  # of the run that the detector follows
@@ -88,7 +109,10 @@ class TachDetector(MonitoringNode):
         self._too_close = self._unused = 0  # of earlier detectors
         self._waiting: deque[float] = deque()
         self._output = PulseOutput(self, values['tach_type'])
-        self.create_input(self._samples.message_type, 'tach_waveform', self._on_waveform)
+        if self._joint:  # several publishers may send the joints of a robot
+            self.create_input(JointState, 'tach_waveform', self._on_joint, most_publishers=64)
+        else:
+            self.create_input(self._samples.message_type, 'tach_waveform', self._on_waveform)
         self._waveform_flow = self.watch_input(
             'waveform', 'tach_waveform', 'look at the acquisition of the keyphasor')
         self._pulse_flow = self.health.add(Flow(
@@ -133,6 +157,21 @@ class TachDetector(MonitoringNode):
             self.warn(line)
         self._timeline.messages.clear()
 
+    def _on_joint(self, message: JointState) -> None:
+        assert self._joint is not None
+        times = self._joint.pulses(message)
+        if times is None:
+            return
+        self._waveform_flow.came()
+        self._publish(times)
+        error = self._joint.crossings.state.pulse_error_std
+        if not self._declared and self._pulses >= _KNOWN and np.isfinite(error):
+            self._declared = True
+            self.get_logger().info(
+                f'joint {self._joint.joint}: pulses have an error of {1e6 * error:.3g} us; '
+                'declare it to jitter_predictor: jitter_distribution normal, '
+                f'jitter_std {error:.3g}')
+
     def _publish(self, times: FloatArray) -> None:
         self._pulses += len(times)
         if len(times):
@@ -160,9 +199,17 @@ class TachDetector(MonitoringNode):
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
             samples_lost=samples.samples_lost)
+        if self._joint:
+            joint = self._joint.crossings.state
+            self.counts.update(samples_dropped=joint.dropped, gaps=joint.gaps,
+                               restarts=joint.restarts)
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the numbers of pulses found and of subscribers, the levels, the threshold."""
+        if self._joint:
+            text, values = self._joint.summary()
+            return text, {**values, 'pulses': str(self._pulses),
+                          'subscribers': str(self._output.subscribers)}
         state = self._detector.state
         values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
         values['pulses'] = str(self._pulses)
