@@ -128,7 +128,7 @@ class IntervalJudge:
 
     @property
     def waiting(self) -> int:
-        """Number of pulses not yet judged."""
+        """Return the number of pulses not yet judged."""
         return self._queue.size
 
     def take(self, pulses: FloatArray) -> None:
@@ -564,7 +564,7 @@ class IntervalJudge:
 
     @property
     def _room_of_marks(self) -> int:
-        """Number of intervals until the angles between the marks are learnt."""
+        """Return the number of intervals until the angles between marks are learnt."""
         assert self._lock is not None
         size = self._lock.steps.size
         if size == 1 or self._rehearses:

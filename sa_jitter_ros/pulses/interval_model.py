@@ -81,7 +81,7 @@ class IntervalModel:
 
     @property
     def room(self) -> int:
-        """Number of intervals until the scatter is computed anew."""
+        """Return the number of intervals until the scatter is computed anew."""
         return self.block + _REACH - self._levels.size
 
     @property
@@ -91,7 +91,7 @@ class IntervalModel:
 
     @property
     def known(self) -> int:
-        """Number of intervals from which the scatter is known."""
+        """Return the number of intervals from which the scatter is known."""
         return int(self._count)
 
     @property
@@ -106,7 +106,7 @@ class IntervalModel:
 
     @property
     def expected(self) -> float:
-        """Expected level of the next interval."""
+        """Return the expected level of the next interval."""
         return float(self._predicted(self._chosen, np.append(self._levels, 0.0), 1)[0])
 
     def deviations(self, levels: FloatArray) -> FloatArray:
