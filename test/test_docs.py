@@ -490,7 +490,8 @@ def diagnostic_keys():
     for name in NODES:
         with node(name) as made:
             made.update_counts()
-            keys |= {*made.counts, *made.health.ages(), *made.summary()[1]}
+            ages = {f'{flow}_age' for flow in made.health.flows}
+            keys |= {*made.counts, *ages, *made.summary()[1]}
     return keys
 
 

@@ -159,9 +159,9 @@ def test_detector_that_finds_no_pulse_says_so(ros_graph, clock):
 @pytest.mark.parametrize(('node', 'parameters', 'ages', 'text'), [
     (JitterPredictor, {'follow_shaft_speed': True}, {'speed_age', 'prediction_age'},
      'no /shaft_speed'),
-    (JitterPredictor, {}, {'speed_age', 'prediction_age'}, None),
+    (JitterPredictor, {}, {'prediction_age'}, None),
     (ResidualAnalyser, {}, {'average_age', 'prediction_age'}, 'no /shaft/order_amplitude'),
-    (LiveView, {'port': 0}, {'average_age', 'prediction_age'}, 'no /shaft/order_amplitude'),
+    (LiveView, {'port': 0}, {'average_age'}, 'no /shaft/order_amplitude'),
     (MachineSimulator, {'playing': False}, set(), None),
 ])
 def test_each_node_shows_the_ages_of_what_it_takes(

@@ -101,8 +101,13 @@ class Health:
         return flow
 
     def ages(self) -> dict[str, str]:
-        """Return the age of each flow in s as a text, `nan` before its first data."""
-        return {f'{flow.name}_age': f'{flow.age:.1f}' for flow in self.flows.values()}
+        """
+        Return the age of each flow in s as a text, `nan` before its first data.
+
+        Flows that are neither judged nor ever came mean nothing to the node.
+        """
+        return {f'{flow.name}_age': f'{flow.age:.1f}' for flow in self.flows.values()
+                if flow.judged or not math.isnan(flow.last)}
 
     def silent(self, stale_after: float) -> list[tuple[Level, Flow]]:
         """Return the silent flows, the worst first."""
