@@ -247,11 +247,15 @@ def test_a_long_trend_is_bounded_in_memory_and_on_the_line():
     assert shown['time'][-1] == board.TREND_AVERAGES - 1.0
 
 
-def test_order_map_shows_amplitudes_in_decibels_and_is_bounded():
+def test_order_map_shows_amplitudes_in_decibels_and_is_bounded(monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(board, 'time', clock)
     angle, orders = 2.0 * np.pi * np.arange(4096) / 4096, board.OrderMap()
     wave = np.cos(19.0 * angle) + 0.02 * np.cos(1500.0 * angle)
     for factor in (1.0, 0.1):
         content = orders.add(factor * np.stack((0.0 * wave, wave)))
+        assert orders.add(np.stack((wave, wave))) is None  # a sliding average, too early
+        clock.now += board.MAP_PERIOD
     found = content(1)
     assert (found['pool'], found['step'], found['span']) == (7, 1, 80.0)  # 2000 orders
     assert found['peak'] == pytest.approx(1.0)
@@ -267,6 +271,7 @@ def test_order_map_shows_amplitudes_in_decibels_and_is_bounded():
     assert content(7)['rows'] == []
     for _ in range(board.MAP_AVERAGES + 5):
         content = orders.add(np.stack((wave, wave)))
+        clock.now += board.MAP_PERIOD
     found = content(0)
     assert len(found['rows']) <= board.MAP_ROWS
     assert found['step'] * len(found['rows']) <= board.MAP_NUMBERS // (2 * 2000) + found['step']

@@ -115,8 +115,9 @@ class LiveView(MonitoringNode):
             if kind in maps:
                 self._board.put(f'{shaft}/{kind}_spectrum', partial(spectrum_content, average),
                                 by_channel=True)
-                self._board.put(f'{shaft}/{kind}_map', maps[kind].add(average.values[:CHANNELS]),
-                                by_channel=True)
+                content = maps[kind].add(average.values[:CHANNELS])
+                if content is not None:
+                    self._board.put(f'{shaft}/{kind}_map', content, by_channel=True)
 
         def on_indicators(message: Float64MultiArray) -> None:
             average = decode_average('condition_indicator', message)

@@ -43,6 +43,7 @@ SPECTRUM_ORDERS = 2000
 TREND_NUMBERS, TREND_AVERAGES = 400_000, 2000  # numbers that are kept, and averages
 MAP_NUMBERS, MAP_AVERAGES = 1_000_000, 300  # amplitudes that are kept, and averages
 MAP_ROWS, MAP_COLUMNS = 100, 300  # of a map that is sent
+MAP_PERIOD = 0.2  # s between the rows of a map: sliding averages come faster
 MAP_SPAN = 80.0  # dB from the largest amplitude of a map down to the smallest that is told apart
 MAP_LEVELS = 64  # steps of this span, each a character from '0' on
 TREND_SENT = 12_000  # numbers of one trend that are sent: of every n-th average
@@ -169,9 +170,18 @@ class OrderMap:
 
     def __init__(self) -> None:
         self._rows: deque[NDArray[np.float32]] = deque()
+        self._next = -math.inf  # s, when the next row may be added
 
-    def add(self, waveforms: FloatArray) -> Callable[[int], Json]:
-        """Add an average (channel, angle); others of another shape start a new map."""
+    def add(self, waveforms: FloatArray) -> Callable[[int], Json] | None:
+        """
+        Add an average (channel, angle); others of another shape start a new map.
+
+        Returns the content by channel, None where the last row is too young for another.
+        """
+        now = time.monotonic()
+        if now < self._next:
+            return None
+        self._next = now + MAP_PERIOD
         amplitudes = spectrum(waveforms)[0].astype(np.float32)
         if not self._rows or self._rows[-1].shape != amplitudes.shape:
             self._rows = deque(maxlen=int(np.clip(
