@@ -45,11 +45,12 @@ _CERTAIN = 5.0
 LARGEST_ERROR = 0.7
 # Least share of the variance of the errors that the vibration must show.
 _LEAST_SHOWN = 0.05
-# Errors that are so many times as large as declared may have been fitted a turn of an order aside,
-# and those with less evidence than this may be noise that has been aligned to itself: they are
-# fitted again from so many times more, or less, than the declared jitter on. The result counts if
-# it has that much more evidence, because the declared size is likely.
-_SUSPICIOUS, _CONVINCING, _WIDER, _UNLIKELY = 1.8, 3.0, 4.0, 2.0
+# Errors that are so many times as large as declared, and turn an order across their width so far,
+# may have been fitted a turn aside (those that were fill one turn), and errors with less evidence
+# than this may be noise that has been aligned to itself: they are fitted again from so many times
+# more, or less, than the declared jitter on. The result counts if it has that much more evidence,
+# because the declared size is likely.
+_SUSPICIOUS, _LARGE_TURNS, _CONVINCING, _WIDER, _UNLIKELY = 1.8, 0.7, 3.0, 4.0, 2.0
 # Phase in rad beyond which the likelihood of a pulse has several maxima.
 _AMBIGUOUS = 1.0
 # Amplitudes below this fraction of the RMS of a channel are rounding errors.
@@ -139,7 +140,7 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
         additional_orders=additional_orders, most_orders=most_orders, declared=declared,
         with_ripple=with_ripple)
     fit, gain, reason = attempt(expected=declared)
-    if fit is not None and (fit.std > _SUSPICIOUS * declared or fit.evidence < _CONVINCING):
+    if fit is not None and (_may_be_aside(fit, declared) or fit.evidence < _CONVINCING):
         other = attempt(expected=declared * (_WIDER if fit.std > declared else 1.0 / _WIDER))
         if other[0] is not None and other[0].evidence > fit.evidence + _UNLIKELY:
             fit, gain, reason = other
@@ -170,6 +171,12 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
         2.0 * np.pi * order * fit.standard_errors < _AMBIGUOUS, fit.std * float(seconds.mean()),
         fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, fit.aligned.T, fit.noise.T,
         fit.ripple * periods / cycle_length)
+
+
+def _may_be_aside(fit: PulseErrorFit, declared: float) -> bool:
+    """Return whether errors are larger than declared and turn an order that was used too far."""
+    turns = _UNIFORM_WIDTH * fit.std * float(fit.orders.max())
+    return fit.std > _SUSPICIOUS * declared and turns > _LARGE_TURNS
 
 
 def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, declared: float
