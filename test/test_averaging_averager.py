@@ -284,3 +284,14 @@ def test_a_waveform_without_pulses_says_so():
 def test_a_waveform_that_cannot_be_used_is_refused(tach):
     with pytest.raises(sa.SignalError, match='keyphasor waveform'):
         sa.detect_pulses(tach, RATE)
+
+
+def test_path_delay_is_taken_from_the_pulses():
+    vibration = np.cos(2.0 * np.pi * 8.0 * SPEED * np.arange(6000) / RATE)
+    pulses = np.arange(70) / SPEED
+    plain, = sa.average(vibration, RATE, pulses, orders=[8.0])
+    delayed, = sa.average(vibration, RATE, pulses + 3e-3, orders=[8.0], path_delay=3e-3)
+    np.testing.assert_allclose(delayed.amplitudes, plain.amplitudes, rtol=1e-9)
+    np.testing.assert_allclose(delayed.pulses, pulses, rtol=0, atol=1e-12)
+    with pytest.raises(sa.ParameterError, match='path_delay'):
+        sa.average(vibration, RATE, pulses, path_delay=np.inf)

@@ -25,7 +25,7 @@ from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector
 from sa_jitter_ros.parameter_file import read_parameters
 
-RATE, SPEED, SECONDS, CLOCK = 6000.0, 25.0, 10.0, 4000.0
+RATE, SPEED, SECONDS, CLOCK = 6000.0, 25.0, 10.0, 20000.0
 NODES = {'jitter_predictor': JitterPredictor, 'live_view': LiveView,
          'recording_player': RecordingPlayer, 'residual_analyser': ResidualAnalyser,
          'synchronous_averager': SynchronousAverager, 'tach_detector': TachDetector}
@@ -99,7 +99,7 @@ def test_machine_file_declares_the_machine_to_the_commands(written, recording, c
     assert declaration.unknown == ()
     assert declaration.model.orders == (7.0, 14.0, 21.0)
     assert declaration.model.keyphasor_rate == pytest.approx(CLOCK, rel=0.05)
-    assert design.main(['--params', str(machine)]) == 0
+    assert design.main(['--params', str(machine), '--output', str(written / 'design.png')]) == 0
     assert close_loop.main([
         str(recording), '--field', 'vibration=acc', '--field', 'sample_rate=fs', '--field',
         'pulse_times=clicks', '--params', str(machine), '--output', str(written / 'loop'),

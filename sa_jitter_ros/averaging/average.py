@@ -115,10 +115,11 @@ class KeyphasorParameters:
     interval_tolerance: float = 0.0
     minimum_interval: float = 0.0
     time_tolerance: float = 0.01
+    path_delay: float = 0.0
 
     def __post_init__(self) -> None:
         """Check what `PulseValidator` does not check."""
-        for name in ('interval_tolerance', 'minimum_interval', 'time_tolerance'):
+        for name in ('interval_tolerance', 'minimum_interval', 'time_tolerance', 'path_delay'):
             object.__setattr__(self, name, number(name, getattr(self, name)))
         for name in ('pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth',
                      'maximum_missing'):

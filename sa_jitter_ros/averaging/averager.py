@@ -87,7 +87,8 @@ class Averager:
         interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
         interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
-        time_tolerance: float = 0.01, buffer_seconds: float = math.inf,
+        time_tolerance: float = 0.01, path_delay: float = 0.0,
+        buffer_seconds: float = math.inf,
     ) -> None:
         sample_rate = number('sample_rate', sample_rate)
         start_time = number('start_time', start_time)
@@ -106,7 +107,8 @@ class Averager:
             pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
             missing_teeth=missing_teeth, missing_pulses=missing_pulses,
             maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
-            minimum_interval=minimum_interval, time_tolerance=time_tolerance)
+            minimum_interval=minimum_interval, time_tolerance=time_tolerance,
+            path_delay=path_delay)
         settings = keyphasor.average(
             ratio=ratio, orders=orders, averaging=averaging, angle_law=angle_law,
             trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
@@ -194,7 +196,7 @@ def average(
     interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
     missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
     interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
-    time_tolerance: float = 0.01,
+    time_tolerance: float = 0.01, path_delay: float = 0.0,
 ) -> tuple[Average, ...]:
     """
     Return the synchronous averages of a recording of vibration (channel, sample) or (sample,).
@@ -234,7 +236,7 @@ def average(
         samples_per_revolution=samples_per_revolution, missing_teeth=missing_teeth,
         missing_pulses=missing_pulses, maximum_missing=maximum_missing,
         interval_tolerance=interval_tolerance, minimum_interval=minimum_interval,
-        time_tolerance=time_tolerance)
+        time_tolerance=time_tolerance, path_delay=path_delay)
     samples, pulses = _array(vibration), np.asarray(pulse_times)
     if pulse_times is None:
         raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '

@@ -21,6 +21,9 @@ _MOST_CYCLES, _AVERAGES = 100, 8
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
 _DEFAULT_ORDERS = (1.0, 2.0, 3.0)
 _SHAFT = 'shaft'
+_DISCARDED = 0.5  # of the trigger cycles of an average
+_COARSE, _TICKS, _WIDEST = 0.02, 2.5, 0.45  # of an interval
+_CLEAR = 4.0  # standard errors of a delay that is corrected
 
 
 def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
@@ -41,11 +44,18 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
         jitter = {'jitter_distribution': 'normal', 'jitter_std': float(std)}
     nodes: dict[str, dict[str, Any]] = {
         'synchronous_averager': {**common, 'missing_teeth': found['missing_teeth'],
-                                 'correct_jitter': True},
+                                 'maximum_discarded': _DISCARDED, 'correct_jitter': True},
         'jitter_predictor': {**common, 'trigger_speed': float(found['speed']['mean']),
                              'follow_shaft_speed': True, **jitter},
         'residual_analyser': {'shaft': _SHAFT},
         'live_view': {'shafts': [_SHAFT]}}
+    pitch = 1.0 / (float(found['speed']['mean']) * count)
+    if tick > _COARSE * pitch:  # intervals scatter by a tick to either side
+        nodes['synchronous_averager']['interval_tolerance'] = min(
+            _WIDEST, _TICKS * tick / pitch)
+    delay = check.findings['path_delay']
+    if delay.value is not None and abs(delay.value) > _CLEAR * delay.standard_error:
+        nodes['synchronous_averager']['path_delay'] = float(delay.value)
     if check.from_waveform:
         # The declared jitter is that of a pulse time which is the first sample past the threshold.
         nodes['tach_detector'] = {'interpolate': False}

@@ -47,6 +47,8 @@ PARAMETERS = (
               minimum=0.0, maximum=0.49),
     Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
               unit='s', minimum=0.0),
+    Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, of filters and '
+              'converters; it is subtracted from their times', unit='s'),
     TRIGGER_CYCLES,
     Parameter('maximum_discarded', 0.0, 'largest number of discarded trigger cycles between those '
               'of an average, as a share of trigger_cycles; 0: a discarded cycle ends the average',

@@ -78,7 +78,7 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
     if span > _MUCH * duration:
         return _other_unit(spans, span / duration, rate)
     if span * _MUCH**2 < duration:
-        if 0.5 / _MUCH < 1e3 * span / duration < _FACTOR:
+        if 0.5 / _FACTOR < 1e3 * span / duration < _FACTOR:
             return (Mistake(
                 'unit_khz', f'{spans}: the sampling rate of {rate:g} Hz looks like kHz; give '
                 f'sample_rate={1e3 * rate:.10g}', rate_scale=1e3),)
@@ -88,8 +88,9 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
                  'no vibration: ')
         first = math.floor(float(times.min()))
         if first > _EPOCH > end:
-            return (Mistake('unit_epoch', f'{apart}they are counted since 1970; set start_time to '
-                            'the time of the first sample on the same clock', shift=float(first)),)
+            return (Mistake(
+                'unit_epoch', f'{apart}they are counted since 1970; set start_time to the time of '
+                'the first sample on the clock of the pulses', shift=float(first)),)
         return (Mistake('no_overlap', f'{apart}set start_time to the time of the first sample on '
                         'the clock of the pulses', shift=float(times.min()) - start),)
     return ()

@@ -89,6 +89,7 @@ class PulseValidator:
     :param maximum_missing: more missing pulses than this in a row are a standstill.
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
     :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
+    :param path_delay: delay (s) of the pulses behind the vibration, which is taken from them.
     :raises ParameterError: an option is out of range, or cycles do not fit the wheel.
 
     One pulse of eight is missing, and one is doubled:
@@ -106,7 +107,7 @@ class PulseValidator:
         self, *, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break',
         interval_tolerance: float = 0.0, maximum_missing: int = 3,
-        minimum_interval: float = 0.0, time_tolerance: float = 0.01,
+        minimum_interval: float = 0.0, time_tolerance: float = 0.01, path_delay: float = 0.0,
     ) -> None:
         teeth = pulses_per_revolution
         per_trigger = teeth if pulses_per_trigger is None else pulses_per_trigger
@@ -124,6 +125,8 @@ class PulseValidator:
                             ('time_tolerance', time_tolerance)):
             if not 0.0 <= value < np.inf:
                 raise ParameterError(f'{name} {value} s must be finite and not negative')
+        if not np.isfinite(path_delay):
+            raise ParameterError(f'path_delay {path_delay} s must be finite')
         if missing_teeth and teeth % per_trigger and per_trigger % teeth:
             raise ParameterError(
                 f'pulses_per_trigger {per_trigger} does not divide the {teeth} teeth of the '
@@ -139,7 +142,7 @@ class PulseValidator:
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
             pulses_per_trigger=per_trigger))
         self.pulses_per_trigger = per_trigger
-        self._time_tolerance = time_tolerance
+        self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
         self._out_of_order = self._restarts = self._non_finite = 0
 
@@ -171,7 +174,7 @@ class PulseValidator:
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
         self._non_finite += int(np.count_nonzero(~finite))
-        pulses = pulses[finite]
+        pulses = pulses[finite] - self._path_delay
         while pulses.size:
             ahead = 0
             if not self._held:
