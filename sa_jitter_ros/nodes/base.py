@@ -203,9 +203,11 @@ class MonitoringNode(Node):
             crowd = ''
             if 0 < most < self.count_publishers(topic):
                 offered = self.get_publishers_info_by_topic(topic)
-                names = ', '.join(sorted(_node_name(item) for item in offered))
-                crowd = (f'{len(offered)} publishers ({names}) mix their messages: stop all but '
-                         f'{most}, or remap them')
+                names = sorted(_node_name(item) for item in offered)
+                crowd = (f'{len(offered)} publishers ({", ".join(names)}) mix their messages: stop '
+                         f'all but {most}, or remap them')
+                if len(set(names)) < len(names):
+                    crowd += '; one that was killed disappears after 20 s'
             self.set_missing(f'single source of {topic}', crowd)
 
     def _cause(self, flow: Flow) -> str:
