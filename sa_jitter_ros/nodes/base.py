@@ -164,11 +164,17 @@ class MonitoringNode(Node):
         Warnings that differ in their numbers only are of one kind.
         """
         self.show_warning(text)
+        if self._is_new(text):
+            self.get_logger().warning(text)
+
+    def _is_new(self, text: str) -> bool:
+        """Return whether the log has room for a text and no other of its kind lately."""
         kind, now = re.sub(r'[-+]?\d[\d.]*(e[-+]?\d+)?', '#', text), time.monotonic()
         self._logged = {key: at for key, at in self._logged.items() if now - at < WARNING_PERIOD}
-        if kind not in self._logged and len(self._logged) < WARNING_KINDS:
-            self._logged[kind] = now
-            self.get_logger().warning(text)
+        if kind in self._logged or len(self._logged) >= WARNING_KINDS:
+            return False
+        self._logged[kind] = now
+        return True
 
     def show_warning(self, text: str) -> None:
         """Show a warning in the next diagnostics, but not in the log."""
@@ -178,16 +184,14 @@ class MonitoringNode(Node):
         """
         Say why the user does not get something, in log and status, until the reason is ''.
 
-        The log has one line when it begins and one when it ends.
+        The log has one line when it begins and one when it ends, unless it comes and goes.
         """
         before = self._missing.pop(what, '')
         if reason:
             self._missing[what] = reason
-        if bool(reason) != bool(before):
-            if reason:
-                self.get_logger().warning(f'{what}: {reason}')
-            else:
-                self.get_logger().info(f'{what}: well again')
+        line = f'{what}: {reason or "well again"}'
+        if bool(reason) != bool(before) and self._is_new(line):
+            self._log(Level.WARN if reason else Level.OK, line)
 
     def _log(self, level: Level, line: str) -> None:
         if level == Level.ERROR:  # rclpy wants one line of code for each severity
@@ -204,8 +208,8 @@ class MonitoringNode(Node):
             if 0 < most < self.count_publishers(topic):
                 offered = self.get_publishers_info_by_topic(topic)
                 names = sorted(_node_name(item) for item in offered)
-                crowd = (f'{len(offered)} publishers ({", ".join(names)}) mix their messages: stop '
-                         f'all but {most}, or remap them')
+                crowd = (f'{len(offered)} publishers ({", ".join(names)}) mix their messages: '
+                         f'stop all but {most}, or remap them')
                 if len(set(names)) < len(names):
                     crowd += '; one that was killed disappears after 20 s'
             self.set_missing(f'single source of {topic}', crowd)
