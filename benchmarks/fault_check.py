@@ -31,7 +31,7 @@ from sa_jitter_ros.nodes.messages import AverageMessage
 
 AMPLITUDE = 5e-4  # of the largest value: error of an amplitude by band-limited interpolation
 POINT = 4e-3  # the same of a point of the waveform with samples on one side only
-BELIEVED = 0.15  # of the pitch: pulses displaced by more must not be used
+BELIEVED = 0.04  # of the pitch: pulses displaced by more must not be used
 LONGEST = 60  # trigger cycles of an exponential average that are computed
 RUNS = 8  # latest runs among which the source of an average is looked for
 LIMIT = 6.0  # standard errors: two of a thousand million normal variables are farther out
@@ -54,8 +54,12 @@ class Place:
 
 
 def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
-                    values: Mapping[str, Any], gain: FloatArray) -> bool:
-    """Tell whether a waveform is the mean of a window, `start` trigger cycles from 0."""
+                    values: Mapping[str, Any], gain: FloatArray, allowed: float = 0.0) -> bool:
+    """
+    Tell whether a waveform is the mean of a window, `start` trigger cycles from 0.
+
+    It may be wrong by what interpolation causes, and by `allowed` more.
+    """
     r, count = window.cycles, window.trigger_cycles
     whole = window.waveforms(start, waveform.values.shape[1])
     cycles = len(whole)
@@ -69,7 +73,7 @@ def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
     if not len(whole):
         return bool(np.isnan(waveform.values).all())
     error = np.abs(waveform.values / gain - weights @ whole).max()
-    return bool(error < POINT * window.run.scale)
+    return bool(error < POINT * window.run.scale + allowed)
 
 
 class ShaftChecker:
@@ -148,10 +152,11 @@ class ShaftChecker:
         """Return the pulses (tau) of as many usable cycles as end at `last`, at least these."""
         pitch = 1.0 / (TEETH * run.speed)
         absent = run.missing | run.undelivered if self._delivered else run.missing
+        absent = absent | {tooth for tooth, late in run.displaced.items()
+                           if abs(late) > BELIEVED * pitch}
         gaps = absent if values['missing_pulses'] == 'break' else set()
         begin = max(last - longest * step, 0)
-        bad = [tooth for tooth in range(begin, last + 1) if tooth in gaps
-               or abs(run.displaced.get(tooth, 0.0)) > BELIEVED * pitch]
+        bad = [tooth for tooth in range(begin, last + 1) if tooth in gaps]
         if bad and bad[-1] >= first:
             return f'tooth {bad[-1]} is missing or displaced'
         begin = max([begin, *(tooth + 1 for tooth in bad)])
@@ -241,28 +246,35 @@ def check_correction(name: str, received: Received, place: Place,
         raise WrongAverageError(f'{name}: pulses at {times} s are not those of {header}')
     true = run.errors(teeth)
     true -= true.mean()
-    apart = np.abs(errors - true) / standard_errors
-    if abs(errors.mean()) > MEAN or not apart.max() < LIMIT:
+    told = np.isfinite(errors)  # without ambiguity
+    apart = np.abs(errors - np.mean(errors[told]) - true + np.mean(true[told]))[told]
+    apart /= standard_errors[told]
+    if (told.all() and abs(errors.mean()) > MEAN) or not apart.max(initial=0.0) < LIMIT:
         raise WrongAverageError(f'{name}: errors of the pulses are {1e6 * true} us and not '
                                 f'{1e6 * errors}, {apart.max():.3g} standard errors apart')
     ratio = place.values[f'{name}.ratio'] * step / TEETH
     measured = run.times(teeth)
-    raw, corrected, truth = (Window(run, pulses, ratio, header.trigger_cycles)
-                             for pulses in (measured, measured - errors, measured - true))
+    raw, truth = (Window(run, pulses, ratio, header.trigger_cycles)
+                  for pulses in (measured, measured - true))
     gain = np.arange(1, run.channels + 1)[:, None]
     orders, known = table[0, :, 0], np.isfinite(table[0, :, 3])
     limit = AMPLITUDE * run.scale
-    expected = corrected.amplitudes(orders).mean(axis=0)
+    expected = truth.amplitudes(orders).mean(axis=0)
+    # What is uncertain of the errors turns the orders, and changes their amplitudes.
+    turns = 2.0 * np.pi * orders * run.speed * np.sqrt(np.nanmean(standard_errors**2))
+    allowed = LIMIT * np.abs(expected) * np.hypot(turns, np.nan_to_num(table[..., 6]))
     found = table[..., 3] * np.exp(1j * table[..., 4]) / gain
     for zero in place.zeros:
         start = (place.first - zero) // step
         turn = np.exp(-2j * np.pi * ratio * start * orders)
-        if (np.abs(found - expected * turn)[:, known].max() < limit and waveform_agrees(
-                corrected, start, received.corrected, place.values, gain)):
+        off = np.abs(found - expected * turn) - allowed
+        if off[:, known].max() < limit and waveform_agrees(
+                truth, start, received.corrected, place.values, gain, float(allowed.sum(axis=1)
+                                                                            .max())):
             break
     else:
         raise WrongAverageError(f'{name}: corrected values of {header} are not those between the '
-                                'corrected pulses')
+                                'true pulses')
     amplitudes, jittered = (np.abs(item.amplitudes(orders).mean(axis=0)) for item in (truth, raw))
     attenuation = jittered / amplitudes
     allowed = LIMIT * table[..., 6] + limit * (1.0 + attenuation) / amplitudes

@@ -25,7 +25,7 @@ VALID: dict[str, list[tuple[str, list[Any]]]] = {
         ('tach.orders', [ORDERS, [2.5], [1.0, 2.0, 5.0, 12.04]]),
         ('gear.orders', [ORDERS, [5.0, 0.41531]]), ('gear.ratio', [2.40789, 0.41, 1.0, 3.5]),
         ('pulses_per_trigger', [0, 1, 2]), ('missing_pulses', ['break', 'bridge']),
-        ('interval_tolerance', [0.2, 0.25, 0.28]), ('gear.samples_per_revolution', [0, 300, 512]),
+        ('interval_tolerance', [0.0, 0.02, 0.03]), ('gear.samples_per_revolution', [0, 300, 512]),
         ('tach.mesh_orders', [[5.0], [12.0]]), ('keyphasor_rate', [0.0, 6400.0])],
     'averager': [('trigger_cycles', [4, 6, 6]), ('shaft.orders', [DECLARED_ORDERS, [1.0, 5.0]]),
                  ('correct_jitter', [True, False]), ('keyphasor_rate', [0.0, 6400.0])],

@@ -114,14 +114,14 @@ class Run:
         """
         Return the tooth whose pulse has this header time (s), or None.
 
-        That of a missing one is half way between its neighbours.
+        That of a missing or displaced one may be half way between its neighbours.
         """
         tau = time - self.clock
         tooth = round((tau - self.first_tooth) * TEETH * self.speed)
         if tooth < 0:
             return None
         exact = [self.times(np.array([tooth]))[0]]
-        if tooth in self.missing or tooth in self.undelivered:
+        if tooth in self.missing or tooth in self.undelivered or tooth in self.displaced:
             exact.append(self.times(np.array([tooth - 1, tooth + 1])).mean())
         # to the nanosecond in messages, and as absolute times round
         return tooth if min(abs(item - tau) for item in exact) < 3e-9 + 2e-15 * abs(time) else None

