@@ -123,6 +123,9 @@ def test_a_doubled_rate_is_learnt_and_counted():
     validator = PulseValidator()
     found = validator.update(np.sort(np.append(pulses, pulses[50:] + 0.015)))
     assert validator.counts.relearnt == 1
+    message, = validator.take_messages()
+    assert 'from 0.03 s to 0.015 s' in message
+    assert 'is there a second keyphasor of the same name' in message
     assert np.count_nonzero(found.starts_run) == 2
     assert np.diff(found.times)[~found.starts_run[1:]].min() == pytest.approx(0.015)
 

@@ -167,6 +167,7 @@ class StreamingAverager:
     def add_pulses(self, times: FloatArray) -> list[tuple[str, Average]]:
         """Take pulse times (s), in order of arrival."""
         triggers = self.validator.update(times)
+        self._messages += self.validator.take_messages()
         self._queue(triggers)
         averages = self._process()
         self._bound_pulses()

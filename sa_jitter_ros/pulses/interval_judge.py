@@ -56,6 +56,9 @@ _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
 _LONGEST_GAP = 1000.0  # revolutions
 _FITS = 0.1  # tolerance with which a pulse after a step of time fits
+# A change of the interval that is reported: across so many intervals, by this much of its
+# logarithm; near a factor of two; and the number of reports that wait.
+_SHORT, _CHANGED, _NEAR, _MESSAGES = 5.0, 0.3, 0.03, 10
 _NEVER = 1 << 62
 _NONE: FloatArray = np.empty(0)
 
@@ -94,6 +97,7 @@ class IntervalJudge:
         self.counts = dict.fromkeys(
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
              'unlocked', 'relearnt'), 0)
+        self.messages: list[str] = []
         block = 64 if target.marks >= _LARGE_BLOCK else 8
         self._model = IntervalModel(
             given=options.tolerance, pulses_per_trigger=options.pulses_per_trigger, block=block)
@@ -375,10 +379,27 @@ class IntervalJudge:
             return
         if after is not None and abs(after - model.level) > tolerance:
             self.counts['relearnt'] += 1
+            self._report_change(gap, model.level, after)
         pulse = self._next(slots, level if len(slots) == 1 and known else math.nan)
         if after is not None:
             model.jump(after)
         self._counter.begin(pulse, 0, passed=steps if known else None)
+
+    def _report_change(self, gap: float, before: float, after: float) -> None:
+        """Say that the interval changed across a gap (s) as no shaft changes it."""
+        old, new = math.exp(before), math.exp(after)
+        if self._rehearses or gap > _SHORT * max(old, new) or abs(after - before) < _CHANGED:
+            return
+        why = 'did another keyphasor take over, or the pulses of several marks become visible?'
+        if abs(new / old - 0.5) < _NEAR:
+            why = ('twice as many pulses come: is there a second keyphasor of the same name, or '
+                   'are both edges of a mark detected?')
+        elif abs(old / new - 0.5) < _NEAR:
+            why = 'every other pulse is missing: is the threshold of the detector too high?'
+        self.messages.append(
+            f'the pulse interval changes from {old:.4g} s to {new:.4g} s at {self.confirmed:.6f} '
+            f's, faster than a shaft can change its speed: {why}')
+        del self.messages[:-_MESSAGES]
 
     @property
     def _tolerance(self) -> float:
@@ -553,6 +574,7 @@ class IntervalJudge:
                 passed = number
             if scatter < _SAME_SCATTER * self._end.scatter:  # which is known better
                 scatter, count = self._end.scatter, max(count, self._end.known)
+            self._report_change(gap, self._end.level, math.log(lock.interval))
         self._counter.begin(first, tooth, passed=passed)
         self.counts['accepted'] += 1
         self._queue = self._queue[1:]

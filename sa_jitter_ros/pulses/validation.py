@@ -187,6 +187,11 @@ class PulseValidator:
             pulses = pulses[ahead:]
         return self._counter.take()
 
+    def take_messages(self) -> list[str]:
+        """Return changes of the interval that no shaft makes, a sentence each, and forget them."""
+        found, self._judge.messages = self._judge.messages, []
+        return found
+
     def flush(self) -> TriggerPulses:
         """Return the trigger pulses that were not certain, because no pulse follows."""
         self._judge.flush()
