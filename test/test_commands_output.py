@@ -8,14 +8,16 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""What commands say where their output cannot be written, and in which order."""
+"""What commands share: output that cannot be written, and the machine file of recordings."""
 
 from pathlib import Path
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-from sa_jitter_ros.commands import close_loop
+from sa_jitter_ros.commands import check_keyphasor, close_loop
+from sa_jitter_ros.parameter_file import shipped
 
 
 @pytest.mark.processes
@@ -44,3 +46,16 @@ def test_loop_refuses_a_folder_that_it_cannot_write_before_it_reads(tmp_path, ca
     assert close_loop.main([*arguments, str(tmp_path / 'new')]) == 2
     assert 'none.npz: no such file' in capsys.readouterr().err
     assert [item.name for item in tmp_path.iterdir()] == ['file']
+
+
+def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypatch):
+    np.savez(tmp_path / 'rig.npz', vibration=np.zeros(100), sample_rate=1e3,
+             pulse_times=[0.0, 0.05])
+    monkeypatch.setattr(check_keyphasor, 'check_keyphasor', lambda recording, **_: recording)
+    command = [str(tmp_path / 'rig.npz'), '--output', str(tmp_path), '--params',
+               str(shipped('machine.yaml'))]
+    parser = check_keyphasor.make_parser()
+    found = check_keyphasor.run(parser.parse_args(command))
+    assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (2.40789, 18.0, 1)
+    found = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
+    assert (found.ratio, found.orders[0]) == (3.0, 18.0)

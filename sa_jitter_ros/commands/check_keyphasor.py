@@ -24,7 +24,7 @@ import sys
 
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, Parser, read_options, require_writable, show)
+    add_recording_options, machine_fields, Parser, read_options, require_writable, show)
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
@@ -45,6 +45,9 @@ def make_parser() -> Parser:
                         help='folder for keyphasor.json, machine.yaml and the figure')
     parser.add_argument('--teeth', type=int, nargs='+', default=(), metavar='N',
                         help='numbers of teeth of gears in the machine, to find the ratio')
+    parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
+                        help='parameter file of the machine: ratio, orders and pulses per '
+                        'revolution of its first shaft')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_recording_options(parser)
     return parser
@@ -56,7 +59,8 @@ def run(options: argparse.Namespace) -> KeyphasorCheck:
         if not options.quiet:
             print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
 
-    recording = read(options.recording, pulses_suffice=True, **read_options(options))
+    recording = read(options.recording, pulses_suffice=True,
+                     **{**machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
     return check_keyphasor(recording, teeth=options.teeth, progress=progress)

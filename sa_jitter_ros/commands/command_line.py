@@ -21,6 +21,7 @@ import tempfile
 from typing import Any, NoReturn
 import warnings
 
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
@@ -104,6 +105,17 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='name or number of the column of a .csv with the times in s')
     group.add_argument('--sample-rate', type=float, metavar='HZ',
                        help='sampling rate of the vibration, if the file does not contain it')
+
+
+def machine_fields(params: Path | None) -> dict[str, Any]:
+    """Return what a machine file says of recordings, as keywords of `read`; raises ModelError."""
+    if params is None:
+        return {}
+    model = next(iter(read_declaration(params).models.values()))
+    fields = {'ratio': model.ratio, 'orders': model.orders,
+              'pulses_per_revolution': model.pulses_per_revolution}
+    return fields | ({'pulses_per_trigger': model.pulses_per_trigger}
+                     if model.pulses_per_trigger else {})
 
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:
