@@ -328,6 +328,7 @@ def first_points(cycles: float, points: int, first_cycle: int, count: int
     return whole + behind, np.where(behind, 1.0 - rest, 0.0) / (points * cycles)
 
 
+@lru_cache(maxsize=64)
 def on_grid(points: int, cycles: float) -> bool:
     """Whether the points of the waveform are at the same angles of every trigger cycle."""
     return (exact_cycles(cycles) * points).denominator == 1

@@ -63,6 +63,12 @@ _NEVER = 1 << 62
 _NONE: FloatArray = np.empty(0)
 
 
+def intervals(before: float, pulses: FloatArray) -> FloatArray:
+    """Return the interval in front of each pulse (n,), of which one came `before` (s)."""
+    every = np.concatenate(((before,), pulses))
+    return np.asarray(every[1:] - every[:-1])  # np.diff takes three times as long for few pulses
+
+
 @dataclass(frozen=True)
 class JudgeOptions:
     """Options of `PulseValidator` that its judge needs."""
@@ -165,7 +171,7 @@ class IntervalJudge:
     def _apart(self, pulses: FloatArray) -> FloatArray:
         """Drop doubles: pulses at the time of the last one, or sooner than `minimum_interval`."""
         least = self._options.minimum_interval
-        gaps = np.diff(pulses, prepend=self.last)
+        gaps = intervals(self.last, pulses)
         if np.all((gaps >= least) & (gaps > 0.0)):
             return pulses
         kept: list[float] = []
@@ -208,7 +214,7 @@ class IntervalJudge:
         room = model.room
         pulses = self._queue[:room + 1]
         slots = (self._slot + np.arange(pulses.size)) % lock.steps.size
-        gaps = np.diff(pulses, prepend=self.confirmed)
+        gaps = intervals(self.confirmed, pulses)
         levels = np.log(gaps / lock.widths[slots])
         off = np.abs(model.deviations(levels))
         # Teeth beside gaps are uneven; a stray among marks that may be uneven needs a search.

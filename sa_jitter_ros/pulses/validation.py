@@ -27,7 +27,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.interval_judge import IntervalJudge, JudgeOptions
+from sa_jitter_ros.pulses.interval_judge import IntervalJudge, intervals, JudgeOptions
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
@@ -178,7 +178,7 @@ class PulseValidator:
         while pulses.size:
             ahead = 0
             if not self._held:
-                back = np.diff(pulses, prepend=self._judge.last) < 0.0
+                back = intervals(self._judge.last, pulses) < 0.0
                 ahead = min(int(np.argmax(back)) if back.any() else pulses.size, _PIECE)
                 self._judge.take(pulses[:ahead])
             if ahead < min(pulses.size, _PIECE):
