@@ -107,27 +107,35 @@ def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None,
     noise = np.array([item.noise for item in averages])
     with np.errstate(divide='ignore', invalid='ignore'):
         clear = np.nanmin(np.abs(amplitudes) / noise, axis=0)
-    found, errors, orders = [], [], []
+    found, errors, orders, turned = [], [], [], []
     centred = speeds - speeds.mean()
     for place, order in enumerate(averages[0].orders):
         channel = int(np.argmax(np.nan_to_num(clear[:, place])))
         if not clear[channel, place] > _CLEAR:
             continue
-        phase = np.unwrap(np.angle(amplitudes[:, channel, place]))
-        turn = 2.0 * math.pi * order * ratio
-        slope = float(centred @ phase / (centred @ centred))
-        left = phase - phase.mean() - slope * centred
-        error = float(np.sqrt(left @ left / (speeds.size - 2) / (centred @ centred)))
-        if np.abs(left).max() < 0.5 * math.pi:
-            found.append(slope / turn)
-            errors.append(max(error, 1e-12) / turn)
+        angle = np.unwrap(np.angle(amplitudes[:, channel, place])) / (
+            2.0 * math.pi * order * ratio)
+        slope, error, left = _slope(centred, angle)
+        if np.abs(left).max() < 0.25 / (order * ratio):
+            found.append(slope)
+            errors.append(max(error, 1e-15))
             orders.append(float(order))
+            turned.append(angle)
     if len(found) < 2:
         return None, 'fewer than two orders stand clear of their noise at all speeds'
-    delays, weight = np.array(found), 1.0 / np.array(errors) ** 2
-    mean = float(delays @ weight / weight.sum())
-    chi2 = float(((delays - mean) ** 2) @ weight)
+    weight = 1.0 / np.array(errors) ** 2
+    # Pulse errors turn all orders at once: the orders are not independent of each other.
+    mean, error, _ = _slope(centred, weight @ np.array(turned) / weight.sum())
+    chi2 = float(((np.array(found) - mean) ** 2) @ weight)
     if stats.chi2.sf(chi2, len(found) - 1) < _AGREE:
         return None, ('the orders turn differently with the speed, as resonances make them: tap '
                       'the sensor, or compare with a second tach at the vibration input')
-    return Delay(mean, float(weight.sum() ** -0.5), tuple(orders)), ''
+    return Delay(mean, error, tuple(orders)), ''
+
+
+def _slope(centred: FloatArray, values: FloatArray) -> tuple[float, float, FloatArray]:
+    """Return the slope of values (n,) over centred places, its error, and what is left."""
+    power = float(centred @ centred)
+    slope = float(centred @ values) / power
+    left = values - values.mean() - slope * centred
+    return slope, float(np.sqrt(left @ left / (values.size - 2) / power)), left
