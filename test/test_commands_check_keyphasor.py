@@ -107,6 +107,21 @@ def test_machine_file_declares_the_machine_to_the_commands(written, recording, c
     assert (written / 'loop' / 'report.json').exists()
 
 
+def test_machine_file_is_compared_with_what_is_found(recording, tmp_path):
+    (tmp_path / 'machine.yaml').write_text(
+        '/**/jitter_predictor:\n  ros__parameters:\n    pulses_per_revolution: 50\n'
+        '    trigger_speed: 25.0\n    orders: [7.0, 9.0]\n')
+    assert check_keyphasor.main([
+        str(recording), '--field', 'vibration=acc', '--field', 'sample_rate=fs', '--field',
+        'pulse_times=clicks', '--output', str(tmp_path / 'out'), '--quiet',
+        '--params', str(tmp_path / 'machine.yaml')]) == 0
+    report = json.loads((tmp_path / 'out' / 'keyphasor.json').read_text())
+    texts = {item['code']: item['text'] for item in report['warnings']}
+    assert report['pulses_per_revolution']['value'] == 12
+    assert 'states 50 marks' in texts['marks_contradict']
+    assert texts['orders_weak'].endswith(': 9')
+
+
 @pytest.mark.parametrize(('arguments', 'line'), [
     (['rig.npz', '--output', 'out'], 'rig.npz: no such file or folder: check the path'),
     (['{rig}', '--output', 'out', '--field', 'raito=2'], 'no field raito'),
