@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
-from sa_jitter_ros.pulses.validation import PulseValidator
+from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
+from sa_jitter_ros.recordings import read
 from scipy.ndimage import gaussian_filter1d
+from worse_pulses import with_slower_clock
 
 SECONDS = 2.5
 WHEELS = {
@@ -148,6 +150,76 @@ def test_steps_of_a_slow_clock_cost_nothing(clock):
     validator = PulseValidator()
     found = np.concatenate([validator.update(pulses).times, validator.flush().times])
     assert np.array_equal(found, pulses)
+
+
+def accepted_alone(pulses, **options):
+    """Return whether all pulses were accepted, and no cycle was lost."""
+    validator = PulseValidator(**options)
+    validator.update(pulses)
+    validator.flush()
+    return validator.finish() == PulseCounts(accepted=pulses.size)
+
+
+def drifting(rng, count, per_revolution, drift):
+    """Return the times of marks at 25 Hz, of a speed that drifts to and fro by `drift`."""
+    time = np.linspace(0.0, 1.3 * count / per_revolution / 25.0, 20_001)
+    phase = rng.uniform(-np.pi, np.pi)
+    speed = 25.0 * (1.0 + drift * np.sin(2.0 * np.pi * time / time[-1] + phase))
+    angle = np.append(0.0, np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time)))
+    uneven = np.array([0.0, 0.01, -0.012, 0.006]) if per_revolution == 4 else 0.0
+    turns = (np.arange(count // per_revolution)[:, None]
+             + np.arange(per_revolution) / per_revolution + uneven)
+    return rng.uniform(0.5, 1.0) + np.interp(turns.ravel(), angle, time)
+
+
+@pytest.mark.parametrize('drift', [0.0, 0.05])
+@pytest.mark.parametrize('per_revolution', [1, 4])
+@pytest.mark.parametrize('clock', [2000.0, 5000.0])
+def test_a_slow_clock_drops_no_pulse(clock, per_revolution, drift):
+    """Nor with jitter of a tenth of its tick, which lets intervals be two ticks apart."""
+    for seed in range(5):
+        rng = np.random.default_rng([seed, 40])
+        pulses = drifting(rng, 320, per_revolution, drift)
+        pulses += rng.normal(0.0, 0.1 / clock, pulses.size)
+        pulses = np.ceil(pulses * clock) / clock
+        assert accepted_alone(pulses, pulses_per_revolution=per_revolution), seed
+
+
+@pytest.mark.parametrize('per_revolution', [1, 4])
+@pytest.mark.parametrize('shape', ['uniform', 'normal', 'bimodal'])
+def test_large_errors_are_no_strays(shape, per_revolution):
+    """Errors of a width of 1 to 10 % of an interval; the first few pulses may be unlocked."""
+    for seed, width in enumerate([0.01, 0.03, 0.1] * 3):
+        rng = np.random.default_rng([seed, 41])
+        pulses = drifting(rng, 320, per_revolution, 0.02)
+        errors = {'uniform': rng.uniform(-0.5, 0.5, pulses.size),
+                  'normal': rng.normal(0.0, 12.0**-0.5, pulses.size),
+                  'bimodal': rng.choice([-0.5, 0.5], pulses.size)}[shape]
+        pulses += width * errors / 25.0 / per_revolution
+        validator = PulseValidator(pulses_per_revolution=per_revolution)
+        validator.update(pulses)
+        validator.flush()
+        counts = validator.finish()
+        assert counts.unlocked <= 4
+        assert counts == PulseCounts(
+            accepted=pulses.size - counts.unlocked, unlocked=counts.unlocked)
+
+
+def test_gear_pulses_of_a_slow_clock_are_all_accepted(shared_data):
+    slower = with_slower_clock(read(shared_data / 'gear0_gearbox.npz'), 6000.0)
+    assert accepted_alone(slower.keyphasor_pulses(interpolate=False))
+
+
+def test_a_stray_on_the_grid_of_the_clock_is_dropped():
+    """Also where it is a whole number of ticks from the pulses, which others are not."""
+    clock = 5000.0
+    pulses = np.ceil(np.arange(300.0) / 25.03 * clock) / clock
+    for place in (20, 40, 100, 160, 180):
+        validator = PulseValidator()
+        found = validator.update(np.sort(np.append(pulses, pulses[100::40] + place / clock)))
+        found = np.append(found.times, validator.flush().times)
+        assert np.isin(found, pulses).all()
+        assert found.size == pulses.size
 
 
 @pytest.mark.parametrize(('times', 'count'), [

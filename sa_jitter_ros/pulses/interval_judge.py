@@ -106,7 +106,8 @@ class IntervalJudge:
         self.messages: list[str] = []
         block = 64 if target.marks >= _LARGE_BLOCK else 8
         self._model = IntervalModel(
-            given=options.tolerance, pulses_per_trigger=options.pulses_per_trigger, block=block)
+            given=options.tolerance, pulses_per_trigger=options.pulses_per_trigger, block=block,
+            marks=target.marks)
         self.forget()
 
     def forget(self) -> None:
@@ -229,7 +230,7 @@ class IntervalJudge:
         if count:
             self._counter.extend(pulses[:count].tolist(), lock.steps[slots[:count]].tolist())
             self.counts['accepted'] += count
-            model.accept(levels[:count])
+            model.accept(levels[:count], gaps[:count])
             self._recent = [*self._recent, *pulses[:count][-_AGREEING - 1:].tolist()][
                 -_AGREEING - 1:]
             self._note(slots[:count].tolist(), levels[:count].tolist(), pulses[:count].tolist())
@@ -270,6 +271,8 @@ class IntervalJudge:
             return True
         if queue.size == 1 and not final:
             return False
+        if self._is_of_clock():
+            return True
         rules = self._rules()
         paths = [Path(0.0, self.confirmed, self._slot, 0, model.level, model.before)]
         for number, pulse in enumerate(queue[:_MOST_WAITING].tolist()):
@@ -282,6 +285,14 @@ class IntervalJudge:
         if final:
             self._drop('unlocked')
         return final
+
+    def _is_of_clock(self) -> bool:
+        """Whether the ticks of a clock explain the next two intervals, which are regular then."""
+        assert self._lock is not None
+        pulses = self._queue[:2]
+        slots = (self._slot + np.arange(pulses.size)) % self._lock.steps.size
+        return self._model.explains(np.diff(pulses, prepend=self.confirmed),
+                                    self._lock.widths[slots], float(pulses[-1]))
 
     def _commit(self, paths: list[Path], final: bool) -> bool:
         """Decide about the first pulses if the likely paths agree about them."""
@@ -324,6 +335,7 @@ class IntervalJudge:
         assert self._lock is not None
         gap = float(self._queue[0]) - self.confirmed
         expected = math.exp(self._model.expected) * float(self._lock.widths[self._slot])
+        self._model.refuse(gap / expected - 1.0)
         self._drop('doubles' if gap < 0.5 * expected else 'early')
         recent = np.diff(self._recent)
         mean = float(recent.mean()) if recent.size == _AGREEING else np.inf
@@ -357,7 +369,7 @@ class IntervalJudge:
                 _RAMP, self._options.tolerance):
             low, high = sorted((model.level, after))
             changes = low - tolerance <= level <= high + tolerance  # the speed does
-            if changes or model.is_clock_step(deviation, after):
+            if changes:
                 pulse = self._next(slots, level)
                 model.jump(level)
                 self._counter.extend([pulse], [steps])
@@ -375,6 +387,8 @@ class IntervalJudge:
             self._learn_marks()
             return
         self.counts['late'] += 1
+        if mark == 1:
+            model.refuse(deviation)
         if not known and mark == 1 and after is not None:
             passed = self._slots_in(gap, model.level)
             if passed and passed == self._slots_in(gap, after):
@@ -588,7 +602,8 @@ class IntervalJudge:
         self.confirmed = first
         self._end = None
         self._tried = self._failed = 0
-        self._model.start(np.array([math.log(lock.interval)]), scatter=scatter, count=count)
+        self._model.start(np.array([math.log(lock.interval)]), scatter=scatter, count=count,
+                          intervals=lock.intervals)
 
     @property
     def _room_of_marks(self) -> int:

@@ -22,9 +22,11 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 
 FloatArray = NDArray[np.float64]
 
+_NONE: FloatArray = np.empty(0)
 _REACH = 8  # intervals that predict the next one
 _PLACE = np.arange(_REACH, 0, -1) - 0.5 * (_REACH + 1)  # of the latest interval first
 _LINE = 1.0 / _REACH + _PLACE * 0.5 * (_REACH + 1) / float(np.sum(_PLACE**2))
@@ -39,9 +41,15 @@ _PRIOR, _PRIOR_COUNT = 0.01, 0.05
 _UNCERTAIN = 2.0  # of n intervals the scatter may be too small by a factor 1 + this / n
 _MEMORY = 64.0  # intervals after which the scatter is forgotten
 _KEPT_SQUARE = 0.3685  # mean square of the smallest three quarters of normal variables
-# Levels that are equal but for rounding, the longest period of a clock (relative to an interval)
-# that they show, and the periods by which an interval may differ.
-_EQUAL, _LONGEST_STEP, _STEPS = 1e-6, 0.02, 2.2
+_WINDOW = 64  # intervals that show the tick of a clock
+# Ticks by which an interval may differ from each prediction: a pulse is up to half a tick off, and
+# as much again by half for the jitter of the shaft. Widths of marks are known to a tick.
+_TICKS = tuple(0.75 * float(np.abs(np.diff((0.0, 1.0, *(-item for item in weights), 0.0))).sum())
+               for weights in _WEIGHTS)
+_OF_MARKS = 1.0
+# A shaft scatters more than was learnt if so many of the latest intervals differ by more than the
+# tolerance, but not by more than _NEAR; it is wider then than the largest of these by _WIDER.
+_SEVERAL, _OF_LATEST, _NEAR, _WIDER = 5, 24, 0.15, 1.5
 # Fractions of a trigger cycle: smallest tolerance, and displacement that no average shows. A pulse
 # further off its expected time waits for the next one, which tells if it was a stray.
 _FLOOR, _HARMLESS = 1e-3, 3e-3
@@ -53,7 +61,7 @@ class IntervalModel:
 
     `given` is the tolerance that the user gave, 0 to learn it. A trigger cycle has
     `pulses_per_trigger` intervals. The scatter is computed anew after every `block` intervals,
-    whatever the size of the pieces in which they come.
+    whatever the size of the pieces in which they come. There are `marks` intervals a revolution.
 
     >>> model = IntervalModel(given=0.0, pulses_per_trigger=1, block=8)
     >>> model.start(np.log([1.0, 1.01, 0.99, 1.0]), scatter=0.01, count=20)
@@ -61,22 +69,31 @@ class IntervalModel:
     ([0.0, 0.1], 0.066)
     """
 
-    def __init__(self, *, given: float, pulses_per_trigger: int, block: int) -> None:
+    def __init__(self, *, given: float, pulses_per_trigger: int, block: int, marks: int = 1
+                 ) -> None:
         self.given, self.block = given, block
+        self._window, self._of_marks = max(_WINDOW, 3 * marks), _OF_MARKS * (marks > 1)
         self._floor = min(_FLOOR * pulses_per_trigger, 0.03)
         self._harmless = min(_HARMLESS * pulses_per_trigger, 0.1)
         self.start(np.zeros(1), scatter=_PRIOR, count=1)
 
-    def start(self, levels: FloatArray, *, scatter: float, count: int) -> None:
-        """Begin with these levels (n,); `count` intervals had this scatter, relative to 1."""
+    def start(self, levels: FloatArray, *, scatter: float, count: int,
+              intervals: FloatArray = _NONE) -> None:
+        """
+        Begin with these levels (n,); `count` intervals had this scatter, relative to 1.
+
+        `intervals` (k,) in s show the tick of a clock.
+        """
         missing = max(_REACH - levels.size, 0)
         self._levels = np.concatenate((np.full(missing, levels[0]), levels[-_REACH:]))
         self._variance = np.full(len(_WEIGHTS), scatter**2)
         self._count = float(count)
         self._chosen = 0
         self._settling = _REACH
-        self._coarse = False
-        self._step = 0.0
+        self._intervals = intervals[-self._window:]
+        self._tick = self._latest = 0.0  # relative to the interval; and when it was seen (s)
+        self._number = 0  # of intervals
+        self._refused: list[tuple[int, float]] = []
         self._set_tolerance()
 
     @property
@@ -122,31 +139,50 @@ class IntervalModel:
                 found = np.where(nearer, other, found)
         return found
 
-    def accept(self, levels: FloatArray) -> None:
-        """Take the next regular levels (n,), n at most `room`."""
+    def accept(self, levels: FloatArray, intervals: FloatArray = _NONE) -> None:
+        """Take the next regular levels (n,), n at most `room`, and their intervals (n,) in s."""
+        self._number += levels.size
         self._levels = np.concatenate((self._levels, levels))
+        self._intervals = np.concatenate((self._intervals, intervals))[-self._window:]
         self._settling = max(self._settling - levels.size, 0)
         if not self.room:
             self._learn()
+
+    def refuse(self, deviation: float) -> None:
+        """Take the deviation of a pulse that is dropped or ends a run; several widen the rest."""
+        if self.given or not abs(deviation) <= _NEAR:
+            return
+        self._refused = [(number, size) for number, size in self._refused
+                         if number > self._number - _OF_LATEST]
+        self._refused.append((self._number, abs(deviation)))
+        if len(self._refused) >= _SEVERAL:
+            scatter = _WIDER * max(size for _, size in self._refused) / _WIDTH
+            self._variance = np.maximum(self._variance, scatter**2)
+            self._refused = []
+            self._set_tolerance()
 
     def jump(self, level: float) -> None:
         """Take a level that was not expected: the next ones may follow it."""
         self.accept(np.array([level]))
         self._settling = _REACH
 
-    def is_clock_step(self, deviation: float, after: float) -> bool:
+    def explains(self, intervals: FloatArray, widths: FloatArray, latest: float) -> bool:
         """
-        Whether the clock of the pulses explains a deviation before an interval of level `after`.
+        Whether a clock explains these doubtful intervals (n,) in s; the tolerance is wider then.
 
-        No shaft has equal intervals. If most are equal, they are read from a slow clock, and one
-        of them is a period longer or shorter now and then.
+        They are from mark to mark, of relative `widths` (n,), and end at the time `latest` (s).
         """
-        found = (self._coarse and abs(deviation) <= _LONGEST_STEP
-                 and abs(after - self.expected) <= self.tolerance)
-        if found:
-            self._step = max(self._step, abs(deviation))
-            self._set_tolerance()
-        return found
+        if self.given:
+            return False
+        length = math.exp(self.expected)
+        if np.any(np.abs(intervals / widths / length - 1.0) > 2.0 * LONGEST_TICK):
+            return False
+        tick = clock_tick(np.concatenate((self._intervals, intervals)), latest) / length
+        if tick <= self._tick:
+            return False
+        before, self._tick, self._latest = self.tolerance, tick, latest
+        self._set_tolerance()
+        return self.tolerance > before
 
     def _predicted(self, kind: int, every: FloatArray, count: int) -> FloatArray:
         """Return what is expected of the last `count` levels, from those before each."""
@@ -166,18 +202,21 @@ class IntervalModel:
             self._variance[kind] += weight * (square - self._variance[kind])
         self._count = min(self._count + self.block, _MEMORY)
         self._chosen = int(np.argmin(self._variance))
-        self._coarse = bool(np.mean(np.abs(np.diff(every)) < _EQUAL) >= 0.5)
         self._levels = every[-_REACH:].copy()
+        if self._tick:  # the smallest so far; others may show that it is a fraction of that
+            tick = clock_tick(self._intervals, self._latest) / math.exp(self.expected)
+            self._tick = min(self._tick, tick or self._tick)
         self._set_tolerance()
 
     def _set_tolerance(self) -> None:
         total = _PRIOR_COUNT * _PRIOR**2 + self._count * float(self._variance[self._chosen])
         #: standard deviation of the error of a prediction, relative to the interval
         learnt = math.sqrt(total / (_PRIOR_COUNT + self._count)) * (1.0 + _UNCERTAIN / self._count)
-        self.scatter = max(learnt, self._floor / _WIDTH)
+        self.scatter = max(learnt, self._floor / _WIDTH,
+                           (_TICKS[self._chosen] + self._of_marks) * self._tick / _WIDTH)
         if self.given:
             self.scatter = min(self.scatter, self.given / _BELIEVED)
-        widest = min(max(_WIDTH * self.scatter, _STEPS * self._step), _WIDEST)
+        widest = min(_WIDTH * self.scatter, _WIDEST)
         #: a deviation up to this is regular
         self.tolerance = self.given or widest
         #: a deviation up to this passes without looking at the next pulse
@@ -198,6 +237,7 @@ def chain_scatter(levels: FloatArray) -> float:
     kinds = [np.abs(np.diff(levels))]
     if levels.size > 3:
         kinds.append(np.abs(np.diff(levels, 2)))
-    typical = [1.48 * float(np.median(kind)) if kind.size > 4
-               else math.sqrt(float(np.mean(np.square(kind)))) for kind in kinds]
-    return min(typical)
+    squares = [np.square(kind) for kind in kinds]
+    return math.sqrt(min(
+        min(_robust_square(square), float(square.mean())) if square.size > 4
+        else float(square.mean()) for square in squares))

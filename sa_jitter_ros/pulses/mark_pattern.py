@@ -24,6 +24,7 @@ _FEWEST = 2  # intervals of a mark
 _SIGNIFICANT = 4.0
 # Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
+_CLEAN = 0.25  # of all pairs of revolutions are without a stray, at least
 
 
 @dataclass(frozen=True)
@@ -102,15 +103,19 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     change = levels[count:] - levels[:-count]
     windows = np.lib.stride_tricks.sliding_window_view(change, count)
     apart = windows.max(axis=1) - windows.min(axis=1)  # apart from a change of speed
+    near = np.abs(windows).max(axis=1) <= _CHANGE
     for tolerance in _REPEATING:
-        fits = np.flatnonzero((apart <= tolerance) & (np.abs(windows).max(axis=1) <= _CHANGE))
+        fits = np.flatnonzero((apart <= tolerance) & near)
         if fits.size:
             begin = int(fits[0])
             slope = float(windows[begin].mean()) / count
             two = (levels[begin:begin + 2 * count].reshape(2, count)
                    - slope * np.arange(2 * count).reshape(2, count))
             widths = two.mean(axis=0)
-            scatter = float(np.std(two[1] - two[0])) + float(np.median(apart[fits])) / 4.0
+            # Of large jitter some repeat by chance, which tell too small a scatter.
+            typical = max(float(np.median(apart[fits])) / 4.0,
+                          float(np.quantile(apart[near], _CLEAN)) / 3.0)
+            scatter = float(np.std(two[1] - two[0])) + typical
             return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
     return None
 

@@ -50,7 +50,8 @@ class Lock:
     For every tooth present (m,), counted from the index: `steps` to the next one in teeth, `teeth`
     its number, and `widths`, the steps with what is known of uneven marks. Deviations of the
     interval behind it within `believed` are expected as long as the widths are not known.
-    `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`.
+    `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`;
+    `intervals` (k,) in s are those from tooth to tooth.
     """
 
     first: int
@@ -62,6 +63,7 @@ class Lock:
     believed: FloatArray
     scatter: float
     known: int
+    intervals: FloatArray
 
     @property
     def even(self) -> bool:
@@ -134,12 +136,13 @@ class EvenTarget:
         if found is None:
             return None
         chain, steps = found
-        levels = np.log(np.diff(pulses[start + chain]) / steps)
+        gaps = np.diff(pulses[start + chain])
+        levels = np.log(gaps / steps)
         ones = np.ones(self.marks, dtype=np.int64)
         return Lock(first=start + int(chain[0]), slot=0, interval=float(np.exp(levels[0])),
                     steps=ones, teeth=np.arange(self.marks), widths=ones.astype(np.float64),
                     believed=np.zeros(self.marks), scatter=chain_scatter(levels),
-                    known=levels.size)
+                    known=levels.size, intervals=gaps[steps == 1])
 
 
 class ToothedWheel:
@@ -206,7 +209,8 @@ class ToothedWheel:
                                 steps=steps, teeth=np.cumsum(steps) - steps,
                                 widths=steps.astype(np.float64),
                                 believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
-                                scatter=chain_scatter(levels), known=levels.size)
+                                scatter=chain_scatter(levels), known=levels.size,
+                                intervals=intervals[np.roll(steps, -slot) == 1])
         return None
 
     def _tolerances(self, steps: IntArray) -> FloatArray:
