@@ -12,7 +12,7 @@
 The tick of a slow clock that times the pulses, from the intervals of a few of them.
 
 No shaft has equal intervals. If most are equal, a clock rounds them, and all are whole multiples
-of its tick. `sa_jitter_ros.keyphasor_check.clock` finds the ticks of fine clocks, from whole records.
+of its tick. `sa_jitter_ros.keyphasor_check.clock` finds those of fine clocks, from whole records.
 """
 
 import numpy as np

@@ -114,7 +114,7 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
             widths = two.mean(axis=0)
             # Of large jitter some repeat by chance, which tell too small a scatter.
             typical = max(float(np.median(apart[fits])) / 4.0,
-                          float(np.quantile(apart[near], _CLEAN)) / 3.0)
+                          min(float(np.quantile(apart[near], _CLEAN)) / 3.0, tolerance))
             scatter = float(np.std(two[1] - two[0])) + typical
             return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
     return None
