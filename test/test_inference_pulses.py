@@ -137,20 +137,15 @@ def delayed(recording, late):
     return replace(recording, pulse_times=times + np.resize(late, times.size))
 
 
-@pytest.mark.parametrize(('marks', 'step', 'target'), [
-    (1, 1, 'a target with 1 mark'), (4, 4, 'a target with 4 marks'),
-    (4, 1, 'a target of 4 marks')])
-def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step, target):
+@pytest.mark.parametrize(('marks', 'step'), [(1, 1), (4, 4), (4, 1)])
+def test_errors_that_repeat_with_no_revolution_are_no_target(marks, step):
     """They are a hum's, say, and the reader sees that they repeat."""
     recording, model = geared(marks, step)
     hum = 2e-4 * np.sin(2.0 * np.pi * (np.arange(5 * step) / step + 0.2) / 5.0)
     found = traced(delayed(recording, hum), model)
-    (why,) = (item.rejected_because for item in found.candidates
-              if item.name == 'target_geometry')
     assert found.verdict == 'unexplained'
     assert not found.findings
-    assert 'repeat every 5 trigger pulses' in why
-    assert f'which no mark of {target}' in why
+    assert found.left.direction == 'pulses'
 
 
 def test_errors_that_repeat_with_the_revolution_are_a_target():

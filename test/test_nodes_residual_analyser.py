@@ -148,7 +148,7 @@ def test_trace_names_the_effect_and_its_size():
     assert effect.name == 'excess_jitter'
     assert effect.effect.std == pytest.approx(5e-5, abs=4.0 * effect.standard_errors['std'])
     assert found.after.rms < 0.2 * found.before.rms
-    reasons = {item.name: item.rejected_because for item in found.candidates if item.stage == 1}
+    reasons = {item.name: item.rejected_because for item in found.candidates}
     assert 'run close_loop on a recording' in reasons['speed_fluctuation']
 
 

@@ -11,10 +11,12 @@
 """Additive noise: white noise on the vibration that the declared model lacks."""
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.effect import (
+    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -27,7 +29,7 @@ _LINES = 0.01
 
 
 @dataclass(frozen=True)
-class AdditiveNoise(Effect):
+class AdditiveNoise(DirectEffect):
     """White noise of `std` per vibration sample, on top of the declared noise."""
 
     name: ClassVar[str] = 'additive_noise'
@@ -46,17 +48,33 @@ class AdditiveNoise(Effect):
         return np.full(len(model.orders), variance)
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit the noise around the lines, beyond what was declared."""
-        lines = evidence.lines
+    def _power(cls, evidence: Evidence) -> tuple[float, float, float]:
+        """Return the declared power of the noise, that beyond it, and its standard error."""
         known = evidence.model.noise_std**2 + sum(
             effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
-        power = lines.noise_density**2
+        power = evidence.lines.noise_density**2
         count, width = power.shape
+        if not width:
+            return known, math.nan, math.nan
         value = float(np.median(power.mean(axis=0))) - known
         # Of a median over lines of means over acquisitions; lines of other noise do not count.
         scatter = float(np.median(power.std(axis=0, ddof=1)))
-        error = scatter * np.sqrt(max(1.0, 0.5 * np.pi * (width > 2)) / (count * width))
+        return known, value, scatter * math.sqrt(
+            max(1.0, 0.5 * math.pi * (width > 2)) / (count * width))
+
+    @classmethod
+    def limit(cls, evidence: Evidence) -> Effect | None:
+        """Return the noise beyond the declared one that the noise around the lines allows."""
+        _, value, error = cls._power(evidence)
+        if not math.isfinite(value):
+            return None
+        return cls(math.sqrt(max(value, 0.0) + ONE_SIDED * error))
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> Finding:
+        """Fit the noise around the lines, beyond what was declared."""
+        known, value, error = cls._power(evidence)
+        count = len(evidence.lines.noise_density)
         # Lines of an average share its noise floor at worst: only acquisitions are independent.
         p_value = float(stats.t.sf(value / error, count - 1)) if error > 0.0 else 1.0
         if not p_value < _SIGNIFICANT:

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.effect import (
+    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -65,7 +66,7 @@ class SlowGain:
 
 
 @dataclass(frozen=True)
-class AmplitudeModulation(Effect):
+class AmplitudeModulation(DirectEffect):
     """
     A slow random gain of mean 1 and standard deviation `std`, common to a shaft's orders.
 
@@ -90,17 +91,23 @@ class AmplitudeModulation(Effect):
         return processes
 
     @classmethod
+    def limit(cls, evidence: Evidence) -> Effect | None:
+        """Return the modulation that the amplitudes of the lines together allow."""
+        if evidence.lines.radial.shape[2] < 2:
+            return None
+        rows = _together(evidence)[2].mean(axis=1)
+        error = float(rows.std(ddof=1) / np.sqrt(len(rows)))
+        return cls(min(float(np.sqrt(max(rows.mean(), 0.0) + ONE_SIDED * error)), 1.0))
+
+    @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit what is common to the amplitudes of all lines, cycle by cycle."""
         radial = evidence.lines.radial
         known = sum(effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
-        weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
         if radial.shape[2] < 2:
             return absent(cls.name, 'one line alone cannot distinguish modulation from noise')
-        common = radial @ weight
-        own = radial**2 @ weight**2
+        common, weight, product = _together(evidence)
         pairs = weight.sum() ** 2 - np.sum(weight**2)
-        product = (common**2 - own) / pairs  # mean product of different lines, each cycle
         rows = product.mean(axis=1)
         variance, error = float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(len(rows)))
         # Without a modulation the lines are independent noise of a known size.
@@ -119,6 +126,15 @@ class AmplitudeModulation(Effect):
                 f'p = {p_value:.2g}')
         return Finding(cls.name, cls(std, bandwidth), {
             'std': std_error, 'bandwidth': bandwidth_error}, p_value, text)
+
+
+def _together(evidence: Evidence) -> tuple[Array, Array, Array]:
+    """Return the weighted sum over lines, the weights, and the mean product of different lines."""
+    radial = evidence.lines.radial
+    weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
+    common = radial @ weight
+    pairs = weight.sum() ** 2 - np.sum(weight**2)
+    return common, weight, np.asarray((common**2 - radial**2 @ weight**2) / pairs)
 
 
 def _chance(mean: float, weight: Array, count: int) -> float:

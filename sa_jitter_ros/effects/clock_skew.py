@@ -10,17 +10,20 @@
 
 """Clock skew: the keyphasor's clock runs faster or slower than that of the vibration."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
-from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import stats
 
-_SIGNIFICANT = 1e-3
+
+def _growing(setting: Setting) -> Array:
+    """Return the time that has gone by, in trigger periods."""
+    return np.asarray(setting.times - setting.times.mean())[None] / setting.model.trigger_period
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,7 @@ class ClockSkew(Effect):
 
     name: ClassVar[str] = 'clock_skew'
     summary: ClassVar[str] = 'speed of the keyphasor clock relative to the vibration clock'
+    timing: ClassVar[Pattern] = Pattern(_growing, show_in_times=False)
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
 
@@ -44,19 +48,12 @@ class ClockSkew(Effect):
         return np.asarray(self.skew * (pulses.times - pulses.times[0]))
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit the slope of the pulse errors over time, the same in all acquisitions."""
-        times = evidence.times
-        if len(times) < 3:
-            return absent(cls.name, 'too few acquisitions to compare the slopes of their errors')
-        x = times - times.mean(axis=1, keepdims=True)
-        slopes = np.sum(x * evidence.errors, axis=1) / np.sum(x**2, axis=1)
-        spread = float(slopes.std(ddof=1))
-        skew, error = float(slopes.mean()), spread / np.sqrt(len(slopes))
-        p_value = float(2.0 * stats.t.sf(abs(skew) / max(error, 1e-300), len(slopes) - 1))
-        text = (f'the pulse errors grow by {skew:.3g} +- {error:.2g} s a second in every '
-                f'acquisition, p = {p_value:.2g}')
-        if p_value > _SIGNIFICANT:
-            return absent(cls.name, f'no common slope of the pulse errors: {text}',
-                          p_value=p_value)
-        return Finding(cls.name, cls(skew), {'skew': error}, p_value, text)
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['ClockSkew', Mapping[str, Any]]:
+        """Return the skew that delays a pulse by some units more every trigger period."""
+        skew = setting.unit / setting.model.trigger_period
+        return cls(skew * float(sizes[0])), {'skew': skew * float(np.sqrt(errors[0, 0]))}
+
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the units by which a pulse comes later every trigger period."""
+        return np.array([self.skew * setting.model.trigger_period / setting.unit])

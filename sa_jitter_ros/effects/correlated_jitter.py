@@ -10,22 +10,19 @@
 
 """Correlated jitter: normal pulse errors with memory (a wandering trigger level)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_in_turn
-from sa_jitter_ros.effects.evidence import Evidence, root
-from sa_jitter_ros.effects.pulse_covariance import fit_memory, goodness_of_fit, memory_p_value
-from sa_jitter_ros.effects.slope_test import require_tach_side
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
+from sa_jitter_ros.effects.timing import autoregressive, PULSES, Setting, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _FORGOTTEN = 1e-3
-_SIGNIFICANT = 0.01  # the better of two explanations, not the existence of one
 
 
 @dataclass(frozen=True)
@@ -35,6 +32,8 @@ class CorrelatedJitter(Effect):
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'
     needs_pulse_errors: ClassVar[bool] = True
+    timing: ClassVar[Spectrum] = Spectrum(
+        PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5)), (-9.0, -2.0), (9.0, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
                                    minimum=-0.999, maximum=0.999)
@@ -57,19 +56,15 @@ class CorrelatedJitter(Effect):
         return np.asarray(self.std**2 * self.correlation ** np.abs(lags))
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit variance and memory of the pulse errors; independent errors are `excess_jitter`."""
-        fit = fit_memory(evidence)
-        std, error = root(fit.variance, fit.variance_error)
-        if std == 0.0:
-            return absent(cls.name, 'the pulse errors vary no more than declared')
-        p_value = memory_p_value(evidence.of_all)
-        text = (f'pulse errors of {std:.3g} s correlated by {fit.shape:.2f} from pulse to pulse, '
-                f'p = {p_value:.2g} if they were independent')
-        if p_value > _SIGNIFICANT:
-            return absent(cls.name, f'the pulse errors are not correlated: {text}',
-                          p_value=p_value)
-        contradiction = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
-        return Finding(cls.name, cls(std, fit.shape),
-                       {'std': error, 'correlation': fit.shape_error},
-                       min(p_value, fit.p_value), text, contradiction)
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['CorrelatedJitter', Mapping[str, Any]]:
+        """Return standard deviation and correlation of a logarithm of power and an artanh."""
+        std = float(setting.unit * np.exp(0.5 * sizes[0]))
+        rho = float(np.tanh(sizes[1]))
+        return cls(std, rho), {'std': 0.5 * std * float(errors[0]),
+                               'correlation': (1.0 - rho**2) * float(errors[1])}
+
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the logarithm of the power and the artanh of the correlation."""
+        return np.array([2.0 * np.log(max(self.std / setting.unit, 1e-9)),
+                         np.arctanh(self.correlation)])

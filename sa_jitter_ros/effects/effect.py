@@ -23,12 +23,15 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
 
+#: What a normal variable exceeds with 5 %, in standard deviations.
+ONE_SIDED = 1.6449
 _MOST_ERRORS = 4_000_000  # of pulses in all scenarios
 
 
@@ -99,24 +102,58 @@ class Effect(Influence):
     #: Whether the vibration moves while the pulse times are correct; recovery shows pulse errors.
     pulse_times_correct: ClassVar[bool] = False
 
+    #: How it shows in pulse times and recovered pulse errors, None where it does not.
+    timing: ClassVar[Spectrum | Pattern | None] = None
+    #: What would distinguish it from the effects that look like it.
+    deciding_measurement: ClassVar[str] = 'a longer recording, or one at other speeds'
+
     def __post_init__(self) -> None:
         """Check every parameter."""
         for name, limits in parameter_ranges(type(self)).items():
             limits.check(f'{self.name}.{name}', getattr(self, name))
 
-    @classmethod
-    def fit(cls, evidence: Evidence) -> 'Finding':
-        """
-        Return the effect that fits the evidence best, what supports and what contradicts it.
+    @property
+    def random(self) -> bool:
+        """Return whether its errors are drawn at random, so that only their size is known."""
+        return self.scatters or not isinstance(self.timing, Pattern)
 
-        An effect that overrides nothing here can be declared, but is not looked for.
+    @classmethod
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['Effect', Mapping[str, Any]]:
         """
-        return absent(cls.name, 'it can be declared, but nothing looks for it in a recording')
+        Return the effect, and the standard errors of its parameters, of what `timing` was fitted.
+
+        `sizes` are the parameters of the spectrum, or the sizes of the columns of the pattern;
+        `errors` their standard errors, of a pattern their covariance.
+        """
+        raise NotImplementedError
+
+    def remark(self, model: DeclaredModel) -> str:
+        """Return what is to be said of the fitted effect beside its parameters, '' for nothing."""
+        return ''
+
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the `sizes` of the effect as it is."""
+        raise NotImplementedError
 
     @property
     def values(self) -> Mapping[str, Any]:
         """Return the parameters by name."""
         return {name: getattr(self, name) for name in parameter_ranges(type(self))}
+
+
+class DirectEffect(Effect):
+    """Base class of the effects whose size is read from the lines, or from the pulses missing."""
+
+    @classmethod
+    def fit(cls, evidence: Evidence) -> 'Finding':
+        """Return the effect that fits the evidence best, what supports and what contradicts it."""
+        raise NotImplementedError
+
+    @classmethod
+    def limit(cls, evidence: Evidence) -> Effect | None:
+        """Return the largest such effect that the evidence allows at 95 %, None for no limit."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -128,7 +165,9 @@ class Finding:
     parameter; `p_value` is the probability of evidence at least this strong if the effect is
     absent; `evidence` describes it in words. `contradiction` says what in the data contradicts
     the effect, '' if nothing does. `indistinguishable_from` names effects that this evidence
-    cannot distinguish from it, `deciding_measurement` a measurement that could.
+    cannot distinguish from it, `deciding_measurement` a measurement that could. `largest_change`
+    is the largest change, over the lines, of the mean attenuation or of the standard deviation of
+    one average that the effect makes, NaN where it is not known.
     """
 
     name: str
@@ -139,6 +178,7 @@ class Finding:
     contradiction: str = ''
     indistinguishable_from: Sequence[str] = ()
     deciding_measurement: str = ''
+    largest_change: float = math.nan
 
 
 def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:

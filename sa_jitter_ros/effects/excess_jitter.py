@@ -10,22 +10,16 @@
 
 """Excess jitter: independent normal pulse errors beyond the declared ones (electrical noise)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_in_turn
-from sa_jitter_ros.effects.evidence import Evidence, root
-from sa_jitter_ros.effects.pulse_covariance import (
-    fit_covariance, goodness_of_fit, memory_p_value, white)
-from sa_jitter_ros.effects.slope_test import require_tach_side
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
+from sa_jitter_ros.effects.timing import PULSES, Setting, Spectrum, white
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-
-_HINT = 0.05  # the p value of a memory that is hardly chance, and no proof
-_DECIDING = 'more acquisitions, or longer ones'
 
 
 @dataclass(frozen=True)
@@ -35,6 +29,7 @@ class ExcessJitter(Effect):
     name: ClassVar[str] = 'excess_jitter'
     summary: ClassVar[str] = 'independent normal pulse errors'
     needs_pulse_errors: ClassVar[bool] = True
+    timing: ClassVar[Spectrum] = Spectrum(PULSES, white, ((0.0,),), (-9.0,), (9.0,))
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)
 
@@ -52,17 +47,12 @@ class ExcessJitter(Effect):
         return np.asarray(np.where(np.asarray(lags) == 0, self.std**2, 0.0))
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit the variance that the pulse errors have beyond the expected one."""
-        fit = fit_covariance(evidence, white)
-        std, error = root(fit.variance, fit.variance_error)
-        if std == 0.0:
-            return absent(cls.name, 'the pulse errors vary no more than declared')
-        text = (f'the pulse errors have {fit.observed_std:.3g} s where '
-                f'{fit.expected_std:.3g} s were expected, p = {fit.p_value:.2g}')
-        contradiction = require_tach_side(evidence) or goodness_of_fit(evidence, fit)
-        unsure = memory_p_value(evidence.of_all) < _HINT
-        return Finding(
-            cls.name, cls(std), {'std': error}, fit.p_value, text, contradiction,
-            indistinguishable_from=('correlated_jitter',) if unsure else (),
-            deciding_measurement=_DECIDING if unsure else '')
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['ExcessJitter', Mapping[str, Any]]:
+        """Return the standard deviation of a logarithm of power."""
+        std = float(setting.unit * np.exp(0.5 * sizes[0]))
+        return cls(std), {'std': 0.5 * std * float(errors[0])}
+
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the logarithm of the power."""
+        return np.array([2.0 * np.log(max(self.std / setting.unit, 1e-9))])

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
+from sa_jitter_ros.effects.effect import (
+    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.model import DeclaredModel
 
@@ -23,7 +24,7 @@ _MOST = 1e6
 
 
 @dataclass(frozen=True)
-class InterferingTone(Effect):
+class InterferingTone(DirectEffect):
     """A tone of `frequency` Hz and peak `amplitude` on every channel."""
 
     name: ClassVar[str] = 'interfering_tone'
@@ -41,6 +42,14 @@ class InterferingTone(Effect):
         passed = (np.sinc((self.frequency - line) * model.duration) ** 2
                   + np.sinc((self.frequency + line) * model.duration) ** 2)
         return np.asarray(self.amplitude**2 * passed)
+
+    @classmethod
+    def limit(cls, evidence: Evidence) -> Effect | None:
+        """Return the strongest line that may be no order of the shaft."""
+        tone = evidence.lines.tone
+        if tone is None or not tone.standard_error >= 0.0:
+            return None
+        return cls(tone.frequency, tone.amplitude + ONE_SIDED * tone.standard_error)
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter
+from sa_jitter_ros.effects.effect import absent, Array, DirectEffect, Finding, parameter
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -24,7 +24,7 @@ METHODS = ('band_limited', 'linear', 'cubic', 'spline')
 
 
 @dataclass(frozen=True)
-class InterpolationLoss(Effect):
+class InterpolationLoss(DirectEffect):
     """The samples were interpolated by `method`, at places that are even between the samples."""
 
     name: ClassVar[str] = 'interpolation_loss'

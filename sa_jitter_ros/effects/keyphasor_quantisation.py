@@ -17,24 +17,30 @@ repeat, p_{k+1} = p_k - T f mod 1, so that the mean over all starting phases nee
 average shows: where pulses were measured, the prediction is made for their own phases.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, Effect, Finding, most_scenarios, parameter, require_in_turn)
-from sa_jitter_ros.effects.evidence import Evidence, root
+    Array, Effect, most_scenarios, parameter, require_in_turn)
+from sa_jitter_ros.effects.evidence import root
+from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import stats
 
 _PHASES, _SEED = 128, 6
 _SAME_RATE = 0.01
-_SIGNIFICANT = 1e-4
-# Least correlation of the errors with those that a grid imposes; what the grid does not see of the
-# motion makes the slope flatter, but other errors make it steeper.
-_ALIKE, _STEEPEST = 0.5, 1.5
+_PARTS = 8
+_SLOPE = 1.0, 0.25  # of the errors over those that a grid imposes, and what it may be off by
+
+
+def _of_grid(setting: Setting) -> Array:
+    """Return the errors that the grid of the clock imposes on a smooth motion, if there is one."""
+    if setting.clock_errors is None:
+        return np.zeros((0, setting.times.size))
+    return np.asarray(setting.clock_errors)[None] / setting.unit
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class KeyphasorQuantisation(Effect):
 
     name: ClassVar[str] = 'keyphasor_quantisation'
     summary: ClassVar[str] = 'pulse times on the grid of a clock'
+    timing: ClassVar[Pattern] = Pattern(_of_grid, about=_SLOPE, replaces_jitter=True)
     clock_rate: float = parameter(10000.0, 'rate of the clock that times the pulses', 'Hz',
                                   above=0.0)
     period_std: float = parameter(0.0, 'standard deviation of the trigger period', 's',
@@ -77,36 +84,16 @@ class KeyphasorQuantisation(Effect):
         return abs(self.clock_rate / model.keyphasor_rate - 1.0) < _SAME_RATE
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Test whether the errors are those that the grid of the pulse times imposes."""
-        clock = evidence.clock.rate
-        if not clock > 0.0:
-            return absent(cls.name, 'the pulse times lie on no grid of a clock')
-        known = np.array([pulses.errors for pulses in evidence.pulses], dtype=float)
-        errors, known = evidence.errors.ravel(), known - known.mean(axis=1, keepdims=True)
-        correlation, p_value = stats.pearsonr(errors, known.ravel())
-        slope = float(errors @ known.ravel() / np.sum(known**2))
-        std, std_error = _period_std(evidence)
-        text = (f'the pulse times lie on a grid of {clock:.6g} Hz, and the errors that the grid '
-                f'imposes on a smooth motion are the recovered ones: correlation '
-                f'{correlation:.3f}, slope {slope:.2f}, p = {p_value:.2g}')
-        if p_value > _SIGNIFICANT or correlation < _ALIKE or slope > _STEEPEST:
-            return absent(cls.name, f'the pulse times lie on a grid of {clock:.6g} Hz, but their '
-                          f'errors are others: correlation {correlation:.3f}, slope {slope:.2f}',
-                          p_value=p_value)
-        return Finding(cls.name, cls(clock, std),
-                       {'clock_rate': evidence.clock.standard_error, 'period_std': std_error},
-                       float(p_value), text)
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['KeyphasorQuantisation', Mapping[str, Any]]:
+        """Return the clock whose grid the pulses lie on, and how much the period varies."""
+        periods = np.diff(setting.true_times)
+        power = (periods - periods.mean()) ** 2
+        # a slow speed moves neighbouring periods together: parts of the recording count
+        parts = [part.mean() for part in np.array_split(power, _PARTS)]
+        std, error = root(float(power.mean()), float(np.std(parts, ddof=1) / np.sqrt(_PARTS)))
+        return cls(setting.clock_rate, std), {'period_std': error}
 
-
-def _period_std(evidence: Evidence) -> tuple[float, float]:
-    """
-    Return the standard deviation of the trigger period in s and its standard error.
-
-    True pulses are the measured ones less their errors, whose noise is taken out of the periods'
-    variance. A slow speed moves neighbouring periods together: acquisitions count, not periods.
-    """
-    periods = np.diff(evidence.unexplained_times - evidence.errors, axis=1)
-    noise = np.nan_to_num(evidence.standard_errors) ** 2
-    rows = np.mean((periods - periods.mean()) ** 2 - noise[:, 1:] - noise[:, :-1], axis=1)
-    return root(float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(rows.size)))
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the slope of the errors over those that a grid imposes."""
+        return np.array([_SLOPE[0]])

@@ -23,7 +23,8 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import legendre
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, most_scenarios, parameter
+from sa_jitter_ros.effects.effect import (
+    absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, joint_characteristic, unit_nodes)
@@ -34,11 +35,12 @@ from scipy.special import spherical_jn
 
 _SCENARIOS, _SEED = 256, 4
 _RULE = unit_nodes(20)
+_NONE_SEEN = 3.0  # expected losses of which none is seen once in twenty times
 _RARE = 1e-12  # probability of the losses that are left out
 
 
 @dataclass(frozen=True)
-class MissingPulses(Effect):
+class MissingPulses(DirectEffect):
     """Every trigger pulse is lost with `probability`."""
 
     name: ClassVar[str] = 'missing_pulses'
@@ -81,6 +83,11 @@ class MissingPulses(Effect):
             return None
         period = mean_period(pulses.times, pulses.missing)
         return np.asarray(period * np.concatenate(([0.0], np.cumsum(pulses.missing))))
+
+    @classmethod
+    def limit(cls, evidence: Evidence) -> Effect | None:
+        """Return the probability of losses of which these pulses could show none."""
+        return cls(min(_NONE_SEEN / max(evidence.record_missing.size, 1), 0.9))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

@@ -16,14 +16,30 @@ a phase, the same in every average. Where the speed changes from average to aver
 follows it; where it changes within one, the cycles turn apart and the amplitude shrinks.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import mean_period, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy.ndimage import gaussian_filter1d
+
+
+_SMOOTH = 6.0  # trigger cycles over which a speed is taken
+_STEADY = 1e-4  # relative spread of the speed: below it a delay is a phase
+
+
+def _of_speed(setting: Setting) -> Array:
+    """Return what a delay adds at the speed of each pulse to the turn of all; none if steady."""
+    speed = gaussian_filter1d(setting.model.trigger_period / np.gradient(setting.true_times),
+                              _SMOOTH, mode='nearest')
+    if np.std(speed) < _STEADY:
+        return np.zeros((0, speed.size))
+    return np.asarray(speed - speed.mean())[None]
 
 
 @dataclass(frozen=True)
@@ -36,8 +52,20 @@ class PathDelay(Effect):
 
     name: ClassVar[str] = 'path_delay'
     summary: ClassVar[str] = 'pulses late by a constant time'
+    timing: ClassVar[Pattern] = Pattern(_of_speed, show_in_times=False)
     delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
                              's', minimum=-1.0, maximum=1.0)
+
+    @classmethod
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['PathDelay', Mapping[str, Any]]:
+        """Return the delay of some units."""
+        return cls(setting.unit * float(sizes[0])), {
+            'delay': setting.unit * float(np.sqrt(errors[0, 0]))}
+
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the delay in units."""
+        return np.array([self.delay / setting.unit])
 
     def gain(self, model: DeclaredModel) -> ArrayLike:
         """Return the turn of each order at the speed of the model."""

@@ -10,26 +10,20 @@
 
 """Phase wander: the source moves relative to the tach shaft (torsion, changing transfer path)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND, slow_band,
     slow_memory, WIDEST)
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
-from sa_jitter_ros.effects.evidence import Evidence, root
-from sa_jitter_ros.effects.pulse_covariance import fit_covariance, fit_memory, white
-from sa_jitter_ros.effects.slope_test import slope_test
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
+from sa_jitter_ros.effects.timing import low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _NARROW = 0.05
-_DECIDING = 'a second keyphasor, or a steadier speed'
-_SIGNIFICANT = 1e-3
-_MOST_BESIDE = 4.0  # variance of independent errors beside that of the wander
-_FREEDOM = 2.0  # what one more parameter gains by chance, Akaike's criterion
 
 
 @dataclass(frozen=True)
@@ -45,6 +39,10 @@ class PhaseWander(Effect):
     summary: ClassVar[str] = 'slow motion of the source relative to the tach shaft'
     pulse_times_correct: ClassVar[bool] = True
     needs_pulse_errors: ClassVar[bool] = True
+    timing: ClassVar[Spectrum] = Spectrum(
+        SOURCE, low_passed,
+        tuple((0.0, float(np.log(edge)), 0.7) for edge in (_NARROW, 0.15, 0.4)),
+        (-9.0, None, 0.0), (14.0, float(np.log(0.5)), 2.0))
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
     bandwidth: float = parameter(
@@ -72,46 +70,17 @@ class PhaseWander(Effect):
         return np.asarray(seconds**2 * recovered_correlation(lags, slow_band(self.bandwidth)))
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit slow errors that the measured pulse times do not have."""
-        if evidence.against_reference:
-            return absent(cls.name, 'relative to a better keyphasor the source cannot move')
-        slope = slope_test(evidence.of_all)
-        if slope.tach_side:
-            return absent(cls.name, 'the pulse times move as the recovered errors do: the '
-                          f'vibration makes {slope.share:.2f} +- {slope.standard_error:.2f} of '
-                          'the motion', p_value=slope.p_value)
-        fit = fit_covariance(evidence, _correlation, bounds=(_NARROW, WIDEST))
-        bandwidth, bandwidth_error = fit.shape, fit.shape_error
-        # Independent errors beside a wander must not swell it.
-        beside = fit_covariance(
-            evidence, lambda lags, share: _correlation(lags, SLOW_BAND[1]) + share * white(
-                lags, 0.0), bounds=(0.0, _MOST_BESIDE))
-        if beside.p_value_over(fit) < _SIGNIFICANT:
-            fit, bandwidth, bandwidth_error = beside, SLOW_BAND[1], float('nan')
-        if fit.variance == 0.0:
-            return absent(cls.name, 'the pulse errors vary no more than declared')
-        seconds, error = root(fit.variance, fit.variance_error)
-        rad = 2.0 * np.pi * evidence.model.fundamental_frequency
-        text = (f'the vibration moves by {seconds:.3g} s relative to the pulses, whose times do '
-                f'not show {slope.share:.2f} +- {slope.standard_error:.2f} of the motion, '
-                f'p = {slope.p_value:.2g}')
-        rivals = () if slope.decided else ('correlated_jitter',)
-        contradiction = ''
-        if rivals:
-            whole = evidence.of_all
-            better = max(fit_covariance(whole, white).gain, fit_memory(whole).gain - _FREEDOM)
-            wander = fit_covariance(whole, _correlation, bounds=(_NARROW, WIDEST)).gain - _FREEDOM
-            if better > wander:
-                contradiction = (
-                    'independent or autoregressive pulse errors explain them better: twice the '
-                    f'log-likelihood gains {better:.1f} with them, {wander:.1f} with a wander')
-        return Finding(cls.name, cls(rad * seconds, bandwidth),
-                       {'std': rad * error, 'bandwidth': bandwidth_error},
-                       max(fit.p_value, 1e-300), text, contradiction,
-                       indistinguishable_from=rivals,
-                       deciding_measurement=_DECIDING if rivals else '')
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['PhaseWander', Mapping[str, Any]]:
+        """Return standard deviation and bandwidth of logarithms of power and edge."""
+        rad = 2.0 * np.pi * setting.model.fundamental_frequency
+        std = float(rad * setting.unit * np.exp(0.5 * sizes[0]))
+        edge = float(np.exp(sizes[1]))
+        return cls(std, float(np.clip(edge, _NARROW, 0.5))), {
+            'std': 0.5 * std * float(errors[0]), 'bandwidth': edge * float(errors[1])}
 
-
-def _correlation(lags: Array, bandwidth: float) -> Array:
-    return recovered_correlation(lags, slow_band(bandwidth))
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the logarithms of power and edge, and of a steep slope."""
+        rad = 2.0 * np.pi * setting.model.fundamental_frequency
+        return np.array([2.0 * np.log(max(self.std / rad / setting.unit, 1e-9)),
+                         np.log(self.bandwidth), 2.0])

@@ -17,21 +17,11 @@ from typing import ClassVar
 import numpy as np
 from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, fading, ripple_of_acceleration, slow_memory)
-from sa_jitter_ros.effects.effect import absent, Array, Effect, Finding, parameter, require_below
-from sa_jitter_ros.effects.evidence import Evidence, root
+from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError, unit_nodes
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights
-from scipy import stats
 
-_SIGNIFICANT = 1e-4
-_FEWEST = 2  # acquisitions
-# Noise moves a cycle's ripple up where it moves the pulses at its ends down: of the least squares
-# fit of both, minus their covariance in the regression below over the variance of the ripple.
-_COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
-_APART = (2.0 + _COSINE) / 90.0 - (1.0 + _COSINE) / 72.0
-_SHARED = float(np.mean((1.0 - _COSINE**2) / (12.0 * _APART))
-                / np.mean((2.0 + _COSINE) / (3.0 * _APART)))
 _FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(128)  # enough for the memory of slow motions
 _MOST_KEPT = 500  # covariances at the same places
 
@@ -76,48 +66,10 @@ class SpeedFluctuation(Effect):
             faded, slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fit the ripple inside the cycles, which the true pulse times must show as well."""
-        model = evidence.model
-        resolved = np.all(np.isfinite(evidence.ripple), axis=1)  # not where a pulse lacks
-        if np.count_nonzero(resolved) < _FEWEST or evidence.ripple[:, 1:-1].size < 12:
-            return absent(cls.name, 'the vibration does not resolve the error inside the cycles')
-        times = evidence.unexplained_times[resolved]
-        expected = _inside(times - evidence.errors[resolved])  # s, at all cycles but the outer two
-        ripple = evidence.ripple[resolved, 1:-1]
-        noise = evidence.ripple_standard_error**2
-        rows = np.mean(evidence.ripple[resolved] ** 2, axis=1)
-        variance = float(rows.mean() - noise)
-        size, error = root(variance, float(rows.std(ddof=1) / np.sqrt(rows.size)))
-        fit = stats.linregress(expected.ravel(), ripple.ravel())
-        shared = 0.0 if evidence.against_reference else _SHARED * noise
-        slope, slope_error = fit.slope + shared / float(expected.var()), fit.stderr
-        p_value = float(stats.t.sf(slope / slope_error, expected.size - 2))
-        # Radians of the tach shaft per s^2 for a ripple of 1 s.
-        unit = 2.0 * np.pi * model.trigger_revolutions / model.trigger_period**3 / (
-            ripple_of_acceleration(ACCELERATION_BAND))
-        text = (f'an error u (1 - u) of {size:.3g} s inside the cycles '
-                f'follows the acceleration between the pulses with slope {slope:.2f} +- '
-                f'{slope_error:.2f}, p = {p_value:.2g}')
-        if variance <= 0.0 or p_value > _SIGNIFICANT or slope <= 0.0:
-            return absent(cls.name, 'the error inside the cycles does not follow the acceleration '
-                          f'between the pulses: slope {slope:.2f}, p = {p_value:.2g}',
-                          p_value=p_value)
-        contradiction = ''
-        r = slope * float(expected.std() / ripple.std())
-        if r**2 * (1.0 + noise / variance) < 0.4:
-            contradiction = (f'the acceleration between the pulses explains {r**2:.0%} of the '
-                             'error inside the cycles: something faster moves')
-        # Jitter of the pulses has no part in the ripple, a moving source none in the pulses.
-        product = ripple * _inside(times)
-        whole = float(np.mean(ripple * expected)) + shared
-        share = float(product.mean()) / whole
-        unsure = float(product.std() / np.sqrt(product.size)) / abs(whole)
-        if share < 0.5 and share + 3.0 * unsure < 1.0:
-            contradiction = (f'the pulse times show {share:.0%} +- {unsure:.0%} of the '
-                             'acceleration: the source moves')
-        return Finding(cls.name, cls(unit * size), {'acceleration_std': unit * error},
-                       p_value, text, contradiction)
+    def of_ripple(cls, size: float, model: DeclaredModel) -> 'SpeedFluctuation':
+        """Return the acceleration that makes errors size u (1 - u), in s, inside the cycles."""
+        return cls(size / ripple_of_acceleration(ACCELERATION_BAND) / model.trigger_period**2
+                   / _cycles(model, 1.0) / model.trigger_period)
 
 
 def _error_covariance(weights: PulseWeights, variance: float) -> Covariance:
@@ -147,9 +99,3 @@ def _error_covariance(weights: PulseWeights, variance: float) -> Covariance:
 def _cycles(model: DeclaredModel, acceleration: float) -> float:
     """Return an acceleration in rad/s^2 of the tach shaft in trigger cycles/s^2."""
     return acceleration / (2.0 * np.pi * model.trigger_revolutions)
-
-
-def _inside(times: Array) -> Array:
-    """Return the ripple of all cycles but the outer two that `times` of pulses bend by."""
-    bends = np.diff(times, 2, axis=1)
-    return np.asarray(0.25 * (bends[:, :-1] + bends[:, 1:]))

@@ -12,26 +12,35 @@
 Target geometry: marks off their even places, an error that repeats with the revolution.
 
 Which mark begins a trigger cycle repeats with a period that the declared marks and pulses per
-trigger make. Errors that repeat with another one are no target's, but a hum's, say.
+trigger make.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, Effect, Finding, most_scenarios, parameter, require_in_turn)
-from sa_jitter_ros.effects.evidence import Evidence
+    Array, Effect, most_scenarios, parameter, require_in_turn)
+from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import stats
 
-_LONGEST = 24
-_SIGNIFICANT = 1e-4
-_FEWEST = 3  # acquisitions
+
+def _own(model: DeclaredModel) -> tuple[int, int]:
+    """Return how many marks begin trigger cycles, and the pulses in a trigger cycle."""
+    marks = model.pulses_per_revolution
+    step = model.pulses_per_trigger or marks
+    return marks // math.gcd(marks, step), step
+
+
+def _marks(setting: Setting) -> Array:
+    """Return for each mark but the last that begins trigger cycles where it is late, alone."""
+    own, _ = _own(setting.model)
+    mark = np.asarray(setting.index) % own
+    return np.array([(mark == m) * 1.0 - (mark == own - 1) for m in range(own - 1)])
 
 
 @dataclass(frozen=True)
@@ -41,6 +50,7 @@ class TargetGeometry(Effect):
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'
     needs_pulse_errors: ClassVar[bool] = True
+    timing: ClassVar[Pattern] = Pattern(_marks)
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')
 
@@ -73,98 +83,29 @@ class TargetGeometry(Effect):
         return self._at(model, pulses.index) if self.pulse_angles else None
 
     @classmethod
-    def fit(cls, evidence: Evidence) -> Finding:
-        """Fold the pulse errors by the marks that begin trigger cycles: a revolution repeats."""
-        model = evidence.model
-        count = evidence.errors.shape[1]
-        marks = model.pulses_per_revolution
-        step = model.pulses_per_trigger or marks
-        own = marks // math.gcd(marks, step)
-        fold = _folded(evidence, own) if 1 < own < count - 2 else None
-        if own > 1 and fold is None:
-            return absent(cls.name, f'too few pulses to fold by the {own} marks that begin '
-                          f'trigger cycles: {_FEWEST} acquisitions of {own + 2} cycles are needed')
-        if fold is None or fold.log_p_value > math.log(_SIGNIFICANT):
-            others = [p for p in range(2, min(_LONGEST, count // 2) + 1) if own % p]
-            return cls._absent({p: found for p in others if (found := _folded(evidence, p))},
-                               own, marks)
-        p_value = math.exp(max(fold.log_p_value, -690.0))
-        angles, errors = np.zeros(marks), np.full(marks, np.nan)
+    def of_timing(cls, sizes: Array, errors: Array, setting: Setting
+                  ) -> tuple['TargetGeometry', Mapping[str, Any]]:
+        """Return the angles of all marks; those that begin no trigger cycle stay at 0."""
+        own, step = _own(setting.model)
+        marks = setting.model.pulses_per_revolution
+        rad = 2.0 * np.pi * setting.model.trigger_speed * setting.unit
+        angles, unsure = np.zeros(marks), np.full(marks, np.nan)
         places = (np.arange(own) * step) % marks
-        angles[places] = 2.0 * np.pi * model.trigger_speed * fold.mean
-        errors[places] = 2.0 * np.pi * model.trigger_speed * fold.error
-        text = (f'the pulse errors repeat every {own} trigger pulses, as the marks do, with '
-                f'{fold.size:.3g} s, p = {p_value:.2g}')
-        if own < marks:
-            text += (f'; {own} of the {marks} marks begin trigger cycles, nothing is known of '
-                     'the others (0 rad)')
-        return Finding(cls.name, cls(tuple(angles.tolist())),
-                       {'pulse_angles': errors.tolist()}, p_value, text)
+        angles[places] = rad * np.append(sizes, -np.sum(sizes))
+        unsure[places] = rad * np.sqrt(np.append(np.diag(errors), np.sum(errors)))
+        return cls(tuple(angles.tolist())), {'pulse_angles': unsure.tolist()}
 
-    @classmethod
-    def _absent(cls, folds: Mapping[int, '_Fold'], own: int, marks: int) -> Finding:
-        """Say with what period the errors repeat that is none of the target's."""
-        if not folds:
-            return absent(cls.name, 'the pulse errors do not repeat with the pulse index')
-        best = min(folds, key=lambda p: folds[p].criterion)
-        p_value = min(1.0, math.exp(max(folds[best].log_p_value, -690.0)) * len(folds))
-        if p_value > _SIGNIFICANT:
-            return absent(cls.name, 'the pulse errors do not repeat with the pulse index: best '
-                          f'period {best}, p = {p_value:.2g}', p_value=p_value)
-        target = (f'a target of {marks} marks, {own} of which begin trigger cycles,' if own > 1
-                  else f'a target with {marks} mark{"s" * (marks > 1)}, the same every time,')
-        return absent(cls.name, f'the pulse errors repeat every {best} trigger pulses with '
-                      f'{folds[best].size:.3g} s, p = {p_value:.2g}, which no mark of {target} '
-                      'does', p_value=p_value)
+    def remark(self, model: DeclaredModel) -> str:
+        """Return how many marks nothing is known of."""
+        own, _ = _own(model)
+        if own == model.pulses_per_revolution:
+            return ''
+        return (f' ({own} of the {model.pulses_per_revolution} marks begin trigger cycles, '
+                'nothing is known of the others: 0 rad)')
 
-
-@dataclass(frozen=True)
-class _Fold:
-    """
-    Pulse errors folded by the pulse index: `mean` (phase,) and its standard `error` in s.
-
-    The p value of their repeating comes from how acquisitions agree, which any memory of the
-    errors leaves valid; the Bayesian information `criterion` compares periods.
-    """
-
-    mean: Array
-    error: float
-    log_p_value: float
-    criterion: float
-
-    @property
-    def size(self) -> float:
-        """Return the root mean square of what repeats, in s."""
-        return float(np.sqrt(np.mean(self.mean**2)))
-
-
-def _folded(evidence: Evidence, period: int) -> _Fold | None:
-    """
-    Return the errors folded by the index; None where too few acquisitions hold all phases.
-
-    Errors at the ends are rough and left out.
-    """
-    table, phases, errors = [], [], []
-    for row, pulses in zip(evidence.errors[:, 1:-1], evidence.pulses):
-        phase = pulses.index[1:-1] % period
-        often = np.bincount(phase, minlength=period)
-        if np.all(often > 0):  # a gap may hide one
-            folded = np.bincount(phase, row, period) / often
-            table.append(folded - folded.mean())
-            phases.append(phase)
-            errors.append(row)
-    count = len(table)
-    if count < _FEWEST:
-        return None
-    rows = np.array(table)
-    mean = rows.mean(axis=0)
-    between = np.sum((rows - mean) ** 2) / ((count - 1) * (period - 1))
-    ratio = count * np.sum(mean**2) / (period - 1) / max(between, 1e-300)
-    log_p_value = float(stats.f.logsf(ratio, period - 1, (count - 1) * (period - 1)))
-    left = np.array(errors) - mean[np.array(phases)]
-    left = left - left.mean(axis=1, keepdims=True)
-    # Where the pulses are those of the reference keyphasor, all errors are 0.
-    variance = max(float(np.mean(left**2)), 1e-300)
-    criterion = left.size * math.log(variance) + period * math.log(left.size)
-    error = float(np.sqrt(between * (period - 1) / period / count))
-    return _Fold(mean, error, log_p_value, criterion)
+    def in_timing(self, setting: Setting) -> Array:
+        """Return the delays in units of the marks that begin trigger cycles, but the last."""
+        own, step = _own(setting.model)
+        angles = np.asarray(self.pulse_angles)[(np.arange(own) * step) % len(self.pulse_angles)]
+        delays = angles / (2.0 * np.pi * setting.model.trigger_speed * setting.unit)
+        return np.asarray((delays - delays.mean())[:-1])

@@ -59,7 +59,7 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
     """
     count, lines = radial.shape
     nothing = Beat('', 1.0, np.ones(lines), np.zeros(lines))
-    if count < 32 or np.unique(frequency).size < 3:
+    if count < 32 or np.unique(frequency).size < 2:
         return nothing
     window = np.hanning(count + 2)[1:-1]
     spectrum = np.fft.rfft((radial - radial.mean(axis=0)) * window[:, None], 4 * count, axis=0)[8:]

@@ -21,7 +21,6 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
-from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
@@ -36,6 +35,7 @@ _STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
 _CERTAIN = 1e-4
 _GROUPS = 3
+_RESOLVED = 1.5  # of what a stretch resolves: lines that may be one
 # A clock this much faster than the declared one has no visible effect.
 _FINE = 50.0
 
@@ -127,9 +127,6 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
     model = observation.model
     picked = [observation.acquisitions[a] for a in chosen]
     usable = [a for a, item in zip(chosen, picked) if np.all(np.isfinite(item.errors))]
-    if len(usable) < 2:
-        raise SignalError('the pulse errors cannot be recovered from the vibration: '
-                          f'{picked[0].reason}; give reference_pulse_times or stronger orders')
     errors, own = [], []
     for a in usable:
         item, read = observation.acquisitions[a], pulses[a][0]
@@ -180,7 +177,25 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
                        beat_gain=beat.gain)
     times, angle = _middles(observation, shortest)
-    return replace(evidence, tone=find_tone(cycles[:len(times)], times, angle, evidence.order))
+    tone = find_tone(cycles[:len(times)], times, angle, evidence.order)
+    return replace(evidence, tone=None if _turns(observation, tone.frequency) else tone)
+
+
+def _turns(observation: Observation, frequency: float) -> bool:
+    """
+    Tell whether a tone is an order that certainly turns with the shaft.
+
+    Single cycles show an order at all lines of the trigger cycle away from it.
+    """
+    model = observation.model
+    for recovery in observation.recoveries:
+        for fit in recovery.fits:
+            orders = fit.orders[fit.declared:][fit.turning[fit.declared:]]
+            apart = model.cycle_length * (frequency / model.fundamental_frequency - orders)
+            away = np.abs(apart - np.rint(apart)) * (fit.errors.size - 1)
+            if np.any(away < _RESOLVED):
+                return True
+    return False
 
 
 def _cycles(observation: Observation) -> Array:

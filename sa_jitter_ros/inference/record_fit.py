@@ -95,7 +95,8 @@ class RecordFit:
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
     lines; `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells which
     orders certainly turn with the shaft: the speed varies enough to show it. `jitter_std` (s) is
-    the estimated size of the pulse errors.
+    the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
+    bends that the fit expected, towards 0.
     """
 
     errors: Array
@@ -109,6 +110,7 @@ class RecordFit:
     amplitudes: ComplexArray
     turning: BoolArray
     jitter_std: float
+    expected_std: Array
 
 
 def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
@@ -575,7 +577,7 @@ class _States:
         return RecordFit(
             errors, np.sqrt(self._variances(0)), self._autocovariance(), bends, bend_errors,
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
-            self._turning(), float(self.size[0]))
+            self._turning(), float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
 
     def _autocovariance(self) -> Array:
         """Return the mean posterior autocovariance of the pulse errors about their mean."""

@@ -66,7 +66,8 @@ class RecordRecovery:
     of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s), NaN beside a missing
     pulse, with their standard errors. `noise_autocovariance` (lag,) in s^2 is that of what
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
-    tones (Hz) that were fitted beside the declared ones. `fits` are those of the stretches.
+    tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
+    the `bridged` pulses. `expected_std` (3,) in s is what the fits expected of errors and bends.
     """
 
     times: FloatArray
@@ -82,6 +83,9 @@ class RecordRecovery:
     jitter_std: float
     undeclared: tuple[FloatArray, FloatArray]
     fits: tuple[RecordFit, ...]
+    bridged: FloatArray
+    stretches: tuple[slice, ...]
+    expected_std: FloatArray
 
     @property
     def errors(self) -> FloatArray:
@@ -216,7 +220,9 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
         mean([fit.noise_autocovariance[:lags] for fit in good]) if good else empty,
         float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
         (empty, empty) if longest is None else (
-            longest.orders[longest.declared:], longest.tones), tuple(good))
+            longest.orders[longest.declared:], longest.tones), tuple(good), pulses.bridged,
+        tuple(part for part, fit in zip(stretches, fits) if fit is not None),
+        np.sqrt(mean([fit.expected_std**2 for fit in good])) if good else np.zeros(3))
 
 
 def _roughness(recovery: RecordRecovery) -> float:

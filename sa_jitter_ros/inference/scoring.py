@@ -77,12 +77,31 @@ class Bench:
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""
         return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
-                      [*self.declared, *effects], self.scatter)
+                      self.with_declared(effects), self.scatter)
+
+    def with_declared(self, effects: Sequence[Effect]) -> list[Effect]:
+        """Return the declared effects and others, which take the place of those of their name."""
+        names = {item.name for item in effects}
+        return [*(item for item in self.declared if item.name not in names), *effects]
+
+    def change(self, others: Sequence[Effect], effect: Effect) -> float:
+        """
+        Return the largest change of a line that an effect makes beside others.
+
+        It is that of the mean attenuation, or of the standard deviation of one average.
+        """
+        without, with_it = (self.expect(known, self.fit) for known in (
+            [*others], [*others, effect]))
+        changes = [np.abs(with_it.attenuation - without.attenuation).mean(axis=0)]
+        for name in ('attenuation_variance', 'amplitude_variance'):
+            changes.append(np.abs(np.sqrt(getattr(with_it, name).mean(axis=0))
+                                  - np.sqrt(getattr(without, name).mean(axis=0))))
+        return float(np.max(changes))
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
                unsteadiness: float = 0.0) -> Expectation:
         """Predict some acquisitions."""
-        return expect(self.observation, self.lines, self.level, [*self.declared, *effects],
+        return expect(self.observation, self.lines, self.level, self.with_declared(effects),
                       self.pulses, self.group, chosen, unsteadiness=unsteadiness,
                       memory=self.memory)
 
@@ -109,7 +128,7 @@ class Bench:
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
         power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
         model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
-        scattering = [effect for effect in (*self.declared, *effects) if effect.scatters]
+        scattering = [effect for effect in self.with_declared(effects) if effect.scatters]
         known = expect(replace(self.observation, model=model), self.lines, self.level, scattering,
                        self.pulses, self.group, [0]).amplitude_variance[0]
         chance = _CHANCE * np.sqrt(2.0 / len(amplitude))

@@ -12,39 +12,56 @@
 # flake8: noqa: A005
 
 """
-The trace: effects are added one at a time while a significant residual remains.
+The trace: which effects the declared model lacks, and what remains with them.
 
-Effects are fitted to one half of the acquisitions (every other one) and scored on the other half.
-The result may be that no effect explains the residual.
+Effects on pulse times and source are chosen by the likelihood of the timing, those on the lines
+one at a time while the amplitudes scatter more than predicted. They are fitted to some of the
+acquisitions and scored on the others. The result may be that no effect explains the residual.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.effect import absent, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
-from sa_jitter_ros.errors import ModelError, SignalError
-from sa_jitter_ros.inference.candidates import best_of, Candidate, SIGNIFICANT, try_all
+from sa_jitter_ros.effects.timing import SOURCE
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.inference.candidates import (
+    best_of, Candidate, least_change, SIGNIFICANT, too_small, try_all)
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, line_evidence)
+from sa_jitter_ros.inference.line_checks import check_lines
+from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
-from sa_jitter_ros.inference.residual import Residual, UNDEFINED
+from sa_jitter_ros.inference.residual import ACCURACY, Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
+from sa_jitter_ros.inference.timing import read_timing, stretches, Timing
+from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.recordings.recording import Recording
 
 Array = NDArray[Any]
 Progress = Callable[[str], None]
+#: The largest change that an effect beside others makes.
+Change = Callable[[Sequence[Effect], Effect], float]
 
 _MOST_EFFECTS = 4
+_SPEED = 'speed_fluctuation'
+_UNDECIDED = 1e-2  # change of an average by what may be there
+_AGAINST, _PRIOR = 54.6, 0.018  # odds against an effect (e^4), and its probability before data
+_UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
+_SCATTER = 'the scatter of the amplitudes'
+_UNSEEN = 'nothing of it shows in this recording'
 _FEWEST = 4
+_HELD_OUT = 6
 _SAME_CLOCK = 0.01
 
 
@@ -68,6 +85,7 @@ class Trace:
     fit: tuple[int, ...]
     held_out: tuple[int, ...]
     findings: tuple[Finding, ...]
+    present: tuple[Finding, ...]
     candidates: tuple[Candidate, ...]
     before: Residual
     after: Residual
@@ -80,6 +98,11 @@ class Trace:
     evidence: Evidence | None
     verdict: str
     unsteadiness: float
+    timing: Timing | None
+    left: Check | None
+    limits: tuple[Limit, ...]
+    undecided: tuple[str, ...]
+    probabilities: Mapping[str, float]
     not_compared: str = ''
 
 
@@ -128,13 +151,14 @@ def _unresolved(observation: Observation) -> str:
 
 
 def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str) -> Trace:
-    """Return the trace of a recording whose lines cannot be compared."""
+    """Return the trace of a recording whose lines cannot be compared: its pulse times remain."""
     count = len(observation.acquisitions)
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
+    fit, held_out = parted(count)
     return Trace(
-        observation, tuple(declared), Lines(none, none), np.zeros(0), tuple(range(0, count, 2)),
-        tuple(range(1, count, 2)), (), (), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)),
-        np.zeros((count, 0)), nothing, nothing, None, 'none', float('nan'), reason)
+        observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, (), (), (),
+        UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing,
+        None, 'none', float('nan'), None, None, (), (), {}, reason)
 
 
 def require_acquisitions(observation: Observation) -> None:
@@ -149,57 +173,176 @@ def require_acquisitions(observation: Observation) -> None:
 def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     """Trace the residual of the observations of a bench."""
     observation, declared = bench.observation, bench.declared
-    count = len(observation.acquisitions)
+    everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
     own = bench.unsteadiness(())
-    after = bench.score((), unsteadiness=own)
-    at_first = moves = dependences(bench, (), ())
-    chosen: list[Finding] = []
-    candidates: list[Candidate] = []
-    first_evidence: Evidence | None = None
-    reason = ''
-    while len(chosen) < _MOST_EFFECTS:
-        significant = remains(after, moves)
-        effects = [finding.effect for finding in chosen if finding.effect is not None]
-        try:
-            evidence = replace(bench.gather(effects, bench.fit),
-                               whole=bench.gather(effects, range(count)))
-        except SignalError as error:
-            reason = str(error)
-            break
-        first_evidence = first_evidence or evidence
-        say(f'round {len(chosen) + 1}: p = {after.p_value:.2g}, RMS residual {after.rms:.4f}')
-        round_ = try_all(bench, evidence, chosen, after, moves, own, significant)
-        winner = best_of(round_)
-        if winner is None and not significant:
-            candidates += round_
-            break
-        candidates += [item if winner is None or item is winner or item.rejected_because
-                       else replace(item, rejected_because=f'{winner.name} has the more specific '
-                                    'evidence') for item in round_]
-        if winner is None:
-            break
-        chosen.append(winner.finding)
-        say(f'added {winner.name}: {winner.finding.evidence}')
-        effects = [finding.effect for finding in chosen if finding.effect is not None]
+    first = bench.score((), unsteadiness=own)
+    at_first = dependences(bench, (), ())
+    say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
+    chosen, present, timing = _of_timing(bench)
+    for finding in chosen:
+        say(f'found {finding.name}: {finding.evidence}')
+    candidates = [Candidate(finding.name, 0, finding, None, '') for finding in chosen]
+    candidates += [Candidate(finding.name, 0, finding, None, too_small(finding))
+                   for finding in present]
+    more, tried, evidence = _of_lines(bench, chosen, say)
+    chosen, candidates = [*chosen, *more], [*candidates, *tried]
+    last = max((item.stage for item in tried), default=0)
+    present += [item.finding for item in tried if item.stage == last and item.rejected_because
+                and item.rejected_because == too_small(item.finding)]
+    effects = _effects(chosen)
+    own = bench.unsteadiness(effects)
+    before = bench.score((), unsteadiness=own) if chosen else first
+    after = bench.score(effects, chosen, unsteadiness=own) if chosen else first
+    moves = dependences(bench, effects, chosen) if chosen else at_first
+    left = _unexplained(bench, timing, chosen)
+    unexplained = remains(after, moves) or left is not None
+    absorbed = left.text if left is not None else _SCATTER if (
+        after.p_amplitude < SIGNIFICANT) else ''
+    if absorbed:
+        chosen, candidates = _beyond_doubt(chosen, candidates, absorbed, left is None)
+        effects = _effects(chosen)
         own = bench.unsteadiness(effects)
+        before = bench.score((), unsteadiness=own)
         after = bench.score(effects, chosen, unsteadiness=own)
         moves = dependences(bench, effects, chosen)
-    unexplained = remains(after, moves)
-    if reason and unexplained:
-        candidates += [Candidate(name, 1, Finding(name, None, {}, 1.0, reason, reason), None,
-                                 reason) for name in EFFECTS]
-    effects = [finding.effect for finding in chosen if finding.effect is not None]
-    everything = range(count)
     attenuation, _, amplitude = bench.observed(everything)
-    verdict = ('unexplained' if unexplained else 'traced' if chosen else 'none')
-    before = bench.score((), unsteadiness=own) if chosen else after
+    rows = limits(timing, evidence, [item.name for item in (*chosen, *present)])
+    names = {item.name for item in candidates}
+    if timing is not None:
+        candidates += [Candidate(name, 0, absent(name, 'the likelihood of the timing gains '
+                                                 f'nothing: probability {value:.2g}'), None,
+                                 f'the likelihood of the timing gains nothing by it: probability '
+                                 f'{value:.2g}')
+                       for name, value in timing.probabilities.items() if name not in names]
+    names |= {item.name for item in candidates}
+    for name in EFFECTS.keys() - names:
+        reason = bench.untold.get(name, _UNSEEN)
+        candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        tuple(chosen), tuple(candidates), before, after, at_first, moves,
-        attenuation, amplitude,
-        bench.expect((), everything, unsteadiness=own),
-        bench.expect(effects, everything, unsteadiness=own), first_evidence, verdict, own)
+        tuple(chosen), tuple(present), tuple(candidates), before, after, at_first, moves,
+        attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
+        bench.expect(effects, everything, unsteadiness=own), evidence,
+        'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
+        rows, _undecided(bench.change, effects, rows), _probabilities(timing, candidates))
+
+
+def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:
+    """Return the effects on the timing that change an average, and those that hardly do."""
+    parts = stretches(bench.observation, bench.fit, bench.clock)
+    timing = read_timing(parts, bench.declared) if parts else None
+    return *_sorted(timing, bench.change), timing
+
+
+def _sorted(timing: Timing | None, change: Change) -> tuple[list[Finding], list[Finding]]:
+    """Return the effects that change an average, those that change it most first, and others."""
+    chosen: list[Finding] = []
+    present: list[Finding] = []
+    findings = timing.findings if timing is not None else ()
+    for finding in findings:
+        others = [item.effect for item in findings if item is not finding
+                  and item.effect is not None and item.name != _SPEED]
+        assert finding.effect is not None
+        finding = replace(finding, largest_change=change(others, finding.effect))
+        matters = finding.effect is not None and (
+            finding.largest_change >= least_change(finding.effect))
+        (chosen if matters else present).append(finding)
+    chosen.sort(key=lambda item: -item.largest_change)
+    return chosen, [item for item in present if item.name != _SPEED]
+
+
+def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
+              ) -> tuple[list[Finding], list[Candidate], Evidence]:
+    """Return the effects that scatter the amplitudes, all that were tried, and the evidence."""
+    more: list[Finding] = []
+    tried: list[Candidate] = []
+    everything = range(len(bench.observation.acquisitions))
+    evidence = bench.gather((), everything)
+    while len(more) < _MOST_EFFECTS:
+        found = [*chosen, *more]
+        effects = _effects(found)
+        own = bench.unsteadiness(effects)
+        now = bench.score(effects, found, unsteadiness=own)
+        round_ = try_all(bench, replace(bench.gather(effects, bench.fit),
+                                        whole=bench.gather(effects, everything)),
+                         found, now, own, len(more) + 1)
+        winner = best_of(round_)
+        tried += [item if item is winner or item.rejected_because else replace(
+            item, rejected_because=f'{winner.name if winner else ""} has the more certain '
+            'evidence') for item in round_]
+        if winner is None:
+            break
+        more.append(winner.finding)
+        say(f'found {winner.name}: {winner.finding.evidence}')
+    return more, tried, evidence
+
+
+def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], left: str,
+                  of_lines: bool) -> tuple[list[Finding], list[Candidate]]:
+    """Return the effects that do not merely absorb a part of what is left, and the candidates."""
+    kept = [finding for finding in chosen if finding.effect is not None and not (
+        finding.effect.scatters if of_lines else finding.effect.random)]
+    names = {finding.name for finding in kept}
+    return kept, [item if item.rejected_because or item.name in names else replace(
+        item, rejected_because=f'it absorbs a part of what no effect explains: {left}')
+        for item in candidates]
+
+
+def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
+               ) -> tuple[str, ...]:
+    """Return the effects that, as large as their limits, would still change an average."""
+    found = []
+    for row in rows:
+        if row.effect is None:
+            continue
+        try:
+            size = change(effects, row.effect)
+        except ModelError:  # so large that no average is left
+            size = math.inf
+        if size >= _UNDECIDED:
+            found.append(row.name)
+    return tuple(found)
+
+
+def _probabilities(timing: Timing | None, candidates: Sequence[Candidate]) -> Mapping[str, float]:
+    """
+    Return the probability of every effect that was tried.
+
+    Of those on the lines it follows from their p value p, with at most -e p log(p) for the odds
+    against them (Sellke, Bayarri and Berger 2001).
+    """
+    found = dict(timing.probabilities) if timing is not None else {}
+    for item in candidates:
+        p_value = item.finding.p_value
+        if item.name not in found:
+            against = -math.e * p_value * math.log(p_value) if 0.0 < p_value < 1.0 / math.e else (
+                float(p_value > 0.0))
+            likely = 1.0 / (1.0 + _AGAINST * against) if against < 1.0 else _PRIOR
+            found[item.name] = likely if not item.rejected_because else min(likely, 0.5)
+    return found
+
+
+def _effects(findings: Sequence[Finding]) -> list[Effect]:
+    return [finding.effect for finding in findings if finding.effect is not None]
+
+
+def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding]) -> Check | None:
+    """
+    Return what no effect explains and changes an average, the surest of it.
+
+    Within a cycle the recovery follows the speed to a cubic: the rest looks like a moving source.
+    """
+    model = bench.observation.model
+    rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
+    names = {finding.name for finding in chosen}
+    checks = [check for check in (timing.checks if timing is not None else ())
+              if 0.5 * (rad * check.size) ** 2 > ACCURACY
+              and not (check.direction == SOURCE and _SPEED in names)]
+    if 'interfering_tone' not in names:
+        checks += check_lines(bench.observation, bench.lines)
+    left = [check for check in checks if check.p_value < _UNEXPLAINED / _CHECKS]
+    return min(left, key=lambda check: check.p_value) if left else None
 
 
 def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
@@ -212,7 +355,7 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
     """Return what scoring needs of `observation`, the joined `observations` of `recordings`."""
     lines = choose_lines(observation)
     count = len(observation.acquisitions)
-    fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
+    fit, held_out = parted(count)
     group = channel_groups(observation)
     known = [gather_pulses(recording, item, group)
              for recording, item in zip(recordings, observations)]
@@ -223,6 +366,14 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
     return with_fewer_cycles(Bench(
         observation, lines, level, [row for _, rows in known for row in rows], clock, group,
         line_evidence(observation, lines), fit, held_out, tuple(declared)))
+
+
+def parted(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return acquisitions that fit parameters, and those in the middle that are held out."""
+    few = max(count // 3, min(count // 2, _HELD_OUT))
+    start = (count - few) // 2
+    held_out = tuple(range(start, start + few))
+    return tuple(a for a in range(count) if a not in held_out), held_out
 
 
 def _one_clock(clocks: Sequence[Clock]) -> Clock:

@@ -12,11 +12,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+import math
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import parameter_ranges
+from sa_jitter_ros.effects.additive_noise import AdditiveNoise
 from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual
@@ -46,7 +49,15 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
         'against': 'reference keyphasor' if observation.against_reference else 'vibration',
-        'missing_effects': [_effect(finding) for finding in trace.findings],
+        'missing_effects': [_effect(finding) for finding in trace.findings
+                            if finding.name not in {item.name for item in trace.declared}],
+        'present': [{**_effect(finding), 'largest_change': finding.largest_change}
+                    for finding in trace.present],
+        'limits': [{'name': item.name, 'parameter': item.parameter, 'upper_95': item.upper,
+                    'lower_95': item.lower, 'unit': item.unit} for item in trace.limits],
+        'undecided': list(trace.undecided),
+        'probabilities': dict(trace.probabilities),
+        'declared_changes': _changes(trace),
         'candidates': [_candidate(item) for item in trace.candidates],
         'error_before': errors(trace.before),
         'error_after': errors(trace.after),
@@ -54,7 +65,8 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
             trace.dependences_before, trace.dependences_after)],
         'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
-        'remains': str(moving(trace.dependences_after) or ''),
+        'remains': trace.left.text if trace.left else str(
+            moving(trace.dependences_after) or ''),
         'lines': lines,
     })
     return content
@@ -108,6 +120,31 @@ def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
             **{when: {'change': item.change, 'standard_error': item.standard_error,
                       'p_value': item.p_value}
                for when, item in (('before', before), ('after', after))}}
+
+
+def _changes(trace: Trace) -> list[Mapping[str, Json]]:
+    """Return the declared numbers that are others, and what they are."""
+    model, found = trace.observation.model, []
+    jitter = math.sqrt(model.distribution.variance)
+    declared = {effect.name: effect for effect in trace.declared}
+    for item in trace.findings:
+        effect = item.effect
+        if effect is None:
+            continue
+        error = item.standard_errors
+        if isinstance(effect, JitterScale):
+            found.append(('jitter', 'jitter_std', jitter, jitter * effect.scale,
+                          jitter * error['scale'], 's'))
+        elif isinstance(effect, AdditiveNoise):
+            total = math.hypot(model.noise_std, effect.std)
+            found.append(('noise', 'noise_std', model.noise_std, total,
+                          effect.std / total * error['std'], '1'))
+        elif item.name in declared:
+            for name, limits in parameter_ranges(type(effect)).items():
+                found.append((item.name, name, declared[item.name].values[name],
+                              effect.values[name], error.get(name), limits.unit))
+    keys = 'name', 'parameter', 'declared', 'value', 'standard_error', 'unit'
+    return [dict(zip(keys, row)) for row in found]
 
 
 def _effect(finding: Finding) -> Mapping[str, Json]:

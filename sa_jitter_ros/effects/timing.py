@@ -1,0 +1,103 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+How an effect shows in pulse times and in the errors that are recovered from the vibration.
+
+Time moves in one of three directions: the pulses err (`PULSES`), the source of the vibration moves
+and the pulses are right (`SOURCE`), or the shaft moves and both with it (`MOTION`). An effect is a
+random error with a spectrum in one of these directions, or a known pattern of an unknown size.
+Sizes are in parts of a `unit` (s), frequencies in cycles a trigger cycle.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.prediction.model import DeclaredModel
+
+Array = NDArray[Any]
+
+PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    The pulses of one unbroken stretch that patterns refer to.
+
+    `index` (pulse,) counts trigger pulses from the first of the recording; `times` (pulse,) in s
+    are the measured ones and `true_times` those less their recovered errors; `clock_errors`
+    (pulse,) in s are what the grid of a clock makes of a smooth motion, None without a clock of
+    `clock_rate` Hz.
+    """
+
+    model: DeclaredModel
+    unit: float
+    index: Array
+    times: Array
+    true_times: Array
+    clock_errors: Array | None = None
+    clock_rate: float = 0.0
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """
+    A random error: `density` (parameters, frequency) in unit^2 per cycle a trigger cycle.
+
+    `starts` are values of its parameters from which a fit begins, one after the other: the first
+    parameter is the logarithm of its power. `lower` and `upper` are bounds; `lower` None stands
+    for the lowest frequency that a recording resolves, as a logarithm.
+    """
+
+    direction: str
+    density: Callable[[Array, Array], Array]
+    starts: tuple[tuple[float, ...], ...]
+    lower: tuple[float | None, ...]
+    upper: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """
+    Known errors of unknown sizes: `columns` of a setting (column, pulse), in parts of the unit.
+
+    With `about` (value, tolerance) the size of the first column is a number that the effect
+    prescribes. `replaces_jitter` says that the declared jitter is no longer of known size. Errors
+    that do not `show_in_times` are those of all pulses alike, relative to the vibration.
+    """
+
+    columns: Callable[[Setting], Array]
+    about: tuple[float, float] | None = None
+    replaces_jitter: bool = False
+    show_in_times: bool = True
+
+
+def white(parameters: Array, frequency: Array) -> Array:
+    """Return the density of independent errors: the same at all frequencies."""
+    return np.full(np.shape(frequency), np.exp(parameters[0]))
+
+
+def autoregressive(parameters: Array, frequency: Array) -> Array:
+    """Return the density of first-order autoregressive errors; artanh of their correlation."""
+    rho = np.tanh(parameters[1])
+    return np.asarray(np.exp(parameters[0]) * (1.0 - rho**2)
+                      / np.abs(1.0 - rho * np.exp(2j * np.pi * frequency)) ** 2)
+
+
+def low_passed(parameters: Array, frequency: Array) -> Array:
+    """Return a Butterworth density: logarithms of power, edge and half the order of its slope."""
+    edge, slope = np.exp(parameters[1]), np.exp(parameters[2])
+    flat = 0.5 * np.pi / slope
+    height = np.exp(parameters[0]) / (2.0 * edge * flat / np.sin(flat))
+    return np.asarray(height / (1.0 + np.minimum(np.abs(frequency) / edge, 1e6) ** (2.0 * slope)))

@@ -1,0 +1,107 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Checks of the lines: whether all move together, as pulse errors and load move them.
+
+With the pulse errors taken out, the phases of all lines follow the angle of the shaft. Paths that
+change, and resonances that the speed crosses, turn lines each by itself, and make amplitudes
+follow the speed. No effect of the package does that.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.observation import Observation
+from sa_jitter_ros.inference.timing_checks import Check
+from sa_jitter_ros.prediction.influence import mean_period
+from scipy import stats
+
+Array = NDArray[Any]
+
+LINES = 'lines'
+_ROUNDS = 3
+_TURN = 0.03  # rad, by which the lines of steady machines turn each by itself at most
+_FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
+_FEWEST = 8  # acquisitions
+_STEADY = 1e-4  # relative spread of the speed
+
+
+def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
+    """Return the checks of the amplitudes of all acquisitions of a recording that has lines."""
+    if not lines.count or len(observation.acquisitions) < 3 or not observation.recoveries:
+        return ()
+    orders = observation.orders.size
+    amplitude = lines.of(observation.stacked('corrected')[..., :orders])
+    noise = np.sqrt(np.mean(lines.of(observation.stacked('noise')[..., :orders]) ** 2, axis=0))
+    order = observation.orders[lines.order]
+    number = observation.pulses.number[[item.first for item in observation.acquisitions]]
+    turned = amplitude * np.exp(
+        -2j * np.pi * observation.model.cycle_length * np.outer(number, order))
+    frequency = observation.model.fundamental_frequency
+    turned *= np.exp(-2j * np.pi * frequency * np.outer(_late(observation), order))
+    weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
+    for _ in range(_ROUNDS):  # all lines of an acquisition may be late by one time
+        ratio = turned / turned.mean(axis=0)
+        late = np.angle(ratio) / order @ (weight / weight.sum())
+        turned = turned * np.exp(-1j * np.outer(late, order))
+    mean = turned.mean(axis=0)
+    ratio, noise = turned / mean, noise / np.abs(mean)
+    return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise))
+
+
+def _late(observation: Observation) -> Array:
+    """Return by how much the pulses of each acquisition are late in the mean, in s."""
+    late, number, before = [], 0, -1
+    for item in observation.acquisitions:
+        number += item.first <= before
+        before = item.first
+        errors = observation.recoveries[number].errors[item.first:item.first + item.times.size]
+        late.append(float(np.nan_to_num(errors.mean())))
+    return np.array(late)
+
+
+def _turns(ratio: Array, noise: Array, order: Array) -> Check:
+    """Test whether a line turns by itself."""
+    count = len(ratio)
+    power = np.mean(ratio.imag**2, axis=0)
+    own = np.sqrt(np.maximum(power - noise**2, 0.0))
+    chance = stats.chi2.sf(count * power / (noise**2 + _TURN**2), count - 1)
+    worst = int(np.argmin(chance))
+    return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
+                 f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
+                 'average to average, relative to the other orders')
+
+
+def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check, ...]:
+    """Test whether the amplitudes follow the speed."""
+    speed = 1.0 / np.array([mean_period(item.times, item.missing)
+                            for item in observation.acquisitions])
+    speed = speed / speed.mean() - 1.0
+    spread = float(np.std(speed))
+    count = speed.size
+    if count < _FEWEST or spread < _STEADY:
+        return ()
+    shape = np.stack([np.ones(count), speed / spread, (speed / spread) ** 2], axis=1)
+    fitted = shape @ np.linalg.lstsq(shape, size, rcond=None)[0]
+    total, left = np.var(size, axis=0), np.mean((size - fitted) ** 2, axis=0)
+    explained = np.where(total - left > _FOLLOWS * total, total - left, 0.0)
+    worst = int(np.argmax(explained / noise**2))
+    if not explained[worst] > _TURN**2:
+        return ()
+    freedom = count - 3
+    ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
+    return (Check(float(stats.f.sf(ratio, 2, freedom)) * size.shape[1], LINES,
+                  math.sqrt(float(explained[worst])),
+                  f'the amplitudes follow the speed: {math.sqrt(float(explained[worst])):.2g} of '
+                  'an amplitude RMS, as a resonance makes them'),)

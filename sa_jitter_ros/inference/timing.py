@@ -1,0 +1,379 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the timing of a recording shows: effects on pulse times and source, their sizes and limits.
+
+The likelihood of pulse times and recovered errors chooses among sets of effects
+(`timing_choice`). What it leaves is checked in ways that no effect has a part in: power in a
+direction, sinusoids, and errors that are not normal.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.effect import Finding, parameter_ranges
+from sa_jitter_ros.effects.evidence import root
+from sa_jitter_ros.effects.jitter_scale import JitterScale
+from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
+from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
+from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
+from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.timing_checks import Check, check_timing
+from sa_jitter_ros.inference.timing_choice import Choice, Chooser, DECIDED, RIPPLE
+from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
+from sa_jitter_ros.inference.timing_fit import JITTER
+from scipy import stats
+from scipy.special import ndtr
+
+Array = NDArray[Any]
+
+_EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
+_VISIBLE = 0.02  # of a tick: errors of a grid below it are none
+_SEED = 11
+_CERTAIN = 1e-12  # p value of what the pulse times themselves show
+_PART, _FEWEST_PARTS, _CHANCE = 20, 4, 1e-4  # cycles whose mean power scatters by itself
+_RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
+_REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
+_DRAWN = 4000
+_EDGE = 3  # pulses at either end of a stretch that are not checked
+
+
+@dataclass(frozen=True)
+class Timing:
+    """
+    The effects that pulse times and recovered errors show, `findings`, whatever their size.
+
+    `probabilities` and `limits` are those of all effects that they could show; `checks` test what
+    is left, `excess` (direction to (bin,)) is its power over the expected one at `frequency`
+    (cycles a trigger cycle).
+    """
+
+    findings: tuple[Finding, ...]
+    probabilities: Mapping[str, float]
+    chooser: Chooser = field(repr=False)
+    choice: Choice = field(repr=False)
+    checks: tuple[Check, ...]
+    frequency: Array
+    excess: Mapping[str, Array]
+
+    @property
+    def p_value(self) -> float:
+        """Return the p value of all checks together."""
+        least = min((check.p_value for check in self.checks), default=1.0)
+        return float(-np.expm1(len(self.checks) * np.log1p(-min(least, 1.0 - 1e-16))))
+
+
+def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
+    """Return the unbroken stretches of pulses of some acquisitions; neighbours are in one."""
+    model = observation.model
+    unit = max(float(np.sqrt(model.distribution.variance)), 1e-12)
+    found = []
+    if not observation.recoveries:  # averages from topics, each with a mean error of 0
+        grid = _grid(observation.pulses.times, clock)
+        return [_of_average(observation, observation.acquisitions[a], unit, grid, clock.rate)
+                for a in chosen]
+    for number, first, last in _runs(observation, chosen):
+        recovery = observation.recoveries[number]
+        start, stop = recovery.number[first], recovery.number[last] + 1
+        for part in recovery.stretches:
+            here = slice(max(part.start, start), min(part.stop, stop))
+            if here.stop - here.start < 3:
+                continue
+            found.append(_stretch(observation, number, here, clock, unit))
+    return found
+
+
+def _of_average(observation: Observation, item: Acquisition, unit: float, grid: Array | None,
+                rate: float) -> Stretch:
+    """Return the pulses of one average, without what happens inside its cycles."""
+    count = item.times.size
+    setting = Setting(observation.model, unit, item.first + np.arange(count), item.times,
+                      item.times - item.errors,
+                      None if grid is None else grid[item.first:item.first + count], rate)
+    return Stretch(setting, np.ones(count, np.bool_), item.errors,
+                   float(np.sqrt(np.mean(item.standard_errors**2))), math.inf,
+                   np.zeros(count - 1), math.inf, 1e-6 * unit)
+
+
+def _runs(observation: Observation, chosen: Sequence[int]) -> list[tuple[int, int, int]]:
+    """Return recording and first and last pulse of each run of neighbouring acquisitions."""
+    runs: list[tuple[int, int, int]] = []
+    number, before = 0, -1
+    wanted = set(chosen)
+    previous = -2
+    for a, item in enumerate(observation.acquisitions):
+        if item.first <= before:
+            number += 1
+        before = item.first
+        if a not in wanted:
+            continue
+        end = item.first + item.times.size - 1
+        if runs and previous == a - 1 and runs[-1][0] == number:
+            runs[-1] = (number, runs[-1][1], end)
+        else:
+            runs.append((number, item.first, end))
+        previous = a
+    return runs
+
+
+def _stretch(observation: Observation, number: int, here: slice, clock: Clock, unit: float
+             ) -> Stretch:
+    """Return one unbroken stretch of the pulses of a recording, missing ones too."""
+    recovery, model = observation.recoveries[number], observation.model
+    bridged, errors = recovery.bridged[here], recovery.bridged_errors[here]
+    measured = np.zeros(recovery.bridged.size, np.bool_)
+    measured[recovery.number] = True
+    measured = measured[here]
+    expected = recovery.expected_std
+    bends = np.nan_to_num(recovery.ripple[here.start:here.stop - 1])
+    error_std = float(np.median(recovery.bridged_standard_errors[here][measured]))
+    prior = expected[0]
+    bend_prior = expected[1]
+    # where the vibration resolves the errors, it shows more than the reference keyphasor does
+    referenced = observation.pulses.reference is not None and not error_std < _RESOLVED * unit
+    if referenced and observation.pulses.reference is not None:
+        better = observation.pulses.reference[here]
+        known = np.isfinite(better)
+        measured = measured & known
+        errors = np.where(known, bridged - better, 0.0)
+        errors = errors - errors[measured].mean()
+        error_std, prior = _REFERENCE * unit, math.inf
+        bends, bend_prior = np.zeros(bridged.size - 1), _REFERENCE * unit
+    smooth, grid = _grid(recovery.times, clock), None
+    if smooth is not None:
+        grid = np.zeros(recovery.bridged.size)
+        grid[recovery.number] = smooth
+        grid = grid[here]
+    setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
+                      grid, clock.rate)
+    return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
+                   recovery.ripple_standard_error, bend_prior, referenced)
+
+
+def _grid(times: Array, clock: Clock) -> Array | None:
+    """Return the errors that the grid of a clock imposes on pulses, None where it imposes none."""
+    if not clock.rate > 0.0:
+        return None
+    smooth = smooth_on_grid(times, clock.rate)
+    return smooth if np.std(smooth) > _VISIBLE / clock.rate else None
+
+
+def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
+                names: frozenset[str] | None = None) -> Timing | None:
+    """
+    Return what some stretches show; None where they are too short to show anything.
+
+    With `names` these effects are fitted, and no set is chosen.
+    """
+    parts = [item for item in parts if item.errors.size > FEWEST + 2
+             and math.isfinite(item.error_std) and np.all(np.isfinite(item.errors))]
+    if not parts:
+        return None
+    chooser = Chooser(parts, declared)
+    if names is None:
+        choice = chooser.choose()
+    else:
+        chooser.fit(names)
+        choice = Choice(names, chooser.fits, chooser.setting, tuple(chooser.declared.values()))
+    findings = tuple(_findings(chooser, choice))
+    fit = choice.fit
+    checks = tuple(check_timing(chooser, choice)) if names is None else ()
+    probabilities = _probabilities(choice, findings)
+    return Timing(findings, probabilities, chooser, choice, checks, fit.data.frequency,
+                  {direction: fit.excess(direction) for direction in (PULSES, SOURCE, MOTION)})
+
+
+def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:
+    """Return the probability of each effect; power beyond the declared is of two names."""
+    found = {name: value for name, value in choice.probabilities.items() if name in EFFECTS}
+    scaled = found.pop(JITTER, choice.probabilities.get(JITTER, 0.0))
+    named = {finding.name for finding in findings}
+    shared = any(JITTER in finding.indistinguishable_from for finding in findings)
+    excess = 0.5 if shared else float(_EXCESS in named)
+    found[JITTER], found[_EXCESS] = (1.0 - excess) * scaled, excess * scaled
+    return found
+
+
+def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
+    """Return the p value of the likelihood gained by an effect beside the others."""
+    if choice.ticked and name == _CLOCK:
+        return _CERTAIN
+    without = chooser.fit(choice.best - {name}, choice.fit.starts)
+    gain = max(choice.fit.value - without.value, 0.0)
+    return float(stats.chi2.sf(2.0 * gain, max(choice.fit.count - without.count, 1)))
+
+
+def _findings(chooser: Chooser, choice: Choice) -> list[Finding]:
+    found = []
+    for name in sorted(choice.best):
+        if name == JITTER:
+            found.append(_of_jitter(chooser, choice))
+        elif name != RIPPLE:
+            found.append(_of_effect(chooser, choice, name))
+    if _CLOCK in choice.fit.columns and JITTER not in choice.best:
+        beside = _beside_the_clock(chooser, choice)
+        found += [beside] if beside else []
+    speed = _of_speed(choice)
+    return [*found, speed] if speed else found
+
+
+def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
+    """Return a spectrum or pattern as effect."""
+    fit, kind = choice.fit, EFFECTS[name]
+    if name in fit.place:
+        effect, errors = kind.of_timing(fit.starts[name], fit.standard_errors(name),
+                                        choice.setting)
+    elif name in fit.columns:
+        effect, errors = kind.of_timing(*fit.pattern(name), choice.setting)
+    else:  # errors that are within the ticks of a clock
+        effect, errors = kind.of_timing(np.ones(1), np.zeros((1, 1)), choice.setting)
+    rivals = tuple(_EXCESS if other == JITTER else other for other in choice.rivals(name)
+                   if other != RIPPLE)
+    if RIPPLE in choice.rivals(name):
+        rivals = (*rivals, _SPEED)
+    return Finding(name, effect, errors, _p_value(choice, name, chooser),
+                   _text(choice, name, effect, errors), indistinguishable_from=rivals,
+                   deciding_measurement=kind.deciding_measurement if rivals else '')
+
+
+def _text(choice: Choice, name: str, effect: Effect, errors: Mapping[str, Any]) -> str:
+    """Say what was found and how surely."""
+    remark = effect.remark(choice.setting.model)
+    return (f'{effect.summary}: {_sizes(effect, errors)}{remark}, which pulse times and errors '
+            f'recovered from the vibration show; probability {choice.probabilities[name]:.3g}')
+
+
+def _sizes(effect: Effect, errors: Mapping[str, Any]) -> str:
+    """Return the numbers of an effect with standard errors and units."""
+    found = []
+    for name, limits in parameter_ranges(type(effect)).items():
+        value, error = effect.values[name], errors.get(name)
+        if isinstance(value, tuple):
+            found.append(f'{name} of {np.sqrt(np.mean(np.square(value))):.3g} {limits.unit} RMS')
+        elif error is not None:
+            found.append(f'{name} {value:.3g} +- {error:.2g} {limits.unit}')
+        else:
+            found.append(f'{name} {value:.6g} {limits.unit}')
+    return ', '.join(found)
+
+
+def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
+    """Return how large the declared jitter is, or the jitter beyond it."""
+    fit, setting = choice.fit, choice.setting
+    log_power, error = float(fit.starts[JITTER][0]), float(fit.standard_errors(JITTER)[0])
+    scale = math.exp(0.5 * log_power)
+    p_value = _p_value(choice, JITTER, chooser)
+    same = math.sqrt(setting.model.distribution.variance)
+    text = (f'independent pulse errors of {scale * same:.3g} s, {scale:.3g} +- '
+            f'{0.5 * scale * error:.2g} times the declared ones; probability '
+            f'{choice.probabilities[JITTER]:.3g} beside all other sets of effects')
+    rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
+    as_scale = JitterScale(scale)
+    if scale <= 1.0:
+        return Finding(JITTER, as_scale, {'scale': 0.5 * scale * error}, p_value, text,
+                       indistinguishable_from=rivals, deciding_measurement=(
+                           EFFECTS[JITTER].deciding_measurement if rivals else ''))
+    odds = _odds_of_scale(chooser, choice, scale)
+    more = math.log(math.expm1(max(log_power, 1e-9)))
+    # d log(e^p - 1) = e^p / (e^p - 1) dp
+    effect, errors = EFFECTS[_EXCESS].of_timing(
+        np.array([more]), np.array([error / -math.expm1(-max(log_power, 1e-9))]), setting)
+    if odds > DECIDED:
+        return Finding(JITTER, as_scale, {'scale': 0.5 * scale * error}, p_value,
+                       f'{text}; their distribution is the declared one, as wide',
+                       indistinguishable_from=rivals,
+                       deciding_measurement=EFFECTS[JITTER].deciding_measurement if rivals else '')
+    if odds > -DECIDED:
+        rivals = (JITTER, *rivals)
+    return Finding(_EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,
+                   deciding_measurement=EFFECTS[_EXCESS].deciding_measurement if rivals else '')
+
+
+def _odds_of_scale(chooser: Chooser, choice: Choice, scale: float) -> float:
+    """
+    Return the logarithm of the odds that the declared errors are `scale` times as large.
+
+    The alternative adds normal errors of the same power. Only the distribution of single errors
+    tells the two apart, so that only a declared distribution other than the normal one can.
+    """
+    model = choice.setting.model
+    if model.jitter_distribution == 'normal' or len(choice.best) > 1:
+        return 0.0
+    total = 0.0
+    draws = np.random.default_rng(_SEED)
+    for item in chooser.data.stretches:
+        errors = item.errors[item.measured][_EDGE:-_EDGE]
+        trend = np.polynomial.Polynomial.fit(np.arange(errors.size), errors, 3)
+        left = errors - trend(np.arange(errors.size))
+        table = np.asarray(model.distribution.draw(draws, _DRAWN))
+        table = table - table.mean()
+        wider = math.hypot(item.error_std, math.sqrt(scale**2 - 1.0) * float(np.std(table)))
+        for sign, size, noise in ((1.0, scale, item.error_std), (-1.0, 1.0, wider)):
+            total += sign * _log_density(left, size * table, noise)
+    return float(total)
+
+
+def _log_density(errors: Array, table: Array, noise: float) -> float:
+    """Return the log likelihood of errors that are draws of a table plus normal noise."""
+    edges = np.quantile(table, np.linspace(0.0, 1.0, 201))
+    low, high = edges[:-1], np.maximum(edges[1:], edges[:-1] + 1e-12)
+    width = max(noise, 1e-3 * float(np.std(table)))
+    inside = ndtr((errors[:, None] - low) / width) - ndtr((errors[:, None] - high) / width)
+    density = np.mean(inside / (high - low), axis=1)
+    return float(np.sum(np.log(np.maximum(density, 1e-12 / np.std(errors)))))
+
+
+def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
+    """Return the jitter beside the errors of a clock's grid, None without."""
+    fit = choice.fit
+    bare = chooser.fit(choice.best, fit.starts, held={(JITTER, 0): -12.0})
+    gain = fit.value - bare.value
+    if gain < 0.5 * math.log(fit.data.cycles) + DECIDED:
+        return None
+    effect, errors = EFFECTS[_EXCESS].of_timing(
+        fit.starts[JITTER], fit.standard_errors(JITTER), choice.setting)
+    return Finding(_EXCESS, effect, errors, float(stats.chi2.sf(2.0 * gain, 1)),
+                   f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
+
+
+def _of_speed(choice: Choice) -> Finding | None:
+    """Return the acceleration of the shaft that bends the angle inside the cycles, if it shows."""
+    fit, setting = choice.fit, choice.setting
+    data = fit.data
+    if data.series < 3:  # nothing is known of what happens inside the cycles
+        return None
+    source = sum(float(np.average(fit.contribution(name)[:, 2, 2].real, weights=data.size))
+                 for name, item in fit.spectra.items() if item.direction == SOURCE)
+    parts, count = [], 0
+    for item in data.stretches:
+        if not np.isfinite(item.bend_std):
+            continue
+        for part in np.array_split(item.bends, max(1, item.bends.size // _PART)):
+            parts.append(np.mean(part**2) - item.bend_std**2 - source * data.unit**2)
+            count += part.size
+    if len(parts) < _FEWEST_PARTS:
+        return None
+    power, error = float(np.mean(parts)), float(np.std(parts, ddof=1) / math.sqrt(len(parts)))
+    noise = float(np.mean([item.bend_std**2 for item in data.stretches]))
+    chance = float(stats.norm.sf(power / (noise * math.sqrt(2.0 / count) + 1e-300)))
+    if power <= 0.0 or chance > _CHANCE:
+        return None
+    size, size_error = root(power, error)
+    effect = SpeedFluctuation.of_ripple(size, setting.model)
+    return Finding(
+        _SPEED, effect, {'acceleration_std': effect.acceleration_std * size_error / size}, chance,
+        'the speed changes within a trigger cycle: the angle between the pulses errs by '
+        f'u (1 - u) times {size:.3g} s')

@@ -1,0 +1,222 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Checks of what a fit of the timing leaves, in ways that no effect has a part in.
+
+Each has a p value from draws of the fitted model. None names a culprit.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects import EFFECTS
+from sa_jitter_ros.effects.timing import PULSES, SOURCE
+from sa_jitter_ros.inference.timing_choice import Choice, Chooser
+from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
+from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
+
+Array = NDArray[Any]
+
+_DRAWS, _SEED = 400, 11
+_BINS = 5  # of frequency, whose excess power is taken together
+_SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
+_EDGE = 3  # pulses at either end of a stretch that filters do not reach
+_FEWEST = 40  # pulses whose distribution is looked at
+_OFTEN, _TAIL = 0.02, 0.9  # shares of the draws: of the p values that they tell, and their tail
+
+
+@dataclass(frozen=True)
+class Check:
+    """
+    A test of what the fit leaves: its p value and what it looked at, in words.
+
+    `direction` is that in which the time moves; `size` (s) is the standard deviation of what is
+    left there.
+    """
+
+    p_value: float
+    direction: str
+    size: float
+    text: str
+
+
+def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
+    """Return all checks of the best fit; none where the ticks of a clock hide what is left."""
+    if choice.ticked:
+        return ()
+    # of a motion of the source nothing is known but its bandwidth
+    directions = [PULSES, *([] if any(
+        EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
+    found = [check(choice.fit, direction) for direction in directions
+             for check in (_power, _sinusoid)]
+    return (*found, _shape(chooser, choice), _steadiness(chooser, choice))
+
+
+def _power(fit: TimingFit, direction: str) -> Check:
+    """Test whether the power in a direction is the expected one, in neighbouring bins together."""
+    data = fit.data
+    size = data.size
+    window = np.ones(min(_BINS, size.size))
+
+    def statistic(ratio: Array) -> Array:
+        gain = size * (ratio - 1.0 - np.log(np.maximum(ratio, 1e-300)))
+        return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
+
+    draws = np.random.default_rng(_SEED).gamma(size, 1.0 / size, (_DRAWS, size.size))
+    ratio = fit.excess(direction)
+    gain = statistic(ratio)[0]
+    top = int(np.argmax(gain))
+    near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
+    more = np.sum((size * np.abs(ratio - 1.0) * fit.floor(direction))[near]) / size.sum()
+    return Check(_chance(float(gain[top]), statistic(draws).max(axis=1)), direction,
+                 data.unit * math.sqrt(more),
+                 f'the power of the {direction} from {data.frequency[near][0]:.3g} to '
+                 f'{data.frequency[near][-1]:.3g} cycles a trigger cycle is '
+                 f'{float(np.average(ratio[near], weights=size[near])):.3g} times the expected')
+
+
+def _sinusoid(fit: TimingFit, direction: str) -> Check:
+    """Test whether a sinusoid in a direction stands out."""
+    data = fit.data
+    frequency = np.sort(np.concatenate([np.arange(1, n // 2 + 1) / n for n in data.lengths]))
+    tried = frequency > _SLOWEST / data.longest
+    inverse = fit.inverse[data.bin]
+    wave = np.einsum('fij,fj->fi', data.passed, steering(direction, data.frequency, data.frequency)
+                     )[data.bin]
+    known = np.einsum('fi,fij,fj->f', wave.conj(), inverse, wave).real
+    size = np.abs(np.einsum('fi,fij,fj->f', wave.conj(), inverse, fit.left)) ** 2 / known
+    top = int(np.argmax(np.where(tried, size, 0.0)))
+    count = int(np.count_nonzero(tried))
+    return Check(-math.expm1(count * math.log1p(-math.exp(-max(float(size[top]), 1e-9)))),
+                 direction, data.unit * math.sqrt(2.0 * size[top] / known[top] / data.longest),
+                 f'a sinusoid of the {direction} of {frequency[top]:.4g} cycles a trigger cycle')
+
+
+def _shape(chooser: Chooser, choice: Choice) -> Check:
+    """
+    Test whether the pulse errors are drawn as the model draws them, by skewness and kurtosis.
+
+    Those of the recovered errors, whitened, are compared with those of drawn errors: of the
+    declared distribution, and normal ones for all that is beside it. Jitter larger than declared
+    may have the declared distribution, too.
+    """
+    fit, data = choice.fit, chooser.data
+    larger = JITTER in fit.starts and fit.starts[JITTER][0] > 0.0
+    p_value = max(_likeness(chooser, choice, scaled) for scaled in ((False, True) if larger else (
+        False,)))
+    names = [*fit.spectra, *([JITTER] if JITTER in fit.place else [])]
+    power = sum(float(np.average(fit.contribution(name)[:, 1, 1].real, weights=data.size))
+                for name in names)
+    return Check(p_value, PULSES, data.unit * math.sqrt(power),
+                 'skewness and kurtosis of the pulse errors')
+
+
+def _likeness(chooser: Chooser, choice: Choice, scaled: bool) -> float:
+    """Return the p value of skewness and kurtosis."""
+    fit, data = choice.fit, chooser.data
+    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
+    p_values = []
+    for item in data.stretches:
+        if item.errors.size < _FEWEST:
+            continue
+        seen = _moments(_filtered(_left(chooser, choice, item), white, data))
+        null = _moments(_filtered(_drawn(choice, item, scaled), white, data))
+        for value, draws in zip(seen, null):
+            middle = np.median(draws)
+            p_values.append(_chance(abs(float(value - middle)), np.abs(draws - middle)))
+    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0
+
+
+def _steadiness(chooser: Chooser, choice: Choice) -> Check:
+    """Test whether the pulse errors are as large in all parts of the recording."""
+    data = choice.fit.data
+    seen, drawn = [], []
+    for item in data.stretches:
+        if item.errors.size >= _FEWEST:
+            seen += _powers(chooser, choice, item, None)
+            drawn += _powers(chooser, choice, item, _drawn(choice, item, True))
+    if len(seen) < 2:
+        return Check(1.0, PULSES, 0.0, 'the size of the pulse errors')
+    logs, null = np.log(np.array(seen)), np.log(np.array(drawn))
+    usual = np.median(null)
+    spread, size = float(np.var(logs)), float(np.ptp(np.exp(logs - usual)))
+    power = float(np.average(choice.fit.spectrum(choice.fit.parameters)[:, 1, 1].real,
+                             weights=data.size))
+    return Check(_chance(spread, np.var(null, axis=0)), PULSES,
+                 data.unit * math.sqrt(size * power),
+                 f'the power of the pulse errors is {float(np.exp(logs.max() - logs.min())):.2g} '
+                 'times larger in some parts of the recording than in others')
+
+
+def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None) -> list[Array]:
+    """Return the power of whitened errors (part, draw) in parts of a stretch."""
+    fit, data = choice.fit, choice.fit.data
+    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
+    errors = _left(chooser, choice, item) if drawn is None else drawn
+    values = _filtered(errors, white, data)
+    parts = np.array_split(values, max(1, values.shape[-1] // _FEWEST), axis=-1)
+    return [np.asarray(np.mean(part**2, axis=-1)) for part in parts]
+
+
+def _left(chooser: Chooser, choice: Choice, item: Stretch) -> Array:
+    """Return the errors (pulse,) that patterns and a trend leave, in units."""
+    errors = item.errors / choice.fit.data.unit - chooser.known_errors(choice, item)
+    errors = np.where(item.measured, errors, np.mean(errors[item.measured]))
+    place = np.arange(errors.size)
+    return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
+
+
+def _drawn(choice: Choice, item: Stretch, scaled: bool) -> Array:
+    """Return drawn errors (draw, pulse) in units, as the recovery shows them."""
+    fit, data = choice.fit, choice.fit.data
+    rng = np.random.default_rng([_SEED, int(item.setting.index[0])])  # others in each stretch
+    shape = _DRAWS, item.errors.size
+    power = math.exp(fit.starts[JITTER][0]) if JITTER in fit.starts else 1.0
+    power = power if scaled else min(power, 1.0)  # normal errors make the rest
+    declared = math.sqrt(power) / data.unit * np.asarray(
+        choice.setting.model.distribution.draw(rng, shape))
+    gain = np.abs(data.passed[:, 1, 1])
+    total = fit.spectrum(fit.parameters)[:, 1, 1].real
+    rest = np.sqrt(np.maximum(total - data.measured * power * gain**2, 0.0))
+    return (_through(declared, gain, data) + _through(rng.standard_normal(shape), rest, data))
+
+
+def _filtered(values: Array, gain: Array, data: TimingData) -> Array:
+    return _through(values, gain, data)[..., _EDGE:-_EDGE]
+
+
+def _through(values: Array, gain: Array, data: TimingData) -> Array:
+    """Return values (..., pulse) through a filter whose `gain` is given in bins of frequency."""
+    count = values.shape[-1]
+    transform = np.fft.rfft(values, axis=-1) * np.interp(
+        np.arange(count // 2 + 1) / count, data.frequency, gain)
+    transform[..., 0] = 0.0
+    return np.asarray(np.fft.irfft(transform, count, axis=-1))
+
+
+def _moments(values: Array) -> tuple[Array, Array]:
+    """Return skewness and logarithm of kurtosis of each row."""
+    z = values - values.mean(axis=-1, keepdims=True)
+    z = z / np.sqrt(np.mean(z**2, axis=-1, keepdims=True))
+    return np.asarray(np.mean(z**3, axis=-1)), np.asarray(np.log(np.mean(z**4, axis=-1)))
+
+
+def _chance(value: float, draws: Array) -> float:
+    """Return the chance of draws as large as a value; their tail is taken as exponential."""
+    share = float(np.mean(draws >= value))
+    if share > _OFTEN:
+        return share
+    high = float(np.quantile(draws, _TAIL))
+    width = float(np.mean(draws[draws > high] - high))
+    return float((1.0 - _TAIL) * math.exp(-(value - high) / max(width, 1e-300)))

@@ -1,0 +1,277 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The choice among sets of effects on the timing, by the evidence for each set.
+
+The evidence is the greatest likelihood less what parameters gain by chance (Schwarz), and the odds
+against any effect. Effects are added, taken out and exchanged while that raises it. All sets that
+were tried give each effect its probability.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations, product
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.lattice import placed_on_grid
+from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, Spectrum
+from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
+
+Array = NDArray[Any]
+
+#: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
+RIPPLE = 'ripple'
+_ODDS = 4.0  # against an effect, as a logarithm: one in fifty-five
+#: Logarithm of the odds of two explanations, 20 to 1, from which on one of them is the answer.
+DECIDED = math.log(20.0)
+_MOST = 4  # effects at once
+_BESIDE_CLOCK = 2  # patterns beside that of a clock
+_STEPS = np.linspace(-4.0, 4.0, 161)  # standard errors that the size of one may be wrong by
+_BETTER = 0.01
+_RARE = 1e9
+_ROOM = 0.02  # of a tick that errors may leave it by
+
+
+@dataclass(frozen=True)
+class Choice:
+    """
+    The best set of effects, and all sets that were tried with their evidence.
+
+    `fits` maps sets of names to their fits. `declared` are the effects that are part of the
+    declared model: in a set, their parameters are in question.
+    """
+
+    best: frozenset[str]
+    fits: Mapping[frozenset[str], TimingFit]
+    setting: Setting
+    declared: tuple[Effect, ...]
+
+    @property
+    def fit(self) -> TimingFit:
+        """Return the fit of the best set."""
+        return self.fits[self.best]
+
+    @property
+    def ticked(self) -> bool:
+        """Return whether the ticks of a clock make all errors, so that no others can be told."""
+        return any(isinstance(timing := EFFECTS[name].timing, Pattern) and timing.replaces_jitter
+                   for name in self.best - self.fit.columns.keys() & EFFECTS.keys())
+
+    @cached_property
+    def probabilities(self) -> Mapping[str, float]:
+        """Return the probability of each name that was tried."""
+        names = frozenset().union(*self.fits)
+        if self.ticked:
+            return {name: float(name in self.best) for name in names}
+        scores = {key: score(key, fit) for key, fit in self.fits.items()}
+        top = max(scores.values())
+        odds = {key: math.exp(max(value - top, -700.0)) for key, value in scores.items()}
+        total = sum(odds.values())
+        return {name: sum(value for key, value in odds.items() if name in key) / total
+                for name in names}
+
+    def rivals(self, name: str) -> tuple[str, ...]:
+        """Return what explains the data in place of `name` with odds that decide nothing."""
+        if self.ticked:
+            return ()
+        least = score(self.best, self.fit) - DECIDED
+        return tuple(other for other in self.probabilities if other not in self.best and (
+            swapped := (self.best - {name}) | {other}) in self.fits
+            and score(swapped, self.fits[swapped]) > least)
+
+
+def score(names: frozenset[str], fit: TimingFit) -> float:
+    """Return the logarithm of the evidence for a set of effects, its prior odds included."""
+    for name in names & fit.columns.keys():
+        about = fit.patterns[name][0].about
+        if about is not None and abs(fit.pattern(name)[0][0] - about[0]) > about[1]:
+            return -_RARE
+    if not math.isfinite(fit.value):
+        return -_RARE
+    return fit.value - 0.5 * fit.count * math.log(fit.data.cycles) - _ODDS * len(names)
+
+
+class Chooser:
+    """Fits sets of effects to some stretches, each set once."""
+
+    def __init__(self, stretches: Sequence[Stretch], declared: Sequence[Effect] = ()) -> None:
+        self.data = TimingData(stretches)
+        self.setting = self.data.stretches[0].setting
+        self.declared = {item.name: item for item in declared if item.timing is not None}
+        self.patterns: dict[str, tuple[Pattern, Array]] = {}
+        for name, kind in EFFECTS.items():
+            if isinstance(kind.timing, Pattern):
+                columns = self._columns(kind.timing)
+                if columns is not None:
+                    self.patterns[name] = kind.timing, columns
+        marks = self._ripple()
+        if marks is not None:
+            self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
+        self.fits: dict[frozenset[str], TimingFit] = {}
+
+    @property
+    def pool(self) -> Sequence[str]:
+        """Return the names of all that may be in a set."""
+        return [JITTER, *(name for name, kind in EFFECTS.items()
+                          if name in self.patterns or (isinstance(kind.timing, Spectrum)
+                          and not (name == 'excess_jitter' and name not in self.declared))),
+                *([RIPPLE] if RIPPLE in self.patterns else [])]
+
+    def _columns(self, pattern: Pattern) -> Array | None:
+        """Return the ordinates (ordinate, 3, column) of a pattern, None where it has none."""
+        rows = [pattern.columns(item.setting) for item in self.data.stretches]
+        count = min(len(row) for row in rows)
+        if not count or count > self.data.longest // 4:
+            return None
+        return np.stack([self.data.of_errors(
+            [row[i] for row in rows], in_times=pattern.show_in_times) for i in range(count)],
+                        axis=-1)
+
+    def _made(self, names: frozenset[str], fit: TimingFit) -> Iterator[list[Array]]:
+        """
+        Yield what the patterns of a set make of all pulses, in units.
+
+        The size of a single one may be wrong by some standard errors.
+        """
+        found = {name: np.concatenate([self.patterns[name][0].columns(item.setting)
+                                       for item in self.data.stretches], axis=1) for name in names}
+        sizes = {name: fit.pattern(name)[0] for name in names}
+        yield [sizes[name] @ columns for name, columns in found.items()]
+        if len(names) == 1:
+            (name,) = names
+            if sizes[name].size == 1:
+                error = float(np.sqrt(fit.pattern(name)[1][0, 0]))
+                for step in _STEPS:
+                    yield [(sizes[name] + step * error) @ found[name]]
+
+    def _room(self, known: Sequence[Array]) -> bool:
+        """Tell whether the ticks can make the errors less `known` ones (all pulses), in units."""
+        rate, begin = self.setting.clock_rate, 0
+        beyond = []
+        for item in self.data.stretches:
+            part = slice(begin, begin + item.errors.size)
+            begin = part.stop
+            left = item.errors.copy()
+            for row in known:
+                left -= self.data.unit * row[part]
+            beyond.append(placed_on_grid(left[item.measured], rate)[1] ** 2)
+        noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
+        return bool(np.mean(beyond) < max(noise, (_ROOM / rate) ** 2))
+
+    def known_errors(self, choice: Choice, stretch: Stretch) -> Array:
+        """Return what declared patterns, and those of a choice, make of the pulses, in units."""
+        total = np.zeros(stretch.errors.size)
+        for name in self.patterns.keys() & EFFECTS.keys():
+            columns = self.patterns[name][0].columns
+            if name in choice.best:
+                total += choice.fit.pattern(name)[0] @ columns(stretch.setting)
+            elif name in self.declared:
+                total += self.declared[name].in_timing(self.setting) @ columns(stretch.setting)
+        return total
+
+    def _ripple(self) -> Array | None:
+        """Return the ordinates of a motion that repeats with the revolution."""
+        model = self.setting.model
+        marks = model.pulses_per_revolution
+        own = marks // math.gcd(marks, model.pulses_per_trigger or marks)
+        if own == 1 or own > self.data.longest // 4:
+            return None
+        waves: list[Array] = []
+        for harmonic in range(1, own // 2 + 1):
+            both = self.data.of_wave(MOTION, harmonic / own)
+            waves += both[:1] if 2 * harmonic == own else both
+        return np.stack(waves, axis=-1)
+
+    def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,
+            extra: Mapping[str, Spectrum] | None = None,
+            held: Mapping[tuple[str, int], float] | None = None) -> TimingFit:
+        """Return the fit of a set; `extra` spectra are in question, too."""
+        if not extra and not held and names in self.fits:
+            return self.fits[names]
+        fixed: list[Fixed] = []
+        known: Array | float = 0.0
+        start = dict(start or {})
+        for name, effect in self.declared.items():
+            sizes = effect.in_timing(self.setting)
+            if isinstance(effect.timing, Spectrum):
+                if name in names:
+                    start.setdefault(name, sizes)
+                else:
+                    fixed.append(Fixed(effect.timing.direction, _of(effect.timing, sizes)))
+            elif name not in names and name in self.patterns:
+                known = known + self.patterns[name][1] @ sizes
+        spectra = {name: timing for name in sorted(names & EFFECTS.keys())
+                   if isinstance(timing := EFFECTS[name].timing, Spectrum)}
+        patterns = {name: self.patterns[name] for name in sorted(names) if name in self.patterns}
+        new = [[(name, np.array(first)) for first in item.starts] for name, item in spectra.items()
+               if name not in start]
+        found = max((TimingFit(
+            self.data, {**spectra, **(extra or {})}, patterns, scaled=JITTER in names, fixed=fixed,
+            known=known, start={**start, **dict(some)}, held=held) for some in product(*new)),
+            key=lambda fit: fit.value)
+        if not extra and not held:
+            self.fits[names] = found
+        return found
+
+    def choose(self) -> Choice:
+        """
+        Return the set of the greatest evidence that adding, dropping and exchanging reaches.
+
+        Where the ticks of a clock can make all errors that few other patterns leave, they do.
+        """
+        best = self._of_ticks()
+        if best:
+            return self._choice(best)
+        top = score(best, self.fit(best))
+        pool = self.pool
+        while True:
+            moves = [best | {name} for name in pool if name not in best]
+            moves += [best - {name} for name in best]
+            moves += [(best - {name}) | {other} for name in best for other in pool
+                      if other not in best]
+            start = self.fits[best].starts
+            scores = {move: score(move, self.fit(move, start)) for move in moves
+                      if len(move) <= _MOST}
+            better = max(scores, key=lambda move: scores[move])
+            if scores[better] <= top + _BETTER:
+                break
+            best, top = better, scores[better]
+        return self._choice(best)
+
+    def _of_ticks(self) -> frozenset[str]:
+        """Return a clock and the fewest other patterns beside which its ticks make all errors."""
+        clocks = {name for name, (item, _) in self.patterns.items() if item.replaces_jitter}
+        others = sorted(self.patterns.keys() & EFFECTS.keys() - clocks)
+        if clocks:
+            for count in range(_BESIDE_CLOCK + 1):
+                for some in combinations(others, count):
+                    alone = frozenset(some)
+                    fit = self.fit(alone)
+                    if any(self._room(made) for made in self._made(alone, fit)):
+                        self.fits[alone | clocks] = fit
+                        return alone | clocks
+        return frozenset()
+
+    def _choice(self, best: frozenset[str]) -> Choice:
+        """Return the choice of a set."""
+        possible = {names: fit for names, fit in self.fits.items()
+                    if names == best or score(names, fit) > -_RARE}
+        return Choice(best, possible, self.setting, tuple(self.declared.values()))
+
+
+def _of(spectrum: Spectrum, sizes: Array) -> Callable[[Array], Array]:
+    return lambda frequency: spectrum.density(sizes, frequency)

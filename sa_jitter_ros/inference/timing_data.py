@@ -1,0 +1,259 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Pulse times and recovered errors of a recording, as the likelihood of its timing takes them.
+
+Three series, one value a trigger pulse: second differences of the corrected pulse times, the
+errors that were recovered from the vibration, and the bends inside the cycles. Errors of the
+pulses are in the second series alone: in the measured times they would be there twice, and a
+taper would let the difference of the two leak. Their cross-periodograms, in
+bins of frequency, are what the likelihood is made of; a taper at both ends of every stretch keeps
+the motion of the shaft from leaking.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
+
+Array = NDArray[Any]
+
+ALIASES = np.arange(-2, 3)
+_ZERO = 2  # the one of the frequency itself
+_TAPER = 0.05  # of a stretch, at either end
+_BINS, _WIDER, _NARROW = 60, 1.12, 6
+#: Trigger cycles of a stretch from which it shows something.
+FEWEST = 12
+_POINTS = 64  # in a cycle
+_NO_NOISE = 1e-8  # of second differences, in unit^2
+_U = (np.arange(_POINTS) + 0.5) / _POINTS
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """
+    Consecutive trigger pulses and what was recovered at them.
+
+    `measured` (pulse,) tells which pulses are no interpolation. `errors` (pulse,) in s are
+    measured minus true times, with the noise `error_std` (s), shrunk by a prior of `prior_std` (s,
+    infinite for none); `bends` (cycle,) in s are the factors of u (1 - u) inside the cycles, not
+    shrunk, with the noise `bend_std` that a prior of `bend_prior_std` left. Against a reference
+    keyphasor (`referenced`) no motion of the source shows.
+    """
+
+    setting: Setting
+    measured: Array
+    errors: Array
+    error_std: float
+    prior_std: float
+    bends: Array
+    bend_std: float
+    bend_prior_std: float
+    referenced: bool = False
+
+
+class TimingData:
+    """
+    Periodograms of some stretches and what is the same for every model of them.
+
+    `frequency` (bin,) are the middles of bins of `size` ordinates; `alias` (alias, bin) the
+    frequencies that fall on them; `steer` the cross-spectra (alias, bin, 3, 3) of unit errors in
+    each direction; `passed` (bin, 3, 4) is what the recovery makes of them, `noise` (bin, 3, 3)
+    what it adds. `ordinates` (ordinate, 3) are the
+    transforms.
+    """
+
+    def __init__(self, stretches: Sequence[Stretch]) -> None:
+        self.stretches = list(stretches)
+        self.unit = self.stretches[0].setting.unit
+        self.lengths = [item.errors.size - 2 for item in self.stretches]
+        self.longest = max(self.lengths)
+        self.cycles = sum(self.lengths)
+        self.measured = float(np.mean(np.concatenate([item.measured for item in self.stretches])))
+        frequency = np.concatenate([_frequencies(n) for n in self.lengths])
+        self._sorted = np.argsort(frequency, kind='stable')
+        frequency = frequency[self._sorted]
+        weight = np.concatenate([np.where(_frequencies(n) == 0.5, 0.5, 1.0) * _effective(n)
+                                 for n in self.lengths])[self._sorted]
+        edges = _edges(frequency.size, len(self.lengths))
+        self.edges, self.weight = edges, weight
+        self.size = np.add.reduceat(weight, edges[:-1])
+        self.frequency = np.add.reduceat(weight * frequency, edges[:-1]) / self.size
+        self.bin = np.repeat(np.arange(self.size.size), np.diff(edges))
+        self.alias = np.abs(self.frequency + ALIASES[:, None])
+        # bends that nothing resolves are no series
+        self.series = 3 if any(np.isfinite(item.bend_std) for item in self.stretches) else 2
+        passed, noise = self._recovery()
+        self.passed = passed[:, :self.series]
+        self.noise = noise[:, :self.series, :self.series]
+        self.steer = {}
+        for name in (PULSES, SOURCE, MOTION):
+            passed = np.stack([np.einsum('fij,fj->fi', self.passed, steering(
+                name, self.frequency, self.frequency + n, referenced=self._referenced))
+                for n in ALIASES])
+            self.steer[name] = outer(passed)
+        self.steer[PULSES] = self.steer[PULSES][_ZERO:_ZERO + 1]
+        self.ordinates = self.transform([self._series(item) for item in self.stretches])
+
+    @property
+    def _referenced(self) -> bool:
+        return self.stretches[0].referenced
+
+    def _series(self, item: Stretch) -> Array:
+        """Return the series (pulse - 2, 3) of a stretch; a missing pulse has no error."""
+        middle = float(np.mean(item.errors[item.measured]))
+        times = np.where(item.measured, item.setting.times,
+                         item.setting.times - item.errors + middle)
+        errors = np.where(item.measured, item.errors, middle)
+        n = times.size - 2
+        bends = item.bends[:n] / (1.0 + (item.bend_std / item.bend_prior_std) ** 2)
+        return np.column_stack([np.diff(times - errors, 2), errors[:n], bends]) / self.unit
+
+    def _recovery(self) -> tuple[Array, Array]:
+        """
+        Return what the recovery passes on (bin, 3, 4) and the noise that it adds (bin, 3, 3).
+
+        It is the least squares fit of hat functions and bends to an angle error of white noise,
+        with priors; the noise is as large as the stated standard errors.
+        """
+        stretch = self.stretches[0]
+        priors = np.array([stretch.prior_std, stretch.bend_prior_std, stretch.bend_prior_std])
+        prior = np.diag((self.unit / priors) ** 2)
+        variance = float(np.mean([item.error_std for item in self.stretches]) / self.unit) ** 2
+        normal = _normal(self.frequency)[1]
+
+        def spread(information: float) -> float:
+            inverse = np.linalg.inv(information * normal + prior)
+            return float(np.average(inverse[:, 0, 0].real, weights=self.size))
+
+        low, high = -30.0, 40.0
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if spread(np.exp(middle)) > variance else (low, middle)
+        information = float(np.exp(low)) * normal
+        inverse = np.linalg.inv(information + prior)
+        passed = np.zeros((self.frequency.size, 3, 4), complex)
+        passed[:, 0, 0] = 1.0
+        passed[:, 1:, 1:] = (inverse @ information)[:, :2]
+        corrected = _corrected(self.frequency)
+        noise = np.zeros((self.frequency.size, 3, 3), complex)
+        noise[:, 0, 0] = _NO_NOISE
+        noise[:, 1:, 1:] = (inverse @ information @ inverse)[:, :2, :2]
+        return (np.asarray(corrected @ passed),
+                np.asarray(corrected @ noise @ corrected.conj().swapaxes(1, 2)))
+
+    def transform(self, series: Sequence[Array]) -> Array:
+        """Return the ordinates (ordinate, 3) of a series (pulse - 2, 3) of every stretch."""
+        rows = []
+        for item in series:
+            window = _window(len(item))
+            item = (item - np.average(item, axis=0, weights=window)) * window[:, None]
+            item = item[:, :self.series]
+            rows.append(np.fft.rfft(item, axis=0)[1:len(item) // 2 + 1] / np.sqrt(
+                np.sum(window**2)))
+        return np.asarray(np.concatenate(rows)[self._sorted])
+
+    def of_errors(self, errors: Sequence[Array], *, in_times: bool = True) -> Array:
+        """Return the ordinates that errors (pulse,) of the pulses, in units, make."""
+        return self.transform([np.column_stack([
+            (in_times - 1.0) * np.diff(row, 2), row[:-2], np.zeros(row.size - 2)])
+            for row in errors])
+
+    def of_wave(self, direction: str, frequency: float) -> tuple[Array, Array]:
+        """Return the ordinates of a unit cosine and sine of a frequency in a direction."""
+        one = np.array([frequency])
+        turn = steering(direction, one % 1.0, one, referenced=self._referenced)[0][:3]
+        turn = _corrected(one)[0] @ turn
+        waves = [np.exp(2j * np.pi * frequency * item.setting.index[:-2])[:, None] * turn
+                 for item in self.stretches]
+        return (self.transform([wave.real for wave in waves]),
+                self.transform([wave.imag for wave in waves]))
+
+    def binned(self, ordinates: Array) -> Array:
+        """Return the mean cross-periodogram (bin, 3, 3) of ordinates."""
+        power = outer(ordinates) * self.weight[:, None, None]
+        return np.asarray(np.add.reduceat(power, self.edges[:-1], axis=0)
+                          / self.size[:, None, None])
+
+
+def steering(direction: str, frequency: Array, turning: Array, *, referenced: bool = False
+             ) -> Array:
+    """
+    Return what a unit wave makes of second differences, errors, bends and cubic bends (f, 4).
+
+    `turning` is its frequency, of which whole cycles a trigger cycle are invisible at `frequency`.
+    """
+    z = np.exp(2j * np.pi * turning)
+    none = np.zeros_like(z)
+    pulses = np.stack([(z - 1.0) ** 2, np.ones_like(z), none, none], axis=-1)
+    followed = _projected(frequency, turning)
+    if referenced:  # the pulses are compared with other pulses, and bends are those of the speed
+        followed[:, 0] = 0.0 if direction == SOURCE else 1.0
+    source = np.concatenate([none[:, None], -followed], axis=1)
+    found = {PULSES: pulses, SOURCE: source, MOTION: pulses + source}
+    return np.asarray(found[direction])
+
+
+def _corrected(frequency: Array) -> Array:
+    """Return the matrix (f, 3, 3) that takes the errors out of the second differences."""
+    matrix = np.tile(np.eye(3, dtype=complex), (frequency.size, 1, 1))
+    matrix[:, 0, 1] = -(np.exp(2j * np.pi * frequency) - 1.0) ** 2
+    return matrix
+
+
+def outer(vectors: Array) -> Array:
+    """Return vector times its conjugate, of the last axis."""
+    return np.asarray(vectors[..., :, None] * vectors[..., None, :].conj())
+
+
+def _normal(frequency: Array) -> tuple[Array, Array]:
+    """Return hat function and bends of a wave over a cycle (f, u, 3) and their products."""
+    z = np.exp(2j * np.pi * frequency)[:, None]
+    bend = np.broadcast_to(_U * (1.0 - _U), (frequency.size, _POINTS))
+    shapes = np.stack([1.0 - _U + _U * z, bend, bend * (2.0 * _U - 1.0)], axis=-1)
+    return shapes, np.einsum('fui,fuj->fij', shapes.conj(), shapes) / _POINTS
+
+
+def _projected(frequency: Array, turning: Array) -> Array:
+    """Return the least squares fit (f, 3) of hat function and bends to a wave."""
+    shapes, normal = _normal(frequency)
+    wave = np.exp(2j * np.pi * turning[:, None] * _U)
+    right = np.einsum('fui,fu->fi', shapes.conj(), wave) / _POINTS
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
+
+
+def _frequencies(count: int) -> Array:
+    return np.arange(1, count // 2 + 1) / count
+
+
+def _window(count: int) -> Array:
+    place = np.arange(count) + 0.5
+    inside = np.minimum(place, count - place) / max(2.0, _TAPER * count)
+    return np.asarray(np.sin(0.5 * np.pi * np.clip(inside, 0.0, 1.0)) ** 2)
+
+
+def _effective(count: int) -> float:
+    """Return the share of the ordinates that count, which the taper correlates."""
+    window = _window(count)
+    return float(np.sum(window**2) ** 2 / np.sum(window**4) / count)
+
+
+def _edges(count: int, stretches: int) -> Array:
+    """Return the edges of bins of ordinates: single frequencies first, then wider ones."""
+    edges, width = [0], 1.0
+    while edges[-1] < count:
+        if len(edges) > _NARROW:
+            width = min(width * _WIDER, max(1.0, count / _BINS / stretches))
+        edges.append(min(edges[-1] + max(1, int(width)) * stretches, count))
+    return np.array(edges)

@@ -1,0 +1,297 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The likelihood of the timing of a recording, with any set of effects, and its maximum.
+
+The ordinates of pulse times, recovered errors and bends are normal (Whittle). Their mean is a sum
+of patterns, their cross-spectrum that of the shaft's motion, of which nothing is known but that it
+is smooth, of the declared jitter, of the noise of the recovery, and of random effects.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
+from sa_jitter_ros.inference.timing_data import TimingData
+from scipy.optimize import minimize
+
+Array = NDArray[Any]
+
+#: What is always there: the motion of the shaft, the declared jitter, the noise of the recovery.
+SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'
+#: Extra components, which no effect has: spectra of free shape in one direction.
+_KNOTS = 5
+_EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
+_SMOOTH = 3.0  # change of the slope of a free spectrum between knots
+_NOISE_KNOWN = 0.5  # logarithm of the noise power
+_ROUNDS, _FIRST_STEPS, _STEPS, _SAME = 4, 150, 60, 0.05
+_STEP, _CURVED = 1e-5, 1e-3
+_LOW, _HIGH = -16.0, 16.0
+
+
+def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
+    """Return a density of motion that is free at some frequencies of a trigger cycle."""
+    knots = np.log(np.geomspace(lowest, 0.5, _KNOTS))
+    place = np.log(frequency)
+    level = np.interp(place, knots, parameters[:_KNOTS])
+    level = np.where(frequency > 0.5, parameters[_KNOTS - 1] - np.exp(parameters[_KNOTS]) * (
+        place - knots[-1]), level)
+    return np.asarray(np.exp(level) / (2.0 * np.pi * frequency) ** 4)
+
+
+def free_density(knots: int, top: float, lowest: float) -> Callable[[Array, Array], Array]:
+    """Return a density that is free at some frequencies up to `top`."""
+    places = np.log(np.geomspace(lowest, top, knots))
+    return lambda parameters, frequency: np.asarray(
+        np.exp(np.interp(np.log(frequency), places, parameters)))
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """A random error of known size: what was declared and is not in question."""
+
+    direction: str
+    density: Callable[[Array], Array]
+
+
+class TimingFit:
+    """
+    The fit of some components; `value` is the logarithm of the greatest likelihood.
+
+    `spectra` and `patterns` are the components in question by name; JITTER among the names lets
+    the declared jitter have any size. `fixed` are declared random errors, `known` (ordinate, 3)
+    the declared patterns. `held` maps (name, number) to the value of a parameter that stays.
+    """
+
+    def __init__(self, data: TimingData, spectra: Mapping[str, Spectrum],
+                 patterns: Mapping[str, tuple[Pattern, Array]], *, scaled: bool = False,
+                 fixed: Sequence[Fixed] = (), known: Array | float = 0.0,
+                 start: Mapping[str, Array] | None = None,
+                 held: Mapping[tuple[str, int], float] | None = None) -> None:
+        self.data, self.spectra, self.patterns = data, spectra, patterns
+        self.free_jitter = scaled or any(item.replaces_jitter for item, _ in patterns.values())
+        self.lowest = 1.5 / data.longest
+        self.columns, total = {}, 0
+        stack = []
+        for name, (_, columns) in patterns.items():
+            self.columns[name] = slice(total, total + columns.shape[-1])
+            total += columns.shape[-1]
+            stack.append(columns)
+        self.matrix = np.concatenate(stack, axis=-1) if stack else np.zeros(
+            (*data.ordinates.shape, 0))
+        self.ordinates = data.ordinates - known
+        self._fixed = data.noise * 0.0
+        for item in fixed:
+            self._fixed = self._fixed + self._of(item.direction, item.density(data.alias))
+        if not self.free_jitter:
+            self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
+        self._lay_out(start or {}, held or {})
+        self._maximise()
+
+    def _of(self, direction: str, density: Array) -> Array:
+        steer = self.data.steer[direction]
+        if direction == PULSES:
+            density = density[len(density) // 2][None] * self.data.measured
+        return np.asarray(np.einsum('af,afij->fij', density, steer))
+
+    def _lay_out(self, start: Mapping[str, Array], held: Mapping[tuple[str, int], float]) -> None:
+        """Place all parameters in one vector, with bounds."""
+        few = max(3, self.data.ordinates.shape[0] // 8)
+        level = float(np.log(np.mean(np.abs(self.ordinates[:few, 0]) ** 2) + 1e-12))
+        blocks: dict[str, tuple[Sequence[float], Sequence[float], Sequence[float]]] = {
+            SHAFT: ((min(level, 3.0),) * (_KNOTS - 1) + (-3.0, _EDGE_SLOPE[0]),
+                    (_LOW,) * _KNOTS + (0.7,), (_HIGH,) * _KNOTS + (2.3,)),
+            NOISE: ((0.0,), (-2.5,), (3.0,))}
+        if self.free_jitter:
+            replaced = any(item.replaces_jitter for item, _ in self.patterns.values())
+            blocks[JITTER] = ((-3.0 if replaced else 0.0,), (-12.0,), (9.0,))
+        for name, item in self.spectra.items():
+            lower = tuple(np.log(1.0 / self.data.longest) if low is None else low
+                          for low in item.lower)
+            blocks[name] = item.starts[0], lower, item.upper
+        self.place, begin = {}, 0
+        for name, (first, _, _) in blocks.items():
+            self.place[name] = slice(begin, begin + len(first))
+            begin += len(first)
+        self.lower, self.upper = (np.concatenate([np.asarray(block[i], float)
+                                                  for block in blocks.values()]) for i in (1, 2))
+        self.parameters = np.concatenate([
+            np.asarray(start.get(name, block[0]), float) for name, block in blocks.items()])
+        for (name, number), value in held.items():
+            at = self.place[name].start + number
+            self.parameters[at] = self.lower[at] = self.upper[at] = value
+        self.parameters = np.clip(self.parameters, self.lower, self.upper)
+        self._held = len(held)
+
+    def _maximise(self) -> None:
+        before = np.inf
+        for number in range(_ROUNDS):
+            self.sizes, self.size_covariance, left = self._patterns(self.spectrum(self.parameters))
+            self.power = self.data.binned(left)
+            found = minimize(self._cost, self.parameters, method='L-BFGS-B', jac=True,
+                             bounds=list(zip(self.lower, self.upper)),
+                             options={'maxiter': _STEPS if number else _FIRST_STEPS})
+            self.parameters, now = found.x, float(found.fun)
+            self.value = -now
+            if not self.columns or abs(before - now) < _SAME:
+                break
+            before = now
+
+    @property
+    def count(self) -> int:
+        """Return the number of parameters of the components in question."""
+        spectra = sum(len(item.upper) for item in self.spectra.values())
+        return int(spectra + self.free_jitter + self.matrix.shape[-1] - self._held)
+
+    @property
+    def starts(self) -> Mapping[str, Array]:
+        """Return the parameters by name, where another fit may start."""
+        return {name: self.parameters[place] for name, place in self.place.items()}
+
+    def density(self, name: str, parameters: Array) -> Array:
+        """Return the power of a random component at each frequency (alias, bin), in unit^2."""
+        values, alias = parameters[self.place[name]], self.data.alias
+        if name == SHAFT:
+            return shaft_density(values, alias, self.lowest)
+        if name == JITTER:
+            return white(values, alias)
+        return self.spectra[name].density(values, alias)
+
+    def _direction(self, name: str) -> str:
+        return {SHAFT: MOTION, JITTER: PULSES}.get(name) or self.spectra[name].direction
+
+    def contribution(self, name: str) -> Array:
+        """Return the cross-spectrum (bin, 3, 3) that a component makes."""
+        return self._of(self._direction(name), self.density(name, self.parameters))
+
+    def spectrum(self, parameters: Array) -> Array:
+        """Return what all components make of the three series together (bin, 3, 3)."""
+        total = self._fixed + self.data.noise * np.exp(parameters[self.place[NOISE]][0])
+        for name in self.place:
+            if name != NOISE:
+                total = total + self._of(self._direction(name), self.density(name, parameters))
+        return np.asarray(total)
+
+    def _prior(self, parameters: Array) -> tuple[float, Array]:
+        """Return minus the logarithm of the prior, and its slope."""
+        slope = np.zeros(parameters.size)
+        place = self.place[SHAFT]
+        bend = np.diff(parameters[place][:_KNOTS], 2) / _SMOOTH
+        bends = np.diff(np.eye(_KNOTS), 2, axis=0) / _SMOOTH
+        slope[place.start:place.start + _KNOTS] = bend @ bends
+        steep = (parameters[place][_KNOTS] - _EDGE_SLOPE[0]) / _EDGE_SLOPE[1]
+        slope[place.stop - 1] = steep / _EDGE_SLOPE[1]
+        noise = parameters[self.place[NOISE]][0] / _NOISE_KNOWN
+        slope[self.place[NOISE].start] = noise / _NOISE_KNOWN
+        total = 0.5 * (bend @ bend + steep**2 + noise**2)
+        for name, item in self.spectra.items():
+            if len(item.upper) > _KNOTS:  # of free shape
+                step = np.diff(parameters[self.place[name]]) / _SMOOTH
+                slope[self.place[name]] += np.diff(np.eye(len(item.upper)), axis=0).T @ step / (
+                    _SMOOTH)
+                total += 0.5 * step @ step
+        return float(total), slope
+
+    def _cost(self, parameters: Array) -> tuple[float, Array]:
+        """Return minus the logarithm of likelihood and prior, and its slope."""
+        data = self.data
+        spectrum = self.spectrum(parameters)
+        inverse = np.linalg.inv(spectrum)
+        value, slope = self._prior(parameters)
+        value += float(np.sum(data.size * (
+            np.linalg.slogdet(spectrum)[1]
+            + np.einsum('fij,fji->f', inverse, self.power).real)))
+        change = data.size[:, None, None] * (inverse - inverse @ self.power @ inverse)
+        along: dict[str, Array] = {}
+        for name, place in self.place.items():
+            if name == NOISE:
+                slope[place] += np.einsum('fij,fji->', change, data.noise).real * np.exp(
+                    parameters[place])
+                continue
+            direction = self._direction(name)
+            if direction not in along:
+                along[direction] = np.einsum('fij,afji->af', change, data.steer[direction]).real
+                if direction == PULSES:
+                    along[direction] = along[direction] * data.measured
+            base = self.density(name, parameters)
+            for i in range(place.start, place.stop):
+                moved = parameters.copy()
+                moved[i] += _STEP
+                step = (self.density(name, moved) - base) / _STEP
+                if direction == PULSES:
+                    step = step[len(step) // 2][None]
+                slope[i] += np.sum(step * along[direction])
+        return value, slope
+
+    def _patterns(self, spectrum: Array) -> tuple[Array, Array, Array]:
+        """Return sizes of the patterns, their covariance, and the ordinates without them."""
+        if not self.columns:
+            return np.zeros(0), np.zeros((0, 0)), self.ordinates
+        inverse = np.linalg.inv(spectrum)[self.data.bin] * self.data.weight[:, None, None]
+        weighted = np.einsum('fij,fjp->fip', inverse, self.matrix)
+        normal = 2.0 * np.einsum('fip,fiq->pq', self.matrix.conj(), weighted).real
+        right = 2.0 * np.einsum('fip,fi->p', weighted.conj(), self.ordinates).real
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        covariance = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-10) / np.outer(
+            scale, scale)
+        sizes = covariance @ right
+        return sizes, covariance, self.ordinates - self.matrix @ sizes
+
+    @cached_property
+    def _covariance(self) -> Array:
+        """Return the covariance of the parameters, by the curvature of the likelihood."""
+        count = self.parameters.size
+        curvature = np.zeros((count, count))
+        for i in range(count):
+            moved = np.stack([self.parameters, self.parameters])
+            moved[:, i] += np.array([_CURVED, -_CURVED])
+            curvature[i] = (self._cost(moved[0])[1] - self._cost(moved[1])[1]) / (2.0 * _CURVED)
+        free = self.lower < self.upper
+        # a parameter at its bound, or without influence, is known to its range at best
+        width = np.where(free, self.upper - self.lower, 1e-6)
+        curvature = 0.5 * (curvature + curvature.T) + np.diag(12.0 / width**2)
+        value, vector = np.linalg.eigh(curvature)
+        return np.asarray((vector / np.maximum(value, 12.0 / width.max() ** 2)) @ vector.T)
+
+    def standard_errors(self, name: str) -> Array:
+        """Return the standard errors of the parameters of a random component."""
+        return np.asarray(np.sqrt(np.diag(self._covariance)[self.place[name]]))
+
+    def pattern(self, name: str) -> tuple[Array, Array]:
+        """Return the sizes of the columns of a pattern and their covariance."""
+        place = self.columns[name]
+        return self.sizes[place], self.size_covariance[place, place]
+
+    @cached_property
+    def left(self) -> Array:
+        """Return the ordinates (ordinate, 3) without the patterns."""
+        return np.asarray(self.ordinates - self.matrix @ self.sizes)
+
+    @cached_property
+    def inverse(self) -> Array:
+        """Return the inverse of the cross-spectrum (bin, 3, 3)."""
+        return np.asarray(np.linalg.inv(self.spectrum(self.parameters)))
+
+    def floor(self, direction: str) -> Array:
+        """Return the variance (bin,), in unit^2, of what the data tell of power in a direction."""
+        steer = self.data.steer[direction][len(self.data.steer[direction]) // 2]
+        return np.asarray(1.0 / np.einsum('fij,fji->f', self.inverse, steer).real)
+
+    def excess(self, direction: str) -> Array:
+        """Return the power (bin,) in a direction over that of the fit; 1 where all is right."""
+        steer = self.data.steer[direction][len(self.data.steer[direction]) // 2]
+        weight = self.inverse @ steer @ self.inverse
+        return np.asarray(np.einsum('fij,fji->f', weight, self.data.binned(self.left)).real
+                          / np.einsum('fij,fji->f', self.inverse, steer).real)

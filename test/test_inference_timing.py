@@ -1,0 +1,222 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The likelihood of the timing: what it finds, how surely, and what it cannot see."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sa_jitter_ros.effects import EFFECTS
+from sa_jitter_ros.effects.clock_skew import ClockSkew
+from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
+from sa_jitter_ros.effects.excess_jitter import ExcessJitter
+from sa_jitter_ros.effects.timing import Setting
+from sa_jitter_ros.inference.limits import largest
+from sa_jitter_ros.inference.timing import read_timing
+from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_fit import TimingFit
+from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy.signal import lfilter
+
+PERIOD, SHAFT_MARKS = 0.02, 4
+MODEL = DeclaredModel(
+    keyphasor_rate=20e3, trigger_speed=1.0 / PERIOD / SHAFT_MARKS, trigger_cycles=20,
+    orders=(20.0, 40.0), ratio=SHAFT_MARKS, pulses_per_revolution=SHAFT_MARKS,
+    pulses_per_trigger=1)
+UNIT = float(np.sqrt(MODEL.distribution.variance))
+NOISE = 0.05  # of the declared jitter: what recovered errors are wrong by
+
+
+def machine(seed, *, count=400, scale=1.0, excess=0.0, rho=0.0, wander=0.0, skew=0.0, marks=None,
+            delay=0.0, shocks=0.0, hum=0.0, noise=NOISE):
+    """Return the stretch of a shaft whose speed walks at random; sizes in units of the jitter."""
+    rng = np.random.default_rng([29, seed])
+    index = np.arange(count)
+    speed = 5e-5 * lfilter([1.0], [1.0, -0.99], rng.standard_normal(count))
+    slow = 2e-3 * np.sin(2.0 * np.pi * index / count) if delay else 0.0
+    motion = PERIOD * np.cumsum(1.0 + speed + slow)
+    errors = scale * rng.uniform(-0.5, 0.5, count) / MODEL.keyphasor_rate
+    drawn = rng.standard_normal(count) * np.sqrt(1.0 - rho**2)
+    errors += excess * UNIT * lfilter([1.0], [1.0, -rho], drawn)
+    if marks is not None:
+        errors += UNIT * np.asarray(marks)[index % len(marks)]
+    errors += shocks * UNIT * lfilter([1.0], [1.0, -0.7], rng.uniform(size=count) < 0.03)
+    errors += hum * UNIT * np.cos(2.0 * np.pi * 0.1371 * index)
+    times = motion + errors
+    source = wander * UNIT * np.convolve(rng.standard_normal(count + 16), np.hanning(17) / np.sqrt(
+        np.sum(np.hanning(17) ** 2)), 'valid')
+    late = errors - source + skew * (motion - motion[0])
+    late = late + delay * (PERIOD / np.gradient(motion) - 1.0)
+    wrong, bends = recovery_noise(rng, count)
+    late = late + noise * UNIT * wrong
+    late -= late.mean()
+    bends = noise * UNIT * bends
+    setting = Setting(MODEL, UNIT, index, times, times - late)
+    return Stretch(setting, np.ones(count, bool), late, noise * UNIT, np.inf,
+                   bends[:-1] + np.gradient(np.gradient(motion))[:-1] / 2.0, float(np.std(bends)),
+                   np.inf)
+
+
+def recovery_noise(rng, count):
+    """
+    Return what errors and bends of a least squares fit to white noise are wrong by.
+
+    The fit is that of hat functions and of u (1 - u) and u (1 - u) (2 u - 1); errors have size 1.
+    """
+    u = (np.arange(64) + 0.5) / 64
+    frequency = np.fft.rfftfreq(count)
+    hat = 1.0 - u + u * np.exp(2j * np.pi * frequency)[:, None]
+    bend = np.broadcast_to(u * (1.0 - u), hat.shape)
+    shapes = np.stack([hat, bend, bend * (2.0 * u - 1.0)], axis=-1)
+    inverse = np.linalg.inv(np.einsum('fui,fuj->fij', shapes.conj(), shapes) / u.size)
+    inverse /= np.fft.irfft(inverse[:, 0, 0], count)[0]
+    root = np.linalg.cholesky(inverse)
+    drawn = np.fft.rfft(rng.standard_normal((3, count))).T
+    return np.fft.irfft(np.einsum('fij,fj->fi', root, drawn), count, axis=0)[:, :2].T
+
+
+def names_of(timing):
+    return {finding.name for finding in timing.findings} - {'speed_fluctuation'}
+
+
+def value_of(timing, name, parameter):
+    finding = next(item for item in timing.findings if item.name == name)
+    return finding.effect.values[parameter], finding.standard_errors[parameter]
+
+
+CASES = {
+    'excess_jitter': ({'excess': 1.5}, ('std', 1.5 * UNIT)),
+    'jitter_scale': ({'scale': 0.6}, ('scale', 0.6)),
+    'correlated_jitter': ({'excess': 1.2, 'rho': 0.7}, ('std', 1.2 * UNIT)),
+    'clock_skew': ({'skew': 2e-5}, ('skew', 2e-5)),
+    'phase_wander': ({'wander': 1.0}, ('std', 2.0 * np.pi * MODEL.fundamental_frequency * UNIT)),
+    'path_delay': ({'delay': 0.02}, ('delay', 0.02)),
+}
+
+
+@pytest.mark.parametrize('name', CASES)
+def test_effect_is_found_with_its_size(name):
+    sizes, (parameter, truth) = CASES[name]
+    off = []
+    for seed in range(4):
+        timing = read_timing([machine(seed, **sizes)])
+        assert names_of(timing) == {name}, seed
+        value, error = value_of(timing, name, parameter)
+        off.append((value - truth) / error)
+        assert timing.probabilities[name] > 0.45  # half of it, where two names share the power
+    assert np.max(np.abs(off)) < 4.0
+    assert np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_uneven_marks_are_found_mark_by_mark():
+    marks = np.array([0.5, -0.3, 0.2, -0.4])
+    timing = read_timing([machine(1, marks=marks)])
+    assert names_of(timing) == {'target_geometry'}
+    value, error = value_of(timing, 'target_geometry', 'pulse_angles')
+    truth = 2.0 * np.pi * MODEL.trigger_speed * UNIT * marks
+    assert np.all(np.abs(np.array(value) - truth) < 4.0 * np.array(error))
+
+
+def test_two_effects_are_told_apart():
+    timing = read_timing([machine(3, excess=1.0, rho=0.8, skew=4e-5)])
+    assert names_of(timing) == {'correlated_jitter', 'clock_skew'}
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.3, 2.0])
+def test_declared_machine_shows_nothing(noise):
+    found = [names_of(read_timing([machine(100 + seed, noise=noise)])) for seed in range(8)]
+    assert sum(bool(names) for names in found) <= 1
+
+
+def test_checks_are_calibrated_on_the_declared_machine():
+    p_values = np.array([read_timing([machine(200 + seed)]).checks[i].p_value
+                         for seed in range(12) for i in (0, 4)])
+    assert np.mean(p_values < 0.05) < 0.2
+    assert p_values.min() > 1e-4
+
+
+@pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])
+def test_effect_that_nobody_knows_is_seen(effect):
+    for seed in range(3):
+        timing = read_timing([machine(seed, **effect)])
+        assert min(check.p_value for check in timing.checks) < 1e-4
+
+
+def test_declared_effect_is_taken_as_declared_and_free_where_wrong():
+    part = machine(5, excess=1.5)
+    right = read_timing([part], [ExcessJitter(1.5 * UNIT)])
+    assert names_of(right) == set()
+    wrong = read_timing([machine(5, excess=1.5, skew=1e-4)], [ClockSkew(5e-5)])
+    assert 'clock_skew' in names_of(wrong)
+    value, error = value_of(wrong, 'clock_skew', 'skew')
+    assert abs(value - 1e-4) < 4.0 * error
+
+
+def test_larger_uniform_jitter_is_a_scale_and_normal_jitter_an_excess():
+    scaled = read_timing([machine(7, scale=2.0, count=900)])
+    assert names_of(scaled) == {'jitter_scale'}
+    normal = read_timing([machine(7, excess=np.sqrt(3.0), count=900)])
+    assert names_of(normal) == {'excess_jitter'}
+    hidden = read_timing([machine(7, scale=2.0, count=200, noise=2.0)])
+    assert any({finding.name, *finding.indistinguishable_from} >= {'excess_jitter', 'jitter_scale'}
+               for finding in hidden.findings)
+
+
+def test_slope_of_the_likelihood_is_that_of_its_differences():
+    data = TimingData([machine(0, wander=0.5, excess=0.5, rho=0.5)])
+    fit = TimingFit(data, {name: EFFECTS[name].timing for name in (
+        'correlated_jitter', 'phase_wander')}, {}, scaled=True)
+    at = fit.parameters + 0.1 * np.random.default_rng(1).standard_normal(fit.parameters.size)
+    slope = fit._cost(at)[1]
+    for i in range(at.size):
+        step = np.zeros(at.size)
+        step[i] = 1e-5
+        numeric = (fit._cost(at + step)[0] - fit._cost(at - step)[0]) / 2e-5
+        assert slope[i] == pytest.approx(numeric, rel=1e-3, abs=1e-2)
+
+
+@pytest.mark.parametrize('name', ['excess_jitter', 'clock_skew'])
+def test_limit_holds_as_often_as_it_says(name):
+    # the true size is half the median limit of the declared machine
+    nothing = [limit_of(machine(300 + seed, count=150), name) for seed in range(9)]
+    median = float(np.median(nothing))
+    size = {'excess': median / UNIT} if name == 'excess_jitter' else {'skew': median}
+    held = [limit_of(machine(400 + seed, count=150, **size), name) >= median
+            for seed in range(24)]
+    # 95 %, with four standard errors of such a count
+    assert 0.95 - np.mean(held) < 4.0 * np.sqrt(0.95 * 0.05 / len(held))
+
+
+def limit_of(part, name):
+    timing = read_timing([part], names=frozenset())
+    effect = largest(timing, name)
+    return next(iter(effect.values.values()))
+
+
+def test_short_or_missing_stretches_show_nothing():
+    assert read_timing([]) is None
+    assert read_timing([machine(0, count=12)]) is None
+
+
+def test_missing_pulses_have_no_error():
+    part = machine(9)
+    rng = np.random.default_rng(1)
+    measured = rng.uniform(size=400) > 0.05
+    errors = np.where(measured, part.errors, 7.0 * UNIT)
+    assert names_of(read_timing([replace(part, measured=measured, errors=errors)])) == set()
+
+
+def test_memory_and_size_come_back_from_what_they_made():
+    truth = CorrelatedJitter(2e-5, 0.6)
+    setting = machine(0).setting
+    again, _ = CorrelatedJitter.of_timing(truth.in_timing(setting), np.zeros(2), setting)
+    assert again.std == pytest.approx(truth.std)
+    assert again.correlation == pytest.approx(truth.correlation)
