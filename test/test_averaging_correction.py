@@ -237,3 +237,26 @@ def test_measured_gearbox_with_a_slow_keyphasor(shared_data):
             :, strongest, np.arange(len(orders))]
         np.testing.assert_allclose(ratio[:, :3], 1.0, atol=0.01)
         np.testing.assert_allclose(ratio[:, 3], 1.0, atol=0.015)
+
+
+def test_an_order_that_the_correction_makes_smaller_is_corrected_too(rng):
+    """Errors may turn a leaking order so that it reads too large."""
+    corrected, raw, true = [], [], []
+    times = np.arange(round(0.95 * RATE)) / RATE
+    pulses = 0.05 + np.arange(16) / SPEED
+    for _ in range(20):
+        phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+        samples = sum(a * np.cos(2.0 * np.pi * g * SPEED * (times - 0.05) + at)
+                      for g, a, at in zip((5.0, 6.0), (1.0, 0.05), phase))
+        late = pulses + rng.uniform(-0.5, 0.5, 16) / 1200.0
+        averages = [sa.average(samples + 0.003 * rng.standard_normal(times.size), RATE, item,
+                               orders=[5.0, 6.0], trigger_cycles=12, correct_jitter=True,
+                               keyphasor_rate=1200.0)[0] for item in (late, pulses)]
+        assert averages[0].correction.accepted
+        corrected.append(np.abs(averages[0].correction.amplitudes[0]))
+        raw.append(np.abs(averages[0].amplitudes[0]))
+        true.append(np.abs(averages[1].amplitudes[0]))
+    corrected, raw, true = map(np.array, (corrected, raw, true))
+    assert np.count_nonzero(raw > corrected) > 0
+    assert np.all(raw != corrected)
+    assert np.mean((corrected - true) ** 2) < 0.5 * np.mean((raw - true) ** 2)

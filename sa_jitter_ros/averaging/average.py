@@ -169,9 +169,10 @@ class Correction:
     an error ambiguous. `jitter_std` in s is the standard deviation of the true jitter that the
     vibration shows, the declared one where it shows too little, NaN where the correction is not
     accepted. `amplitudes` are NaN where the phase of an order stays unknown. `attenuation`
-    (channel, order) is the raw over the corrected amplitude. Both contain the same noise, and
-    `attenuation_standard_error` accounts for this correlation. `cycle_amplitudes` (cycle, channel,
-    order) are those of the single trigger cycles between corrected pulses.
+    (channel, order) is the raw over the corrected amplitude, NaN without an accepted correction.
+    Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
+    `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
+    corrected pulses.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
     20.3 Hz. The correction recovers these errors except for their mean:

@@ -120,27 +120,22 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
                                  'fundamental cycle that tells what they were: average more')
     recovery = _recovered(raw, cycles, settings)
     periods = raw.periods
-    corrected, unsure = raw, np.zeros(raw.amplitudes.shape)
     largest, reach = np.abs(recovery.expected).max(), _REACH * periods.min()
-    if largest > reach:
-        none = np.zeros_like(recovery.errors)
-        recovery = replace(recovery, accepted=False, errors=none, expected=none,
-                           reason=f'a pulse error of {largest:.3g} s is above {reach:.3g} s, '
-                                  f'{_REACH:.0%} of a trigger cycle: check the pulses')
-    elif recovery.accepted:
-        corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
-        amplitudes, unsure = _amplitudes(raw, corrected, recovery)
-        corrected = replace(corrected, amplitudes=amplitudes)
+    reason = recovery.reason if largest <= reach else (
+        f'a pulse error of {largest:.3g} s is above {reach:.3g} s, {_REACH:.0%} of a trigger '
+        'cycle: check the pulses')
+    if reason:
+        return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
+    corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
+    amplitudes, unsure = _amplitudes(raw, corrected, recovery)
     begins = np.flatnonzero(raw.used)
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
     turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
-    ratio, error = attenuation(raw.amplitudes, corrected.amplitudes, corrected.noise, turned)
+    ratio, error = attenuation(raw.amplitudes, amplitudes, corrected.noise, turned)
     return Correction(
-        corrected.waveform, corrected.amplitudes, corrected.noise,
-        np.where(recovery.resolved | (not recovery.accepted), recovery.errors, np.nan),
-        recovery.standard_errors, recovery.accepted, recovery.reason, ratio,
-        np.hypot(error, ratio * unsure), corrected.cycle_amplitudes,
-        recovery.std if recovery.accepted else math.nan)
+        corrected.waveform, amplitudes, corrected.noise,
+        np.where(recovery.resolved, recovery.errors, np.nan), recovery.standard_errors, True, '',
+        ratio, np.hypot(error, ratio * unsure), corrected.cycle_amplitudes, recovery.std)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
@@ -178,7 +173,8 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     unsure = np.clip((noise - _CLEAR) / (_WEAK - _CLEAR), 0.0, 1.0)
     doubt = _CAUTION * np.where((unsure > 0.0) & ~(told & evident), unsure * noise, 0.0)
     gained = np.where(told, np.abs(whole) / size - 1.0, lost)
-    share = np.maximum(gained - doubt, 0.0) / np.maximum(gained + doubt, _TINY)
+    share = np.where(doubt > 0.0, np.maximum(gained - doubt, 0.0) / np.maximum(
+        gained + doubt, _TINY), 1.0)
     ambiguous = np.clip((1.0 - left - _SURE) / (_AMBIGUOUS - _SURE), 0.0, 1.0)
     chance = math.exp(-max(recovery.evidence - _DOUBT, 0.0) / _DECAY)
     share = share * np.where(told, 1.0 - np.maximum(unsure, ambiguous) * chance, 1.0)
