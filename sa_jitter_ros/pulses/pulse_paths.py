@@ -115,7 +115,7 @@ class PathRules:
             passed += self.steps[slot]
             slot = (slot + 1) % len(self.steps)
             level = math.log(gap / width)
-            off = self._deviation(path, level)
+            off = self._deviation(path, level, mark)
             cost = min(0.5 * (off / self.scatter)**2, JUMP)
             if self._believed(path, level, off):
                 cost = min(cost, BELIEVED)
@@ -145,8 +145,13 @@ class PathRules:
             off = math.expm1(level - self.expected)
         return abs(off) <= self.given[path.slot]
 
-    def _deviation(self, path: Path, level: float) -> float:
-        """Return the deviation from the nearest of what the intervals before let expect."""
+    def _deviation(self, path: Path, level: float, mark: int) -> float:
+        """
+        Return the deviation from the nearest of what the intervals before let expect.
+
+        With missing pulses `level` is that of the mean of `mark` intervals; where the speed
+        changes, it lies half way along them.
+        """
         if path.level is None:
             return 0.0
         expected = [path.level]
@@ -154,6 +159,9 @@ class PathRules:
             expected.append(self.expected)
         if path.before is not None:
             expected.append(2.0 * path.level - path.before)
+        if mark > 1:
+            half = 0.5 * (mark - 1)
+            expected += [each + half * (each - path.level) for each in expected[1:]]
         return math.expm1(min((level - each for each in expected), key=abs))
 
 
