@@ -23,6 +23,7 @@ _FEWEST = 2  # intervals of a mark
 # How much more the means of the marks have to scatter than the intervals of one mark explain.
 _SIGNIFICANT = 4.0
 # Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
+_UNEVEN = 0.5  # of levels: intervals of more than 1.6 times others are gaps
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
 _CLEAN = 0.25  # of all pairs of revolutions are without a stray, at least
 
@@ -103,6 +104,9 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     change = levels[count:] - levels[:-count]
     windows = np.lib.stride_tricks.sliding_window_view(change, count)
     apart = windows.max(axis=1) - windows.min(axis=1)  # apart from a change of speed
+    # Pulses that are missing may repeat by chance.
+    first = np.lib.stride_tricks.sliding_window_view(levels[:-count], count)
+    apart[np.ptp(first, axis=1) > _UNEVEN] = np.inf
     near = np.abs(windows).max(axis=1) <= _CHANGE
     for tolerance in _REPEATING:
         fits = np.flatnonzero((apart <= tolerance) & near)
