@@ -182,7 +182,10 @@ def _evidence(numbers: IntArray, places: FloatArray, teeth: int) -> float:
     mean = np.bincount(own, place, teeth) / np.maximum(np.bincount(own, minlength=teeth), 1)
     left = np.abs(place - mean[own])
     # Least absolute deviations: strays that pass for pulses say little.
-    scale = max(float(left.mean()), 1e-9)
-    count = np.count_nonzero(kept)
-    parameters = np.count_nonzero(~missing) - 1 + 2 * np.count_nonzero(missing)
-    return float(_TEMPER * (occupancy - count * np.log(scale)) - 0.5 * parameters * np.log(count))
+    count = int(np.count_nonzero(kept))
+    even, uneven = (-_TEMPER * count * np.log(max(float(each.mean()), 1e-9))
+                    for each in (np.abs(place - np.median(place)), left))
+    # Gaps need not have uneven teeth between them.
+    penalty = 0.5 * np.log(count)
+    return float(_TEMPER * occupancy - 2.0 * penalty * np.count_nonzero(missing)
+                 + max(even, uneven - penalty * (np.count_nonzero(~missing) - 1)))
