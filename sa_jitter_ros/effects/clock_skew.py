@@ -16,14 +16,21 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.timing import Pattern, Setting
+from sa_jitter_ros.effects.timing import Pattern, relative_speed, Setting
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
 def _growing(setting: Setting) -> Array:
-    """Return the time that has gone by, in trigger periods."""
-    return np.asarray(setting.times - setting.times.mean())[None] / setting.model.trigger_period
+    """
+    Return the delay in trigger periods of pulses whose clock began with that of the vibration.
+
+    The delay in the middle of the stretch is one of all pulses: it shows as the speed changes.
+    """
+    period = setting.model.trigger_period
+    elapsed = setting.times - setting.times[0] + period * float(setting.index[0])
+    middle = float(elapsed.mean())
+    return np.asarray(elapsed - middle + middle * (relative_speed(setting) - 1.0))[None] / period
 
 
 @dataclass(frozen=True)

@@ -23,23 +23,18 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.timing import Pattern, Setting
+from sa_jitter_ros.effects.timing import Pattern, relative_speed, Setting
 from sa_jitter_ros.prediction.influence import mean_period, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy.ndimage import gaussian_filter1d
 
 
-_SMOOTH = 6.0  # trigger cycles over which a speed is taken
 _STEADY = 1e-4  # relative spread of the speed: below it a delay is a phase
 
 
 def _of_speed(setting: Setting) -> Array:
     """Return what a delay adds at the speed of each pulse to the turn of all; none if steady."""
-    speed = gaussian_filter1d(setting.model.trigger_period / np.gradient(setting.true_times),
-                              _SMOOTH, mode='nearest')
-    if np.std(speed) < _STEADY:
-        return np.zeros((0, speed.size))
-    return np.asarray(speed - speed.mean())[None]
+    speed = relative_speed(setting)
+    return np.asarray(speed - 1.0)[None] if np.std(speed) > _STEADY else np.zeros((0, speed.size))
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy.ndimage import gaussian_filter1d
 
 Array = NDArray[Any]
 
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
+_SMOOTH = 6.0  # trigger cycles over which a speed is taken
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,12 @@ class Pattern:
     about: tuple[float, float] | None = None
     replaces_jitter: bool = False
     show_in_times: bool = True
+
+
+def relative_speed(setting: Setting) -> Array:
+    """Return the speed at each pulse over its mean, smoothed over some trigger cycles."""
+    speed = gaussian_filter1d(1.0 / np.gradient(setting.true_times), _SMOOTH, mode='nearest')
+    return np.asarray(speed / speed.mean())
 
 
 def white(parameters: Array, frequency: Array) -> Array:
