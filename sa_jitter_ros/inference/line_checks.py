@@ -48,8 +48,9 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     number = observation.pulses.number[[item.first for item in observation.acquisitions]]
     turned = amplitude * np.exp(
         -2j * np.pi * observation.model.cycle_length * np.outer(number, order))
-    frequency = observation.model.fundamental_frequency
-    turned *= np.exp(-2j * np.pi * frequency * np.outer(_late(observation), order))
+    # late pulses are ahead by an angle that follows the speed of their acquisition
+    turned *= np.exp(-2j * np.pi * np.outer(_late(observation) / _periods(observation)
+                                            * observation.model.cycle_length, order))
     weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
     for _ in range(_ROUNDS):  # all lines of an acquisition may be late by one time
         ratio = turned / turned.mean(axis=0)
@@ -58,6 +59,11 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     mean = turned.mean(axis=0)
     ratio, noise = turned / mean, noise / np.abs(mean)
     return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise))
+
+
+def _periods(observation: Observation) -> Array:
+    """Return the mean trigger period (acquisition,) in s."""
+    return np.array([mean_period(item.times, item.missing) for item in observation.acquisitions])
 
 
 def _late(observation: Observation) -> Array:
@@ -85,8 +91,7 @@ def _turns(ratio: Array, noise: Array, order: Array) -> Check:
 
 def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check, ...]:
     """Test whether the amplitudes follow the speed."""
-    speed = 1.0 / np.array([mean_period(item.times, item.missing)
-                            for item in observation.acquisitions])
+    speed = 1.0 / _periods(observation)
     speed = speed / speed.mean() - 1.0
     spread = float(np.std(speed))
     count = speed.size

@@ -55,6 +55,8 @@ Change = Callable[[Sequence[Effect], Effect], float]
 
 _MOST_EFFECTS = 4
 _SPEED = 'speed_fluctuation'
+# A tone turns a line by itself, and errors that grow turn it by more than its phase tells.
+_TURNING = {'interfering_tone', 'clock_skew'}
 _UNDECIDED = 1e-2  # change of an average by what may be there
 _AGAINST, _PRIOR = 54.6, 0.018  # odds against an effect (e^4), and its probability before data
 _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
@@ -339,7 +341,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     checks = [check for check in (timing.checks if timing is not None else ())
               if 0.5 * (rad * check.size) ** 2 > ACCURACY
               and not (check.direction == SOURCE and _SPEED in names)]
-    if 'interfering_tone' not in names:
+    if not names & _TURNING:
         checks += check_lines(bench.observation, bench.lines)
     left = [check for check in checks if check.p_value < _UNEXPLAINED / _CHECKS]
     return min(left, key=lambda check: check.p_value) if left else None
