@@ -31,7 +31,6 @@ class CorrelatedJitter(Effect):
 
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'
-    needs_pulse_errors: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(
         PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5)), (-9.0, -2.0), (9.0, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)

@@ -97,8 +97,6 @@ class Effect(Influence):
     scatters: ClassVar[bool] = False
     #: Whether the pulse times alone show it; it is then reported even if amplitudes do not change.
     visible_in_pulse_times: ClassVar[bool] = False
-    #: Whether its evidence is the recovered errors of single pulses.
-    needs_pulse_errors: ClassVar[bool] = False
     #: Whether the vibration moves while the pulse times are correct; recovery shows pulse errors.
     pulse_times_correct: ClassVar[bool] = False
 

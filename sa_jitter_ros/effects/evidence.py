@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
+from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.influence import (
-    declared_jitter, Influence, known_errors, mean_period, Pulses)
+    declared_jitter, Influence, mean_period, Pulses)
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
@@ -80,7 +80,7 @@ class Evidence:
     (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
     `record_times` are all pulses of the record, `record_missing` (interval,) the number of pulses
     that are missing in each of its intervals; `clock` is the one on whose ticks all pulse times
-    lie, if any. `whole` also contains the acquisitions that no fit may use.
+    lie, if any.
     """
 
     model: DeclaredModel
@@ -95,12 +95,6 @@ class Evidence:
     clock: Clock
     lines: LineEvidence
     explained: tuple[Influence, ...] = ()
-    whole: 'Evidence | None' = None
-
-    @property
-    def of_all(self) -> 'Evidence':
-        """Return the evidence of all acquisitions: it distinguishes effects, no fit uses it."""
-        return self.whole or self
 
     @property
     def periods(self) -> Array:
@@ -116,19 +110,6 @@ class Evidence:
     def times(self) -> Array:
         """Return when the pulses were measured (acquisition, N_t + 1), in s."""
         return np.array([pulses.times for pulses in self.pulses])
-
-    @property
-    def unexplained_times(self) -> Array:
-        """Return `times` less the pulse errors that the effects in `explained` predict, in s."""
-        known = [known_errors(self.model, self.explained, pulses) for pulses in self.pulses]
-        return np.array([times if errors is None else times - errors
-                         for times, errors in zip(self.times, known)])
-
-    @property
-    def hidden_by_ticks(self) -> bool:
-        """Return whether the ticks of the clock alone can make all pulse errors."""
-        whole = self.errors + self.times - self.unexplained_times
-        return ticks_leave_room(whole, self.standard_errors, self.clock.rate)
 
     @property
     def jitter(self) -> PulseErrorDistribution | None:

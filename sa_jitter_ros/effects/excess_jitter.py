@@ -28,7 +28,6 @@ class ExcessJitter(Effect):
 
     name: ClassVar[str] = 'excess_jitter'
     summary: ClassVar[str] = 'independent normal pulse errors'
-    needs_pulse_errors: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(PULSES, white, ((0.0,),), (-9.0,), (9.0,))
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)

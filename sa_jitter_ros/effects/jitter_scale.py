@@ -27,7 +27,6 @@ class JitterScale(Effect):
 
     name: ClassVar[str] = 'jitter_scale'
     summary: ClassVar[str] = 'declared jitter of another size'
-    needs_pulse_errors: ClassVar[bool] = True
     scale: float = parameter(1.0, 'true over declared size of the jitter', '1', minimum=0.0)
 
     def jitter_factor(self, model: DeclaredModel) -> float:

@@ -38,7 +38,6 @@ class PhaseWander(Effect):
     name: ClassVar[str] = 'phase_wander'
     summary: ClassVar[str] = 'slow motion of the source relative to the tach shaft'
     pulse_times_correct: ClassVar[bool] = True
-    needs_pulse_errors: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,
         tuple((0.0, float(np.log(edge)), 0.7) for edge in (_NARROW, 0.15, 0.4)),

@@ -49,7 +49,6 @@ class TargetGeometry(Effect):
 
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'
-    needs_pulse_errors: ClassVar[bool] = True
     timing: ClassVar[Pattern] = Pattern(_marks)
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')

@@ -29,7 +29,7 @@ from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
-from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
+from sa_jitter_ros.effects.timing import Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser, DECIDED, RIPPLE
@@ -56,9 +56,7 @@ class Timing:
     """
     The effects that pulse times and recovered errors show, `findings`, whatever their size.
 
-    `probabilities` and `limits` are those of all effects that they could show; `checks` test what
-    is left, `excess` (direction to (bin,)) is its power over the expected one at `frequency`
-    (cycles a trigger cycle).
+    `probabilities` are those of all effects that they could show; `checks` test what is left.
     """
 
     findings: tuple[Finding, ...]
@@ -66,14 +64,6 @@ class Timing:
     chooser: Chooser = field(repr=False)
     choice: Choice = field(repr=False)
     checks: tuple[Check, ...]
-    frequency: Array
-    excess: Mapping[str, Array]
-
-    @property
-    def p_value(self) -> float:
-        """Return the p value of all checks together."""
-        least = min((check.p_value for check in self.checks), default=1.0)
-        return float(-np.expm1(len(self.checks) * np.log1p(-min(least, 1.0 - 1e-16))))
 
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
@@ -189,11 +179,8 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
         chooser.fit(names)
         choice = Choice(names, chooser.fits, chooser.setting, tuple(chooser.declared.values()))
     findings = tuple(_findings(chooser, choice))
-    fit = choice.fit
-    checks = tuple(check_timing(chooser, choice)) if names is None else ()
-    probabilities = _probabilities(choice, findings)
-    return Timing(findings, probabilities, chooser, choice, checks, fit.data.frequency,
-                  {direction: fit.excess(direction) for direction in (PULSES, SOURCE, MOTION)})
+    checks = check_timing(chooser, choice) if names is None else ()
+    return Timing(findings, _probabilities(choice, findings), chooser, choice, checks)
 
 
 def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:
@@ -281,21 +268,17 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
             f'{0.5 * scale * error:.2g} times the declared ones; probability '
             f'{choice.probabilities[JITTER]:.3g} beside all other sets of effects')
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
-    as_scale = JitterScale(scale)
-    if scale <= 1.0:
-        return Finding(JITTER, as_scale, {'scale': 0.5 * scale * error}, p_value, text,
-                       indistinguishable_from=rivals, deciding_measurement=(
-                           EFFECTS[JITTER].deciding_measurement if rivals else ''))
-    odds = _odds_of_scale(chooser, choice, scale)
+    odds = _odds_of_scale(chooser, choice, scale) if scale > 1.0 else math.inf
+    if odds > DECIDED:
+        if scale > 1.0:
+            text += '; their distribution is the declared one, as wide'
+        return Finding(JITTER, JitterScale(scale), {'scale': 0.5 * scale * error}, p_value, text,
+                       indistinguishable_from=rivals,
+                       deciding_measurement=JitterScale.deciding_measurement if rivals else '')
     more = math.log(math.expm1(max(log_power, 1e-9)))
     # d log(e^p - 1) = e^p / (e^p - 1) dp
     effect, errors = EFFECTS[_EXCESS].of_timing(
         np.array([more]), np.array([error / -math.expm1(-max(log_power, 1e-9))]), setting)
-    if odds > DECIDED:
-        return Finding(JITTER, as_scale, {'scale': 0.5 * scale * error}, p_value,
-                       f'{text}; their distribution is the declared one, as wide',
-                       indistinguishable_from=rivals,
-                       deciding_measurement=EFFECTS[JITTER].deciding_measurement if rivals else '')
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
     return Finding(_EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,

@@ -259,16 +259,13 @@ def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
     """Return the effects that scatter the amplitudes, all that were tried, and the evidence."""
     more: list[Finding] = []
     tried: list[Candidate] = []
-    everything = range(len(bench.observation.acquisitions))
-    evidence = bench.gather((), everything)
+    evidence = bench.gather((), range(len(bench.observation.acquisitions)))
     while len(more) < _MOST_EFFECTS:
         found = [*chosen, *more]
         effects = _effects(found)
         own = bench.unsteadiness(effects)
         now = bench.score(effects, found, unsteadiness=own)
-        round_ = try_all(bench, replace(bench.gather(effects, bench.fit),
-                                        whole=bench.gather(effects, everything)),
-                         found, now, own, len(more) + 1)
+        round_ = try_all(bench, bench.gather(effects, bench.fit), found, now, own, len(more) + 1)
         winner = best_of(round_)
         tried += [item if item is winner or item.rejected_because else replace(
             item, rejected_because=f'{winner.name if winner else ""} has the more certain '
