@@ -24,6 +24,9 @@ from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
 
+#: Converted values of parameters by their names.
+Values = dict[str, Any]
+
 _LARGEST = 1e15  # size of a float: squares and products stay finite
 _WORDS = {float: ('a number', 'numbers'), int: ('a whole number', 'whole numbers'),
           str: ('a text', 'texts'), bool: ('true or false', 'true or false')}
@@ -182,6 +185,20 @@ HARDWARE_ID = Parameter('hardware_id', '', 'name of the machine, for the diagnos
                         'of this computer')
 STALE_AFTER = Parameter('stale_after', 5.0, 'silence of an input that is a warning, and three '
                         'times as long an error; 0: never', unit='s', minimum=0.0, maximum=1e6)
+
+
+def sample_parameters(topic: str) -> tuple[Parameter, ...]:
+    """Return the parameters of the node whose input of samples is `topic`."""
+    return (
+        Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
+                  read_only=True),
+        Parameter('sample_rate', 0.0, f'sampling rate of {topic}; 0 if the messages contain it',
+                  unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
+        Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
+                  unit='s', read_only=True),
+        Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
+                  unit='s', above=0.0, read_only=True),
+    )
 
 
 def require_shaft_names(parameter: str, names: Sequence[str]) -> None:

@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import MessageError, ModelError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.messages import encode_prediction, PREDICTION_FIELDS, PredictionMessage
-from sa_jitter_ros.nodes.parameters import Values
+from sa_jitter_ros.parameters import Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict, Prediction
 from std_msgs.msg import Float64, Float64MultiArray

@@ -29,8 +29,7 @@ from sa_jitter_ros.nodes.live_view_board import (
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
-from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
 
 LARGEST_REPORT = 1_000_000  # characters of missing_effect

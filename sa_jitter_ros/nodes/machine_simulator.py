@@ -21,10 +21,9 @@ from sa_jitter_ros.effects import enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes.base import run_node
-from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names)
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names, Values)
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,

@@ -26,6 +26,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging import results
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.recordings import message_layouts
 from sa_jitter_ros.recordings.message_layouts import (
@@ -37,14 +38,14 @@ from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimensi
 FloatArray = NDArray[np.float64]
 ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
-AMPLITUDE_FIELDS = (
-    'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',
-    'attenuation', 'attenuation_standard_error', 'noise_standard_deviation')
-PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
+AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS
+PULSE_ERROR_FIELDS = results.PULSE_ERROR_FIELDS
 PREDICTION_FIELDS = (
     'order', 'mean_attenuation', 'variance', 'standard_deviation',
     'quantile_05', 'quantile_50', 'quantile_95')
 RESIDUAL_FIELDS = ('order', 'observed', 'predicted', 'residual', 'standard_error', 'z')
+AverageHeader = results.AverageHeader
+AverageMessage = results.AverageMessage
 SAMPLE_TYPES: dict[str, type] = {
     FLOAT64: Float64MultiArray,
     FLOAT32: Float32MultiArray,
@@ -54,38 +55,6 @@ PULSE_TYPES: dict[str, type] = {
     TIME_REFERENCE: TimeReference,
     FLOAT64: Float64MultiArray,
 }
-
-
-@dataclass(frozen=True)
-class AverageHeader:
-    """
-    Times (s), numbers of cycles and `mean_trigger_speed` (Hz, tach shaft) of an average.
-
-    `discarded_cycles` trigger cycles between the first and the last one are not in it.
-    """
-
-    start_time: float
-    end_time: float
-    sequence: int
-    trigger_cycles: int
-    fundamental_cycles: int
-    mean_trigger_speed: float
-    discarded_cycles: int = 0
-
-
-@dataclass(frozen=True)
-class AverageMessage:
-    """
-    One array of results of one average.
-
-    `values` is channel x angle for a synchronous average, channel x order x field for order
-    amplitudes (`AMPLITUDE_FIELDS`), pulse x field for pulse errors (`PULSE_ERROR_FIELDS`) and
-    channel x indicator for condition indicators; `names` are the fields or indicators.
-    """
-
-    header: AverageHeader
-    values: FloatArray
-    names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,7 @@ from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.parameter_file import value_of
-from sa_jitter_ros.parameters import Parameter
-
-Values = dict[str, Any]
+from sa_jitter_ros.parameters import Parameter, Values
 
 
 def descriptor_of(item: Parameter) -> ParameterDescriptor:

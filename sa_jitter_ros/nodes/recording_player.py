@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.nodes.base import run_node
-from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
 from sa_jitter_ros.recordings.fields import fields_of

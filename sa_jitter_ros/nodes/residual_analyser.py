@@ -34,8 +34,8 @@ from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)
-from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name, Values
-from sa_jitter_ros.parameters import Parameter, require_shaft_names
+from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
+from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
 from std_msgs.msg import Float64MultiArray, String

@@ -19,8 +19,7 @@ from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_pulse_array, encode_pulse_reference, known_type, PULSE_TYPES, SAMPLE_TYPES,
     SampleDecoder)
-from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.parameters import Parameter
+from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
 
@@ -30,20 +29,6 @@ TACH_TYPE = Parameter(
     'tach_type', 'sensor_msgs/TimeReference', 'message type of tach_pulse: '
     'sensor_msgs/TimeReference, or std_msgs/Float64MultiArray for more than a few hundred pulses '
     'per second', read_only=True)
-
-
-def sample_parameters(topic: str) -> tuple[Parameter, ...]:
-    """Return the parameters of the node whose input of samples is `topic`."""
-    return (
-        Parameter('vibration_type', 'std_msgs/Float64MultiArray', f'message type of {topic}',
-                  read_only=True),
-        Parameter('sample_rate', 0.0, f'sampling rate of {topic}; 0 if the messages contain it',
-                  unit='Hz', minimum=0.0, maximum=1e9, read_only=True),
-        Parameter('start_time', 0.0, 'time of the first sample if the messages do not contain it',
-                  unit='s', read_only=True),
-        Parameter('time_tolerance', 0.01, 'deviation of a header time that starts a new run',
-                  unit='s', above=0.0, read_only=True),
-    )
 
 
 class SampleInput:

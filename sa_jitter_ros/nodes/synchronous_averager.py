@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.averager_parameters import (
+    gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
-from sa_jitter_ros.nodes.averager_parameters import (gear_settings, keyphasor_parameters,
-                                                     one_ratio, PARAMETERS, shaft_parameters,
-                                                     shaft_settings)
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
                                           PULSE_TYPES)
-from sa_jitter_ros.nodes.parameters import Values
 from sa_jitter_ros.nodes.signals import SampleInput
-from sa_jitter_ros.parameters import require_shaft_names
+from sa_jitter_ros.parameters import require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray
 
 FloatArray = NDArray[np.float64]

@@ -24,10 +24,10 @@ from sa_jitter_ros.nodes.base import MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.joint_input import JointInput
 from sa_jitter_ros.nodes.messages import known_type, SAMPLE_TYPES
-from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.nodes.signals import PulseOutput, sample_parameters, SampleInput, TACH_TYPE
-from sa_jitter_ros.parameters import Parameter, PULSES_PER_REVOLUTION
-from sa_jitter_ros.pulses.detection import KeyphasorDetector
+from sa_jitter_ros.nodes.signals import PulseOutput, SampleInput, TACH_TYPE
+from sa_jitter_ros.parameters import (
+    Parameter, PULSES_PER_REVOLUTION, sample_parameters, Values)
+from sa_jitter_ros.pulses.detector_parameters import DECISIVE, detector_of, DETECTOR_PARAMETERS
 from sensor_msgs.msg import JointState
 
 FloatArray = NDArray[np.float64]
@@ -53,37 +53,8 @@ PARAMETERS = (
     Parameter('imu_axis', 'z', 'axis of linear acceleration that is the waveform',
               choices=('x', 'y', 'z'), read_only=True),
     Parameter('keyphasor', 'keyphasor', 'name of the keyphasor: source of the published pulses'),
-    Parameter('automatic_threshold', True, 'learn the threshold from the state levels (low and '
-              'high) of the waveform'),
-    Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
-    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
-              'difference between the state levels', minimum=0.0, maximum=0.99),
-    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below',
-              choices=('positive', 'negative')),
-    Parameter('edge', 'rising', 'edge of the pulse that gives its time',
-              choices=('rising', 'falling', 'centre')),
-    Parameter('interpolate', True, 'interpolate the time between samples; false: time of the '
-              'first sample past the threshold'),
-    Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
-              unit='s', minimum=0.0),
-    Parameter('learning_time', 0.5, 'length of the windows from which the state levels are learnt',
-              unit='s', above=0.0, maximum=60.0),
-    Parameter('minimum_difference', 0.0, 'state levels closer than this are taken for noise [unit '
-              'of the waveform]', minimum=0.0),
+    *DETECTOR_PARAMETERS,
 )
-
-
-# Parameters that are options of the detector, and all that decide which pulses it finds.
-OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
-           'minimum_difference')
-DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
-
-
-def detector_of(values: Values) -> KeyphasorDetector:
-    """Detector with these parameters; raises `ParameterError`."""
-    return KeyphasorDetector(
-        threshold=None if values['automatic_threshold'] else values['threshold'],
-        **{name: values[name] for name in OPTIONS})
 
 
 class TachDetector(MonitoringNode):

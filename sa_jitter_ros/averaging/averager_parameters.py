@@ -16,10 +16,9 @@ from math import prod
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING, KeyphasorParameters
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.nodes.parameters import Values
-from sa_jitter_ros.nodes.signals import sample_parameters
 from sa_jitter_ros.parameters import (
-    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, TRIGGER_CYCLES)
+    Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TRIGGER_CYCLES,
+    Values)
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
 

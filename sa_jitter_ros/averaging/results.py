@@ -1,0 +1,132 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Results of an average as arrays under the names of their topics, the same in messages and files.
+
+Layouts are those of the topics of `synchronous_averager`: `<shaft>/synchronous_average`, ...
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.indicators import GearSettings, INDICATORS, RunningIndicators
+from sa_jitter_ros.errors import ParameterError, SignalError
+
+FloatArray = NDArray[np.float64]
+
+AMPLITUDE_FIELDS = (
+    'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',
+    'attenuation', 'attenuation_standard_error', 'noise_standard_deviation')
+PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
+
+
+@dataclass(frozen=True)
+class AverageHeader:
+    """
+    Times (s), numbers of cycles and `mean_trigger_speed` (Hz, tach shaft) of an average.
+
+    `discarded_cycles` trigger cycles between the first and the last one are not in it.
+    """
+
+    start_time: float
+    end_time: float
+    sequence: int
+    trigger_cycles: int
+    fundamental_cycles: int
+    mean_trigger_speed: float
+    discarded_cycles: int = 0
+
+
+@dataclass(frozen=True)
+class AverageMessage:
+    """
+    One array of results of one average.
+
+    `values` is channel x angle for a synchronous average, channel x order x field for order
+    amplitudes (`AMPLITUDE_FIELDS`), pulse x field for pulse errors (`PULSE_ERROR_FIELDS`) and
+    channel x indicator for condition indicators; `names` are the fields or indicators.
+    """
+
+    header: AverageHeader
+    values: FloatArray
+    names: tuple[str, ...] = ()
+
+
+class ShaftResults:
+    """The results of the averages of one shaft; condition indicators depend on earlier ones."""
+
+    def __init__(self, gear: GearSettings | None = None) -> None:
+        self._gear = gear or GearSettings()
+        self._indicators = RunningIndicators(self._gear)
+        self.problem = ''  # why the latest average has no condition indicators
+
+    def use(self, gear: GearSettings) -> None:
+        """Use other mesh orders; the indicators forget earlier averages."""
+        if gear != self._gear:
+            self._gear, self._indicators = gear, RunningIndicators(gear)
+
+    def of(self, average: Average) -> dict[str, AverageMessage]:
+        """
+        Return the arrays of the next average by the names of their topics.
+
+        `corrected_average` and `pulse_error` are there if the correction was accepted,
+        `condition_indicator` if the waveform is finite and the mesh orders are in it.
+        """
+        header = AverageHeader(
+            average.start_time, average.end_time, average.sequence, average.trigger_cycles,
+            average.fundamental_cycles, average.trigger_speed, average.discarded_cycles)
+        found = {
+            'synchronous_average': AverageMessage(header, average.waveform),
+            'standard_error': AverageMessage(header, average.standard_error),
+            'order_amplitude': AverageMessage(header, amplitude_table(average), AMPLITUDE_FIELDS)}
+        correction = average.correction
+        if correction is not None and correction.accepted:
+            found['corrected_average'] = AverageMessage(header, correction.waveform)
+            found['pulse_error'] = AverageMessage(header, np.stack(
+                (average.pulses, correction.pulse_errors, correction.standard_errors,
+                 average.used), axis=1), PULSE_ERROR_FIELDS)
+        waveform = average.waveform if correction is None else correction.waveform
+        self.problem = ''
+        if np.isfinite(waveform).all():
+            found |= self._indicate(header, waveform)
+        return found
+
+    def _indicate(self, header: AverageHeader, waveform: FloatArray) -> dict[str, AverageMessage]:
+        """Return the condition indicators of a waveform, none where it lacks a mesh order."""
+        try:
+            self._indicators.update(waveform)
+        except SignalError:  # the number of channels has changed
+            self._indicators = RunningIndicators(self._gear)
+            self._indicators.update(waveform)
+        except ParameterError as error:
+            self.problem = str(error)
+            return {}
+        return {'condition_indicator': AverageMessage(
+            header, self._indicators.get().values, INDICATORS)}
+
+
+def amplitude_table(average: Average) -> FloatArray:
+    """Return (channel, order, `AMPLITUDE_FIELDS`), NaN where there is no correction."""
+    table = np.full((*average.amplitudes.shape, len(AMPLITUDE_FIELDS)), np.nan)
+    table[..., 0] = average.orders
+    table[..., 1] = np.abs(average.amplitudes)
+    table[..., 2] = np.angle(average.amplitudes)
+    table[..., 7] = average.noise
+    if average.correction is not None and average.correction.accepted:
+        correction = average.correction
+        table[..., 3] = np.abs(correction.amplitudes)
+        table[..., 4] = np.angle(correction.amplitudes)
+        table[..., 5] = correction.attenuation
+        table[..., 6] = correction.attenuation_standard_error
+        table[..., 7] = correction.noise  # without the scatter that jitter causes
+    return table

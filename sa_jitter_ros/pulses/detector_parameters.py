@@ -1,0 +1,46 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Parameters of a detector of pulses, and the detector that they make."""
+
+from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.pulses.detection import KeyphasorDetector
+
+DETECTOR_PARAMETERS = (
+    Parameter('automatic_threshold', True, 'learn the threshold from the state levels (low and '
+              'high) of the waveform'),
+    Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
+    Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
+              'difference between the state levels', minimum=0.0, maximum=0.99),
+    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below',
+              choices=('positive', 'negative')),
+    Parameter('edge', 'rising', 'edge of the pulse that gives its time',
+              choices=('rising', 'falling', 'centre')),
+    Parameter('interpolate', True, 'interpolate the time between samples; false: time of the '
+              'first sample past the threshold'),
+    Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
+              unit='s', minimum=0.0),
+    Parameter('learning_time', 0.5, 'length of the windows from which the state levels are learnt',
+              unit='s', above=0.0, maximum=60.0),
+    Parameter('minimum_difference', 0.0, 'state levels closer than this are taken for noise [unit '
+              'of the waveform]', minimum=0.0),
+)
+
+# Parameters that are options of the detector, and all that decide which pulses it finds.
+OPTIONS = ('hysteresis', 'polarity', 'edge', 'interpolate', 'minimum_interval', 'learning_time',
+           'minimum_difference')
+DECISIVE = ('automatic_threshold', 'threshold', *OPTIONS)
+
+
+def detector_of(values: Values) -> KeyphasorDetector:
+    """Detector with these parameters; raises `ParameterError`."""
+    return KeyphasorDetector(
+        threshold=None if values['automatic_threshold'] else values['threshold'],
+        **{name: values[name] for name in OPTIONS})
