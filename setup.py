@@ -26,7 +26,7 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('chain', 'check_keyphasor', 'close_loop', 'demo', 'design')
+COMMANDS = ('average', 'chain', 'check_keyphasor', 'close_loop', 'demo', 'design')
 
 
 def scripts():
@@ -73,6 +73,7 @@ setup(
     ],
     extras_require={
         'bags': ['rosbags>=0.10'],
+        'fleet': ['distributed>=2023.5'],
         'mat73': ['h5py>=3.7'],
         'docs': ['myst-parser>=2,<6', 'sphinx>=7.2,<10'],
         'test': [

@@ -31,7 +31,7 @@ from test_architecture import is_ros, MODULES, needs
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'sa_jitter_ros'
 PYPI_NAMES = {'yaml': 'PyYAML'}
-OPTIONAL = {'h5py': 'mat73', 'rosbags': 'bags'}  # package to extra
+OPTIONAL = {'distributed': 'fleet', 'h5py': 'mat73', 'rosbags': 'bags'}  # package to extra
 # Keys of rosdep that are Debian packages of Ubuntu 24.04 or of ROS 2, no names of pip.
 ROSDEP_KEYS = {
     'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-hypothesis',

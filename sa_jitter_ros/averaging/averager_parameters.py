@@ -15,6 +15,8 @@ from math import prod
 
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING, KeyphasorParameters
 from sa_jitter_ros.averaging.indicators import GearSettings
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import (
     Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, sample_parameters, TRIGGER_CYCLES,
@@ -114,6 +116,15 @@ def keyphasor_parameters(values: Values) -> KeyphasorParameters:
     """Return the parameters of the keyphasor; raises `ParameterError`."""
     return KeyphasorParameters(**{
         item.name: values[item.name] for item in fields(KeyphasorParameters)})
+
+
+def streaming_averager(values: Values, *, buffer_seconds: float) -> StreamingAverager:
+    """Return the averager of all shafts; raises `ParameterError`."""
+    return StreamingAverager(
+        {name: shaft_settings(values, name) for name in values['shafts']},
+        validator=keyphasor_parameters(values).validator(),
+        timeline=VibrationTimeline(time_tolerance=values['time_tolerance'],
+                                   buffer_seconds=buffer_seconds))
 
 
 def gear_settings(values: Values, name: str) -> GearSettings:

@@ -26,7 +26,7 @@ from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
-_READ_OPTIONS = ('sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
+_READ_OPTIONS = ('acquisition', 'sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
 
 
 class Parser(argparse.ArgumentParser):
@@ -95,6 +95,8 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
                         help='field of the recording: the key that the file has for it '
                         '(pulse_times=tach), or its value (sample_rate=97656, orders=20,40); '
                         'may be repeated')
+    parser.add_argument('--acquisition', type=int, default=0, metavar='N',
+                        help='number of the acquisition, from 0, in a file with several')
     group = parser.add_argument_group('channels, if the file does not name them (.wav, .csv)')
     group.add_argument('--tach-channel', default='', metavar='CHANNEL',
                        help='name, or number from 0, of the channel with the tach waveform')
@@ -105,6 +107,22 @@ def add_recording_options(parser: argparse.ArgumentParser) -> None:
                        help='name or number of the column of a .csv with the times in s')
     group.add_argument('--sample-rate', type=float, metavar='HZ',
                        help='sampling rate of the vibration, if the file does not contain it')
+
+
+def add_fleet_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options for many recordings: `jobs`, None if not given, and `scheduler`."""
+    group = parser.add_argument_group('many recordings')
+    group.add_argument('--jobs', type=_count, metavar='N',
+                       help='recordings at a time, each in a process of its own (1)')
+    group.add_argument('--scheduler', default='', metavar='tcp://HOST:PORT',
+                       help='Dask cluster whose workers do it; they must see the same files')
+
+
+def _count(text: str) -> int:
+    """Return a whole number of 1 or more; argparse says which option is wrong."""
+    if not (text.isdecimal() and int(text) > 0):
+        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, 1 or more')
+    return int(text)
 
 
 def machine_fields(params: Path | None) -> dict[str, Any]:

@@ -94,14 +94,28 @@ def _weak(recording: Recording, pulses: FloatArray, *, orders: list[float], rati
         return []
     with np.errstate(divide='ignore', invalid='ignore'):
         clear = np.array([np.abs(item.amplitudes) / item.noise for item in averages])
-    if np.any(np.nan_to_num(np.median(clear, axis=0), posinf=np.inf) > _CLEAR) or np.all(
-            np.isnan(clear)):
-        return []
-    speed = float(np.median([item.trigger_speed for item in averages]))
+    return list(weak_orders(clear, orders, speed=float(np.median(
+        [item.trigger_speed for item in averages])), ratio=ratio))
+
+
+def weak_orders(clear: FloatArray, orders: Sequence[float], *, speed: float, ratio: float
+                ) -> tuple[str, ...]:
+    """
+    Return a sentence if no order stands above its noise, nothing else.
+
+    `clear` (average, channel, order) are amplitudes over their noise, NaN where there is none;
+    `speed` of the tach shaft in Hz.
+
+    >>> weak_orders(np.array([[[5.0, 0.8]]]), (19.0, 38.0), speed=20.0, ratio=1.0)
+    ()
+    """
+    known = clear[:, ~np.isnan(clear).any(axis=0)]
+    if not known.size or np.any(np.median(known, axis=0) > _CLEAR):
+        return ()
     listed = ', '.join(f'{order:g}' for order in orders[:6])
-    return [f'none of the orders {listed} stands above its noise at {speed:.4g} Hz and ratio '
+    return (f'none of the orders {listed} stands above its noise at {speed:.4g} Hz and ratio '
             f'{ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
-            '(check_keyphasor finds them)']
+            '(check_keyphasor finds them)',)
 
 
 def _other_jitter(pulses: FloatArray, declared: float) -> list[str]:

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import (
-    gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
-from sa_jitter_ros.averaging.streaming import StreamingAverager
-from sa_jitter_ros.averaging.timeline import VibrationTimeline
+    gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings,
+    streaming_averager)
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.base import MonitoringNode, run_node
@@ -50,7 +49,8 @@ class SynchronousAverager(MonitoringNode):
             if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
                 raise one_ratio(values, name)
         self._shafts = {name: ShaftOutput(self, name) for name in names}
-        self._averager = self._build(values)
+        self._averager = streaming_averager(
+            values, buffer_seconds=values['buffer_seconds'])
         self._check(values)
         self._apply_indicators(values)
         self._values = values
@@ -77,13 +77,6 @@ class SynchronousAverager(MonitoringNode):
                                f'{", ".join(names)}')
 
     # --- parameters ---
-
-    def _build(self, values: Values) -> StreamingAverager:
-        return StreamingAverager(
-            {name: shaft_settings(values, name) for name in self._shafts},
-            validator=keyphasor_parameters(values).validator(),
-            timeline=VibrationTimeline(time_tolerance=values['time_tolerance'],
-                                       buffer_seconds=values['buffer_seconds']))
 
     def _check(self, values: Values) -> None:
         keyphasor_parameters(values).validator()

@@ -26,7 +26,7 @@ from sa_jitter_ros.recordings.npz_format import open_npz
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 from sa_jitter_ros.recordings.wav_format import open_wav
 
-_SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
+SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
 
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
@@ -100,9 +100,9 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
                 raise RecordingError(f'{item.name} is a pipe or a device: give a file or a '
                                      'rosbag2 folder')
         suffix = 'bag' if path.is_dir() else path.suffix.lower()
-        if suffix not in ('bag', *_SUFFIXES):
+        if suffix not in ('bag', *SUFFIXES):
             raise RecordingError(f'cannot be read: {suffix or "no suffix"} is not one of '
-                                 f'{", ".join(_SUFFIXES)} or a rosbag2 folder; convert it')
+                                 f'{", ".join(SUFFIXES)} or a rosbag2 folder; convert it')
         if suffix in ('.npz', '.mat'):
             opened = open_npz if suffix == '.npz' else open_mat
             recording = channel_map.select(opened(

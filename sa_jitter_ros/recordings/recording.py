@@ -252,14 +252,14 @@ class Recording:
         blocks = [block[0] for block in self.tach_blocks()]
         return np.concatenate(blocks) if blocks else np.empty(0)
 
-    def keyphasor_pulses(self, *, interpolate: bool = True, duration: float = math.inf
-                         ) -> FloatArray:
+    def keyphasor_pulses(self, *, interpolate: bool = True, duration: float = math.inf,
+                         detector: KeyphasorDetector | None = None) -> FloatArray:
         """
         Return the pulse times (s) of the keyphasor in the first `duration` seconds.
 
-        They are `pulse_times`, else those found in the tach waveform (`interpolate` as in
-        `detect_pulses`), else `reference_pulse_times`. Raises RecordingError where there is none
-        of these.
+        They are `pulse_times`, else those found in the tach waveform (by a `detector`, or with
+        `interpolate` as in `detect_pulses`), else `reference_pulse_times`. Raises RecordingError
+        where there is none of these.
         """
         end = self.start_time + duration
         times = self.pulse_times
@@ -272,7 +272,7 @@ class Recording:
                                  'waveform; add one of them, or name the channel that is the '
                                  'waveform (tach_channel, --tach-channel)')
         count = math.ceil(min(duration * self.tach_rate, self.tach.samples))
-        return pulses_in_blocks(KeyphasorDetector(interpolate=interpolate),
+        return pulses_in_blocks(detector or KeyphasorDetector(interpolate=interpolate),
                                 self._tach_samples(count, self.tach_rate))
 
     def _tach_samples(self, count: int, rate: float) -> Iterator[SampleBlock]:

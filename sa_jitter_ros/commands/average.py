@@ -1,0 +1,140 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Command `average`: synchronous averages of recordings, all that the averager does, as files.
+
+Each recording gets a folder with averages.npz, averages.csv and figures; averages.csv and
+recordings.csv beside these folders cover all recordings. Recordings that were finished before are
+skipped. A folder counts for all recordings below it.
+"""
+
+import argparse
+from collections.abc import Sequence
+import os
+from pathlib import Path
+import signal
+import sys
+
+from sa_jitter_ros.commands.command_line import (
+    add_fleet_options, add_recording_options, Parser, read_options, require_writable, show)
+from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
+from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
+from sa_jitter_ros.offline.files import remove_unfinished
+from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
+from sa_jitter_ros.offline.processes import Failure
+from sa_jitter_ros.offline.settings import MachineFile
+from sa_jitter_ros.offline.tables import RECORDINGS, write_tables
+from sa_jitter_ros.recordings.fields import fields_of
+
+
+def make_parser() -> Parser:
+    """Return the parser of the command line."""
+    parser = Parser(prog='average', description=__doc__,
+                    formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
+                        help='.npz, .mat, .wav, .csv or rosbag2, or a folder of them')
+    parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
+                        help='parameter file of the machine; without: settings are chosen from '
+                        'each recording')
+    parser.add_argument('-p', '--param', action='append', default=[], dest='given',
+                        metavar='NAME:=VALUE', help='parameter of synchronous_averager, as in '
+                        'trigger_cycles:=60; overrides the file; may be repeated')
+    parser.add_argument('--output', type=Path, required=True, metavar='DIR',
+                        help='folder for the results')
+    parser.add_argument('--no-figures', action='store_true', help='write arrays and tables only')
+    parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_fleet_options(parser)
+    add_recording_options(parser)
+    return parser
+
+
+def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
+    """Return the jobs, and rows of recordings that cannot have one; raises ParameterError."""
+    machine = MachineFile.read(options.params, options.given)
+    if machine.unknown:
+        print(f'average: {options.params}: ignored, because synchronous_averager has no such '
+              f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
+    found = find_recordings(options.recordings, leave_out=options.output)
+    if not found:
+        raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
+                             'folder: give one with .npz, .mat, .wav, .csv or rosbag2')
+    output = options.output.absolute()
+    keywords, fields = read_options(options), tuple(fields_of(options.fields))
+    return [AverageJob(
+        item.name, os.path.abspath(item.path), str(output / item.name), machine, keywords, fields,
+        not options.no_figures) for item in found if not item.error], [
+            Row(item.name, str(item.path), item.error) for item in found if item.error]
+
+
+def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
+    """Average the recordings and write the tables; raises SaJitterError, OSError."""
+    jobs, rows = jobs_of(options)
+    for row in rows:
+        progress.say(row.error)
+    for job in jobs:
+        remove_unfinished(Path(job.folder))
+
+    def alone(job: AverageJob) -> Row:
+        return average_file(job, lambda share: progress.show(
+            (done + share) / len(jobs), job.name if len(jobs) == 1 else
+            f'{job.name}, {done} of {len(jobs)} done'))
+
+    done = 0
+    in_this = not options.scheduler and options.jobs in (None, 1)
+    try:
+        for job, result in run_jobs(alone if in_this else average_file, jobs,
+                                    processes=options.jobs or 1, scheduler=options.scheduler):
+            row = Row(job.name, job.path, str(result)) if isinstance(result, Failure) else result
+            done += 1
+            rows.append(row)
+            for remark in row.remarks:
+                progress.say(f'warning: {row.recording}: {remark}')
+            if row.error:
+                known = row.error.startswith(row.path)
+                progress.say(row.error if known else f'{row.path}: {row.error}')
+            progress.show(done / len(jobs), f'{done} of {len(jobs)} done')
+    finally:
+        progress.clear()
+        if any(row.averages for row in rows):
+            write_tables(options.output, rows)
+    return rows
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Average recordings; return 0, or 2 after one line if none could be averaged."""
+    options = make_parser().parse_args(args)
+    progress = Progress('average', quiet=options.quiet)
+    use_one_thread()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        require_writable(options.output)
+        rows = run(options, progress)
+    except (SaJitterError, OSError) as error:
+        progress.say(' '.join(str(error).split()))
+        return 2
+    except KeyboardInterrupt:
+        progress.say('stopped; what was finished stays, the same command goes on from there')
+        return 130
+    averaged = [row for row in rows if row.averages]
+    if not averaged:
+        return 2
+    failed = sum(bool(row.error) for row in rows)
+    return show('average', f'{sum(row.averages for row in averaged)} averages of {len(averaged)} '
+                f'recording{"s" * (len(averaged) > 1)}'
+                + (f'; {failed} could not be averaged, or not wholly: see {RECORDINGS}'
+                   if failed else ''),
+                f'written: {options.output}')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,57 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The progress of a command on the standard error: a bar on a terminal, else a line at times."""
+
+from contextlib import suppress
+import sys
+import time
+
+_REDRAW, _LINE = 0.2, 10.0  # s between two bars, two lines
+_WIDTH = 24
+
+
+class Progress:
+    """Shows how much of the work of a program is done, unless `quiet`."""
+
+    def __init__(self, program: str, *, quiet: bool = False) -> None:
+        self._program, self._quiet = program, quiet
+        self._bar = sys.stderr.isatty()
+        self._start = self._last = time.monotonic()
+        self._drawn = False
+
+    def show(self, share: float, text: str) -> None:
+        """Show the share that is done (0 to 1), and a text."""
+        now = time.monotonic()
+        if self._quiet or now - self._last < (_REDRAW if self._bar else _LINE):
+            return
+        self._last = now
+        left = (now - self._start) * (1.0 / share - 1.0) if share > 0.0 else float('inf')
+        line = f'{share:4.0%}  {text}' + (f'  {left:.0f} s left' if left < 1e6 else '')
+        if self._bar:
+            full = round(_WIDTH * min(share, 1.0))
+            line = f'[{"#" * full}{"." * (_WIDTH - full)}] {line}'
+        self._write(f'{self._program}: {line}', end='' if self._bar else '\n')
+        self._drawn = self._bar
+
+    def say(self, line: str) -> None:
+        """Show a line that stays, also if quiet."""
+        self.clear()
+        self._write(f'{self._program}: {line}', end='\n')
+
+    def clear(self) -> None:
+        """Remove the bar."""
+        if self._drawn:
+            self._write('', end='')
+        self._drawn = False
+
+    def _write(self, line: str, *, end: str) -> None:
+        with suppress(OSError):  # the work goes on if nobody can read it
+            print(f'\r\033[K{line}' if self._bar else line, end=end, file=sys.stderr, flush=True)

@@ -1,0 +1,250 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""One recording: its averages in files, by a function of a job that any process can do."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming_averager
+from sa_jitter_ros.averaging.results import ShaftResults
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
+from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
+from sa_jitter_ros.offline.files import finished_together, read_about, Signals, write_averages
+from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
+from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
+from sa_jitter_ros.parameters import Values
+from sa_jitter_ros.pulses.detector_parameters import detector_of
+from sa_jitter_ros.pulses.unit_check import likely_mistake
+from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
+from sa_jitter_ros.samples import SampleBlock
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[float], None]
+
+_VERSION = 1  # of the files: those of another one are written again
+_BLOCK = 1 << 19  # values in a block, of all channels
+_MOST_REMARKS = 10
+
+
+@dataclass(frozen=True)
+class AverageJob:
+    """
+    One recording to average: its `name` in the results, its `path` and the folder of its files.
+
+    `options` are keywords of `read`; `fields` among them are those that the user gave.
+    """
+
+    name: str
+    path: str
+    folder: str
+    machine: MachineFile
+    options: Mapping[str, Any] = field(default_factory=dict)
+    fields: tuple[str, ...] = ()
+    figures: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """
+    What became of one recording.
+
+    `error` is empty if all of it was averaged. With averages and an error it ended early, and the
+    averages up to there are in its files. Counts are those of the averager's diagnostics;
+    `trigger_speed` (Hz) is the mean of the averages.
+    """
+
+    recording: str
+    path: str
+    error: str = ''
+    averages: int = 0
+    trigger_speed: float = math.nan
+    trigger_cycles: int = 0
+    cycles_dropped: int = 0
+    pulses_dropped: int = 0
+    samples_dropped: int = 0
+    gaps: int = 0
+    corrections_refused: int = 0
+    remarks: tuple[str, ...] = ()
+
+
+class RecordingAverager:
+    """Averages a recording; the counts and remarks are complete when `results` is exhausted."""
+
+    def __init__(self, recording: Recording, values: Values, detector: Values) -> None:
+        self._recording, self._values = recording, values
+        self._stream = streaming_averager(values, buffer_seconds=math.inf)
+        self._results = {name: ShaftResults(gear_settings(values, name))
+                         for name in values['shafts']}
+        self._pulses = recording.keyphasor_pulses(detector=detector_of(detector))
+        self.refused = 0
+        self.ended_early = ''
+
+    @property
+    def stream(self) -> StreamingAverager:
+        """Return the averager, for its counts."""
+        return self._stream
+
+    def results(self, progress: Progress | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+        """
+        Iterate over the results of all averages, as (shaft, arrays by topic).
+
+        A recording that breaks off in the middle ends there: `ended_early` says why.
+        """
+        recording, stream = self._recording, self._stream
+        rate, start, index = recording.sample_rate, recording.start_time, 0
+        yield from self._arrays(stream.add_pulses(self._pulses))
+        # Vibration that no pulse follows would only wait.
+        end = self._pulses[-1] + max(np.diff(self._pulses[-3:]), default=0.0) + 1.0 \
+            if self._pulses.size else start
+        blocks = recording.blocks(max(_BLOCK // recording.channels, 1))
+        while True:
+            try:
+                samples = next(blocks, None)
+            except RecordingError as error:
+                self.ended_early = str(error)
+                break
+            if samples is None or start + index / rate > end:
+                break
+            yield from self._arrays(stream.add_samples(
+                SampleBlock(samples, start + index / rate, rate, index)))
+            index += samples.shape[1]
+            if progress is not None:
+                progress(index / recording.samples)
+        yield from self._arrays(stream.finish())
+
+    def none(self) -> SignalError:
+        """Return the error for a recording without an average."""
+        recording, pulses = self._recording, self._pulses
+        start, end = recording.start_time, recording.start_time + recording.duration
+        messages = self._stream.take_messages()
+        return SignalError(
+            f'{pulses.size} pulses and vibration from {start:g} s to {end:g} s make '
+            f'{self._stream.counts.cycles} whole trigger cycles of the '
+            f'{self._values["trigger_cycles"]} of an average: '
+            + (self.ended_early or likely_mistake(pulses, start, end, recording.sample_rate)
+               or '; '.join(messages[:2]) or 'lower trigger_cycles, or give more pulses'))
+
+    def doubts(self, series: Sequence[ShaftSeries]) -> tuple[str, ...]:
+        """Return what contradicts each other in recording, settings and averages of the shafts."""
+        rate = self._values['keyphasor_rate']
+        found = list(doubts(
+            self._recording, self._pulses,
+            jitter_std=1.0 / math.sqrt(12.0) / rate
+            if rate and self._recording.tach is None else None))
+        weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
+        for item in series:
+            settings = self._stream.shafts[item.shaft].settings
+            amplitude, noise = item.field('raw_amplitude'), item.field('noise_standard_deviation')
+            with np.errstate(divide='ignore', invalid='ignore'):
+                clear = amplitude / noise
+            weak.append(weak_orders(
+                clear, item.orders.tolist(), speed=float(np.median(item['trigger_speed'])),
+                ratio=settings.cycle_length / settings.revolutions_per_trigger))
+        return (*found, *(weak[0] if all(weak) else ()))
+
+    def _arrays(self, averages: list[tuple[str, Average]]
+                ) -> Iterator[tuple[str, dict[str, Any]]]:
+        for name, average in averages:
+            self.refused += average.correction is not None and not average.correction.accepted
+            yield name, self._results[name].of(average)
+
+
+def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
+    """
+    Average one recording into its folder, unless that was done before with the same settings.
+
+    A recording that cannot be used gives a row with the reason. Raises OSError where the folder
+    cannot be written.
+    """
+    try:
+        settings = _settings(job)
+        done = read_about(Path(job.folder))
+        if done is not None and done.get('settings') == settings:
+            return _row(done['row'])
+        return _averaged(job, settings, progress)
+    except SaJitterError as error:
+        return Row(job.name, job.path, error=str(error))
+
+
+def _row(values: Mapping[str, Any]) -> Row:
+    """Return the row of a folder that was finished before."""
+    return Row(**{**values, 'remarks': tuple(values['remarks'])})
+
+
+def _settings(job: AverageJob) -> dict[str, Any]:
+    """Return all that decides the files, as values of JSON; raises RecordingError."""
+    path = Path(job.path)
+    try:
+        files = [path] if not path.is_dir() else sorted(path.iterdir())
+        sizes = [[item.name, item.stat().st_size, item.stat().st_mtime_ns] for item in files]
+    except OSError as error:
+        raise RecordingError(f'{path}: {error.strerror}: check the path') from None
+    return {'version': _VERSION, 'files': sizes, 'figures': job.figures, 'path': job.path,
+            'averager': dict(job.machine.averager), 'detector': dict(job.machine.detector),
+            'options': {name: list(value) if isinstance(value, tuple) else value
+                        for name, value in job.options.items()}}
+
+
+def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
+    recording = read(job.path, **job.options)
+    faults = channel_faults(recording)
+    lost = {channel for channel, reason in faults.items() if is_lost(reason)}
+    kept = [k for k in range(recording.channels) if k not in lost] or range(recording.channels)
+    several = '' if recording.acquisitions == 1 else (
+        f'the file holds {recording.acquisitions} acquisitions, of which one is averaged: '
+        '--acquisition chooses another')
+    remarks = [*filter(None, [several]), *recording.remarks, *(
+        f'{recording.channel_names[channel]} {reason}'
+        + (' and is left out: check its sensor and cable' if channel in lost else
+           ': lower its gain, or choose a larger range')
+        for channel, reason in faults.items())]
+    recording = without_channels(recording, lost)
+    signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units)
+    values = averager_values(job.machine, recording, fields=job.fields)
+    averager = RecordingAverager(recording, values, detector_values(job.machine))
+    with finished_together(Path(job.folder)) as folder:
+        series = collect(averager, folder.parent, progress)
+        if not series:
+            raise averager.none()
+        remarks += [*averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
+        row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
+        row = replace(row, remarks=tuple(remarks[:_MOST_REMARKS]))
+        write_averages(folder, signals, series, {'settings': settings, 'row': asdict(row)})
+    return row
+
+
+def collect(averager: RecordingAverager, folder: Path, progress: Progress | None = None
+            ) -> list[ShaftSeries]:
+    """Return the averages of all shafts that have any; large arrays are in files in `folder`."""
+    collectors: dict[str, ShaftCollector] = {}
+    for shaft, results in averager.results(progress):
+        if shaft not in collectors:
+            collectors[shaft] = ShaftCollector(shaft, folder)
+        collectors[shaft].add(results)
+    return [collector.series() for collector in collectors.values()]
+
+
+def _counted(row: Row, averager: RecordingAverager, series: list[ShaftSeries]) -> Row:
+    totals = averager.stream.totals
+    return replace(
+        row, averages=sum(map(len, series)),
+        trigger_speed=float(np.mean(series[0]['trigger_speed'])),
+        trigger_cycles=averager.stream.counts.cycles, corrections_refused=averager.refused,
+        cycles_dropped=totals['cycles_dropped'], pulses_dropped=totals['pulses_dropped'],
+        samples_dropped=totals['samples_dropped'], gaps=totals['gaps'])

@@ -1,0 +1,168 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The files of averages: `averages.npz` and `averages.csv` of a recording, and tables of many.
+
+`averages.npz` has the arrays of each shaft under `<shaft>_<name>`, and those of the header also
+without a shaft: of the first one. `averages.csv` has a row for each average, channel and order.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+import csv
+from dataclasses import dataclass
+import json
+import os
+from pathlib import Path
+import shutil
+import tempfile
+from typing import Any, TextIO
+
+import numpy as np
+from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.offline.series import ShaftSeries
+
+ARRAYS, TABLE = 'averages.npz', 'averages.csv'
+TEMPORARY = '.averages.'  # prefix of folders whose files are not finished
+
+_HEADER = ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
+           'fundamental_cycles', 'discarded_cycles')
+_COLUMNS = ('recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
+            'trigger_cycles', 'discarded_cycles', 'channel')
+_WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles')
+
+
+@dataclass(frozen=True)
+class Signals:
+    """What was averaged: name of the recording, and number, name and unit of its channels."""
+
+    recording: str
+    channels: tuple[int, ...]
+    channel_names: tuple[str, ...]
+    units: tuple[str, ...]
+
+    def label(self, channel: int) -> str:
+        """Return name and unit of the channel in this place, for an axis."""
+        unit = self.units[channel] if channel < len(self.units) else ''
+        return f'{self.channel_names[channel]}\n[{unit or "unit unknown"}]'
+
+
+@contextmanager
+def finished_together(folder: Path) -> Iterator[Path]:
+    """
+    Yield a temporary folder, whose files get their names in `folder` at the end, or not at all.
+
+    `averages.npz` is last: where it is, all others are.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(dir=folder, prefix=TEMPORARY) as temporary:
+            place = Path(temporary, 'finished')
+            place.mkdir()
+            yield place
+            for path in sorted(place.iterdir(), key=lambda path: path.name == ARRAYS):
+                os.replace(path, folder / path.name)
+    finally:
+        with suppress(OSError):  # it holds something
+            folder.rmdir()
+
+
+def write_averages(folder: Path, signals: Signals, series: Sequence[ShaftSeries],
+                   about: Mapping[str, Any]) -> None:
+    """
+    Write `averages.npz` and `averages.csv` of a recording; raises OSError.
+
+    `about` are values of JSON that `read_about` returns.
+    """
+    with (folder / TABLE).open('w', encoding='utf-8', newline='') as file:
+        _write_table(file, signals, series)
+    arrays: dict[str, Any] = {
+        'recording': np.array(signals.recording), 'channels': np.array(signals.channels),
+        'channel_names': np.array(signals.channel_names), 'units': np.array(signals.units),
+        'shafts': np.array([item.shaft for item in series]),
+        'about': np.array(json.dumps(json_values(about), allow_nan=False))}
+    for name in _HEADER:
+        arrays[name] = _typed(name, series[0][name])
+    for item in series:
+        arrays |= {f'{item.shaft}_{name}': _typed(name, array)
+                   for name, array in item.arrays.items()}
+    np.savez(folder / ARRAYS, **arrays)
+
+
+def read_about(folder: Path) -> dict[str, Any] | None:
+    """Return what a finished folder says of itself, None if it is not finished."""
+    try:
+        with np.load(folder / ARRAYS) as arrays:
+            found = json.loads(str(arrays['about']))
+    except Exception:  # a broken file may raise an exception of any type: it is written again
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _typed(name: str, array: Any) -> Any:
+    return np.asarray(array).astype(int) if name in _WHOLE else array
+
+
+def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
+    writer = csv.writer(file, lineterminator='\n')
+    fields = series[0]['order_amplitude_fields'].tolist()
+    writer.writerow([*_COLUMNS, *fields, 'channel_name'])
+    for item in series:
+        header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
+        for row, table in enumerate(item['order_amplitude']):
+            start = [signals.recording, item.shaft, *(
+                header[name][row] for name in _COLUMNS[2:-1])]
+            for channel, name, orders in zip(signals.channels, signals.channel_names,
+                                             table.tolist()):
+                writer.writerows([*start, channel, *values, name] for values in orders)
+
+
+def write_lines(path: Path, lines: Callable[[TextIO], None]) -> None:
+    """Write a text file under a temporary name first; raises OSError."""
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=TEMPORARY) as temporary:
+        place = Path(temporary, path.name)
+        with place.open('w', encoding='utf-8', newline='') as file:
+            lines(file)
+        os.replace(place, path)
+
+
+def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[str, str]]
+                ) -> None:
+    """
+    Write the rows of all `averages.csv` in the folders into one table; raises OSError.
+
+    Its last column, `error`, is empty there; each of the `failures`, (name of a recording,
+    reason), has a row of its own.
+    """
+    def lines(file: TextIO) -> None:
+        columns: list[str] = []
+        for folder in folders:
+            with (folder / TABLE).open(encoding='utf-8', newline='') as part:
+                first = part.readline().rstrip('\n')
+                if not columns:
+                    columns = first.split(',')
+                    file.write(f'{first},error\n')
+                for line in part:
+                    file.write(f'{line[:-1]},\n')
+        writer = csv.writer(file, lineterminator='\n')
+        if not columns:
+            columns = [*_COLUMNS]
+            writer.writerow([*columns, 'error'])
+        for name, reason in failures:
+            writer.writerow([name, *[''] * (len(columns) - 1), reason])
+
+    write_lines(path, lines)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a run that was killed has left in a folder."""
+    for path in folder.glob(f'{TEMPORARY}*'):
+        shutil.rmtree(path, ignore_errors=True)

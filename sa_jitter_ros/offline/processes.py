@@ -1,0 +1,110 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""A function of many jobs, each in a process of its own: one that dies costs its own result."""
+
+from collections.abc import Callable, Iterator, Sequence
+import multiprocessing
+from multiprocessing import connection
+import os
+import signal
+from typing import Any, Generic, TypeVar
+
+from sa_jitter_ros.errors import SaJitterError
+
+Job = TypeVar('Job')
+Result = TypeVar('Result')
+
+_STOP_SECONDS = 5.0  # until a process that does not end is killed
+
+
+class Failure(Exception):
+    """A job that has no result; the text says why."""
+
+
+def attempt(function: Callable[[Job], Result], job: Job) -> Result | Failure:
+    """Return the result of a function, or why it has none; raises OSError."""
+    try:
+        return function(job)
+    except OSError:
+        raise
+    except SaJitterError as error:
+        return Failure(str(error))
+    except MemoryError:
+        return Failure('not enough memory: use fewer processes (--jobs)')
+    except Exception as error:  # what is wrong with one recording costs no other
+        return Failure(f'{type(error).__name__}: {" ".join(str(error).split())}')
+
+
+def _work(function: Callable[[Any], Any], job: Any, sender: Any) -> None:
+    """Do one job in a process of its own, and send what became of it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that started this one ends it
+    try:
+        sender.send(attempt(function, job))
+    except OSError as error:
+        sender.send(error)
+
+
+class Processes(Generic[Job, Result]):
+    """Processes, not more than `count` at a time, each with one job."""
+
+    def __init__(self, function: Callable[[Job], Result], count: int) -> None:
+        self._function, self._count = function, count
+        os.environ.setdefault('OMP_NUM_THREADS', '1')  # of the processes: they share the cores
+        self._context = multiprocessing.get_context('forkserver')
+        self._context.set_forkserver_preload([function.__module__])
+        self._running: dict[Any, tuple[Any, Job]] = {}
+
+    def results(self, jobs: Sequence[Job]) -> Iterator[tuple[Job, Result | Failure]]:
+        waiting = list(reversed(jobs))
+        while waiting or self._running:
+            while waiting and len(self._running) < self._count:
+                self._start(waiting.pop())
+            ready: list[Any] = connection.wait(list(self._running))
+            for receiver in ready:
+                process, job = self._running[receiver]
+                try:
+                    found = receiver.recv()
+                except EOFError:
+                    process.join()
+                    found = Failure(_death(process.exitcode))
+                process.join()
+                receiver.close()
+                del self._running[receiver]
+                if isinstance(found, OSError):
+                    raise found
+                yield job, found
+
+    def _start(self, job: Job) -> None:
+        receiver, sender = self._context.Pipe(duplex=False)
+        process = self._context.Process(target=_work, args=(self._function, job, sender),
+                                        daemon=True)
+        process.start()
+        sender.close()  # that the death of the process is the end of the pipe
+        self._running[receiver] = process, job
+
+    def stop(self) -> None:
+        """End the processes that still run."""
+        for process, _ in self._running.values():
+            process.terminate()
+        for process, _ in self._running.values():
+            process.join(_STOP_SECONDS)
+            if process.is_alive():
+                process.kill()
+                process.join()
+        self._running.clear()
+
+
+def _death(status: int) -> str:
+    if status >= 0:
+        return f'its process ended with status {status} and without a result'
+    name = signal.Signals(-status).name if -status in set(signal.Signals) else f'signal {-status}'
+    return (f'its process was ended by {name}: if the memory was full, use fewer processes '
+            '(--jobs)' if -status == signal.SIGKILL else f'its process was ended by {name}')

@@ -1,0 +1,43 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The tables of a run: all rows of all recordings, and a row for each recording."""
+
+from collections.abc import Sequence
+import csv
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import TextIO
+
+from sa_jitter_ros.offline.average_recording import Row
+from sa_jitter_ros.offline.files import join_tables, TABLE, write_lines
+
+RECORDINGS = 'recordings.csv'
+
+
+def write_tables(output: Path, rows: Sequence[Row]) -> None:
+    """
+    Write `averages.csv` and `recordings.csv` beside the folders of the recordings.
+
+    A recording that ended early, or could not be averaged, has a row with the reason in both.
+    Raises OSError.
+    """
+    ordered = sorted(rows, key=lambda row: (row.recording, row.path))
+    join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
+                [(row.recording, row.error) for row in ordered if row.error])
+
+    def lines(file: TextIO) -> None:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(item.name for item in fields(Row))
+        for row in ordered:
+            values = {**asdict(row), 'remarks': '; '.join(row.remarks)}
+            writer.writerow(values.values())
+
+    write_lines(output / RECORDINGS, lines)

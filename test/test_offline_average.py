@@ -1,0 +1,208 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Recordings averaged into files: what they hold, what is left out, and what bad input costs."""
+
+import csv
+import os
+from pathlib import Path
+import signal
+
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS
+from sa_jitter_ros.commands import average
+from sa_jitter_ros.recordings.npz_format import write_npz
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
+
+CLOCK, RATE, SPEED, SECONDS, RATIO = 3000.0, 8000.0, 16.6, 5.0, 2.40789
+MACHINE = f"""
+/**/synchronous_averager:
+  ros__parameters:
+    shafts: [output, input]
+    input.ratio: {RATIO}
+    input.orders: [19.0, 38.0]
+    input.mesh_orders: [19.0]
+    output.orders: [1.0]
+    trigger_cycles: 20
+    keyphasor_rate: {CLOCK}
+    correct_jitter: true
+"""
+
+
+@pytest.fixture(scope='module')
+def recording():
+    """Return a recording of two channels whose keyphasor is slow."""
+    machine = Gearbox(mesh('input', 19, harmonics=(1.0, 0.5)), RATE, shafts={'input': RATIO},
+                      speed=((0.0, SPEED),), seed=1, effects=(
+                          DeclaredJitter('uniform', 1 / CLOCK / 12**0.5), AdditiveNoise(0.1)))
+    samples = machine.vibration(0, round(RATE * SECONDS))[0]
+    return Recording(ArraySource(np.stack((samples, 0.6 * np.roll(samples, 5)))), RATE,
+                     units=('m/s^2',), channel_names=('drive end', 'free end'),
+                     pulse_times=machine.pulses(0.0, SECONDS).times, ratio=RATIO, orders=(19.0,))
+
+
+@pytest.fixture
+def rig(recording, tmp_path):
+    """Return its path, beside a machine file `machine.yaml`."""
+    write_npz(tmp_path / 'rig.npz', recording)
+    (tmp_path / 'machine.yaml').write_text(MACHINE)
+    return tmp_path / 'rig.npz'
+
+
+def run(*arguments):
+    """Run the command in this process, without figures."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        return average.main([*map(str, arguments), '--no-figures'])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def table(path):
+    """Return the rows of a .csv."""
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def test_files_hold_what_the_library_returns(recording, rig, tmp_path, capsys):
+    out = tmp_path / 'out'
+    assert run(rig, '--params', tmp_path / 'machine.yaml', '--output', out) == 0
+    assert capsys.readouterr() == (f'8 averages of 1 recording\nwritten: {out}\n', '')
+    expected = sa.average(
+        recording.read(), RATE, recording.pulse_times, ratio=RATIO, trigger_cycles=20,
+        orders=(19.0, 38.0), correct_jitter=True, keyphasor_rate=CLOCK)
+    arrays = np.load(out / 'rig' / 'averages.npz')
+    assert list(arrays['shafts']) == ['output', 'input']
+    assert list(arrays['input_order_amplitude_fields']) == list(AMPLITUDE_FIELDS)
+    for name in ('start_time', 'end_time', 'sequence', 'trigger_speed', 'trigger_cycles',
+                 'discarded_cycles'):
+        of_library = [getattr(item, name) for item in expected]
+        assert arrays[name].tolist() == arrays[f'input_{name}'].tolist() == of_library
+    assert arrays['input_angle'] == pytest.approx(expected[0].angle)
+    for name, values in (
+            ('waveform', [item.waveform for item in expected]),
+            ('standard_error', [item.standard_error for item in expected]),
+            ('corrected_average', [item.correction.waveform for item in expected])):
+        np.testing.assert_allclose(arrays[f'input_{name}'], values, atol=1e-12)
+    fields = arrays['input_order_amplitude']
+    for name, values in (
+            ('raw_amplitude', [abs(item.amplitudes) for item in expected]),
+            ('corrected_phase', [np.angle(item.correction.amplitudes) for item in expected])):
+        np.testing.assert_allclose(fields[..., AMPLITUDE_FIELDS.index(name)], values, atol=1e-12)
+    np.testing.assert_allclose(
+        arrays['input_pulse_error'][:, 1],
+        np.concatenate([item.correction.pulse_errors for item in expected]), atol=1e-12)
+    assert arrays['input_condition_indicator'].shape == (
+        4, 2, arrays['input_condition_indicator_names'].size)
+
+
+def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
+    out = tmp_path / 'out'
+    assert run(rig, '--params', tmp_path / 'machine.yaml', '--output', out, '--quiet') == 0
+    rows = table(out / 'rig' / 'averages.csv')
+    assert list(rows[0]) == [
+        'recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
+        'trigger_cycles', 'discarded_cycles', 'channel', *AMPLITUDE_FIELDS, 'channel_name']
+    assert len(rows) == 4 * 2 * (1 + 2)
+    arrays = np.load(out / 'rig' / 'averages.npz')
+    row, = (row for row in rows if (row['shaft'], row['sequence'], row['channel'], row['order'])
+            == ('input', '2', '1', '38.0'))
+    assert row['channel_name'] == 'free end'
+    np.testing.assert_array_equal(
+        [float(row[name]) for name in AMPLITUDE_FIELDS], arrays['input_order_amplitude'][2, 1, 1])
+    everything = table(out / 'averages.csv')
+    assert everything == [{**row, 'error': ''} for row in rows]
+    summary, = table(out / 'recordings.csv')
+    assert (summary['averages'], summary['trigger_cycles'], summary['error']) == ('8', '82', '')
+
+
+def test_finished_recordings_are_skipped_until_settings_or_file_change(
+        rig, tmp_path, monkeypatch):
+    out, times = tmp_path / 'out', []
+    command = [rig, '--params', tmp_path / 'machine.yaml', '--output', out]
+    for change in ((), (), ('-p', 'trigger_cycles:=40'), ('-p', 'trigger_cycles:=40')):
+        assert run(*command, *change) == 0
+        times.append((out / 'rig' / 'averages.npz').stat().st_mtime_ns)
+    assert times[0] == times[1] < times[2] == times[3]
+    assert table(out / 'recordings.csv')[0]['averages'] == '4'
+    os.utime(rig)
+    assert run(*command, '-p', 'trigger_cycles:=40') == 0
+    assert (out / 'rig' / 'averages.npz').stat().st_mtime_ns > times[3]
+
+
+@pytest.mark.parametrize('jobs', [1, 2])
+def test_recordings_that_cannot_be_read_cost_their_own_row(rig, tmp_path, capfd, jobs):
+    data = tmp_path / 'data'
+    (data / 'old').mkdir(parents=True)
+    (data / 'rig.npz').write_bytes(rig.read_bytes())
+    (data / 'old' / 'rig.npz').write_bytes(rig.read_bytes())
+    (data / 'broken.npz').write_bytes(rig.read_bytes()[:-30_000])
+    (data / 'notes.txt').write_text('no recording')
+    os.mkfifo(data / 'pipe.npz')
+    out = data / 'out'
+    for _ in range(2):  # the results in `out` are no recordings
+        assert run(data, '--params', tmp_path / 'machine.yaml', '--output', out, '--jobs', jobs,
+                   '--quiet') == 0
+        rows = {row['recording']: row for row in table(out / 'recordings.csv')}
+        assert [name for name, row in rows.items() if not row['error']] == ['old/rig', 'rig']
+        assert sorted(rows) == ['broken', 'old/rig', 'pipe', 'rig']
+        assert 'pipe or a device' in rows['pipe']['error']
+        lines = capfd.readouterr().err.splitlines()
+        assert len(lines) == 2
+        assert all(f'average: {data}/' in line for line in lines)
+    everything = table(out / 'averages.csv')
+    assert len(everything) == 2 * 24 + 2
+    assert [row['recording'] for row in everything if row['error']] == ['broken', 'pipe']
+
+
+def test_recording_that_ends_in_the_middle_keeps_what_came_before(rig, tmp_path, capsys):
+    rate = 2000.0
+    time = np.arange(12_000) / rate
+    lines = ['time,vibration,tach'] + [
+        f'{t:.4f},{np.cos(2 * np.pi * 19 * 10 * t):.4f},{float(10 * t % 1 < 0.1)}' for t in time]
+    lines[9001] = '4.5,nonsense'
+    (tmp_path / 'rig.csv').write_text('\n'.join(lines))
+    out = tmp_path / 'out'
+    assert run(tmp_path / 'rig.csv', '--tach-channel', 'tach', '--field', 'orders=19', '-p',
+               'trigger_cycles:=10', '--output', out) in (0, 2)
+    captured = capsys.readouterr()
+    assert len(captured.err.splitlines()) == 1
+    assert 'rig.csv' in captured.err
+
+
+@pytest.mark.parametrize(('arguments', 'says'), [
+    (['nothing.npz'], 'nothing.npz: No such file or directory: check the path'),
+    (['rig.npz', '-p', 'pinoin.ratio:=2'], 'synchronous_averager has no parameter pinoin.ratio'),
+    (['rig.npz', '-p', 'trigger_cycles=2'], "parameter 'trigger_cycles=2': give NAME:=VALUE"),
+    (['rig.npz', '-p', 'trigger_cycles:=-2'], 'trigger_cycles is -2: give at least 1'),
+    (['rig.npz', '-p', 'trigger_cycles:=400'], 'make 82 whole trigger cycles of the 400'),
+    (['rig.npz', '--field', 'ration=2'], 'a recording has no field ration'),
+    (['rig.npz', '--params', 'machine.yaml', '--field', 'ratio=2'],
+     '--field ratio with the shafts output, input: give the parameters output.ratio'),
+    (['rig.npz', '--params', 'none.yaml'], 'none.yaml: No such file'),
+    (['rig.npz', '--params', '/dev/zero'], '/dev/zero: is no regular file'),
+    (['/dev/zero', '--params', 'machine.yaml'], '/dev/zero: '),
+    (['empty'], 'empty: no recording in this folder'),
+    (['rig.npz', '--scheduler', 'tcp://127.0.0.1:9'], '--scheduler'),
+])
+def test_unusable_input_is_one_line_and_status_2(
+        rig, tmp_path, capsys, monkeypatch, arguments, says):
+    monkeypatch.chdir(tmp_path)
+    Path('empty').mkdir()
+    assert run(*arguments, '--output', 'out') == 2
+    captured = capsys.readouterr()
+    assert captured.out == ''
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith('average: ')
+    assert says in captured.err
+    assert not list(tmp_path.glob('out/*'))
