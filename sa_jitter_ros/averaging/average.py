@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.amplitude_errors import AmplitudeErrors
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
@@ -91,6 +92,15 @@ class AverageSettings:
                                    ('interpolation', self.interpolation, METHODS)):
             if value not in known:
                 raise ParameterError(f'{name} is {value!r}: give one of {", ".join(known)}')
+
+    def declared_jitter(self, period: float) -> float:
+        """
+        Return the standard deviation of the declared jitter in fundamental cycles, 0 without one.
+
+        `period` (s) is that of a trigger cycle.
+        """
+        clock = math.sqrt(12.0) * self.keyphasor_rate
+        return self.cycle_length / (clock * period) if clock else 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,7 +182,7 @@ class Correction:
     (channel, order) is the raw over the corrected amplitude, NaN without an accepted correction.
     Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
     `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
-    corrected pulses.
+    corrected pulses. `amplitude_errors` say how far `amplitudes` are from the truth.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
     20.3 Hz. The correction recovers these errors except for their mean:
@@ -204,6 +214,7 @@ class Correction:
     attenuation: FloatArray
     attenuation_standard_error: FloatArray
     cycle_amplitudes: ComplexArray
+    amplitude_errors: AmplitudeErrors
     jitter_std: float = math.nan
 
     def __repr__(self) -> str:
@@ -233,7 +244,8 @@ class Average:
     of the average. `cycle_numbers` (N_t,) count from the first cycle, discarded ones included.
     `cycle_amplitudes` (cycle, channel, order)
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
-    angle as those of their mean. `correction` is None unless `correct_jitter` was set.
+    angle as those of their mean. `amplitude_errors` say how well another average would repeat
+    `amplitudes`. `correction` is None unless `correct_jitter` was set.
 
     A shaft at 25 Hz with an order 3 of amplitude 2 and phase 1 rad, in a single channel:
 
@@ -268,6 +280,7 @@ class Average:
     used: NDArray[np.bool_]
     cycle_numbers: NDArray[np.int64]
     cycle_amplitudes: ComplexArray
+    amplitude_errors: AmplitudeErrors
     correction: Correction | None = None
 
     @property

@@ -18,9 +18,11 @@ import math
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected_errors,
+                                                      Repeatability)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
-from sa_jitter_ros.averaging.noise import attenuation
+from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
@@ -102,7 +104,27 @@ class CorrectingAverager:
         if average is None:
             return None
         cycles, self._cycles = self._cycles, []
-        return replace(average, correction=correct_average(average, cycles, self.settings))
+        correction = correct_average(average, cycles, self.settings)
+        errors = average.amplitude_errors
+        if correction.accepted:
+            # The vibration and the declaration together know the jitter better than a few cycles.
+            raw = average.cycle_amplitudes
+            errors = Repeatability.of(
+                raw, _clean(average, raw, self.settings), average.orders,
+                _in_cycles(correction.jitter_std, average, self.settings)).errors(
+                    average.amplitudes)
+        return replace(average, correction=correction, amplitude_errors=errors)
+
+
+def _in_cycles(seconds: float, average: Average, settings: AverageSettings) -> float:
+    """Return a time in fundamental cycles."""
+    return seconds * settings.cycle_length / float(np.mean(average.periods))
+
+
+def _clean(average: Average, cycles: ComplexArray, settings: AverageSettings) -> ComplexArray:
+    """Return the amplitudes of the `cycles` of an average without leakage between its orders."""
+    return without_leakage(cycles, settings.orders, settings.cycle_length,
+                           settings.cycle_length * average.cycle_numbers)
 
 
 def correct_average(raw: Average, cycles: Sequence[CycleSamples],
@@ -127,19 +149,23 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
     corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
-    amplitudes, unsure = _amplitudes(raw, corrected, recovery)
+    amplitudes, unsure, whole = _amplitudes(raw, corrected, recovery)
     begins = np.flatnonzero(raw.used)
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
     turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
     ratio, error = attenuation(raw.amplitudes, amplitudes, corrected.noise, turned)
+    cycles_again = corrected.cycle_amplitudes
     return Correction(
         corrected.waveform, amplitudes, corrected.noise,
         np.where(recovery.resolved, recovery.errors, np.nan), recovery.standard_errors, True, '',
-        ratio, np.hypot(error, ratio * unsure), corrected.cycle_amplitudes, recovery.std)
+        ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
+            cycles_again, _clean(raw, cycles_again, settings), raw.orders, amplitudes=amplitudes,
+            unsure=unsure, largest=whole, jitter=_in_cycles(recovery.std, raw, settings)),
+        recovery.std)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
-                ) -> tuple[ComplexArray, FloatArray]:
+                ) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """
     Return the amplitudes (channel, order) that raw and `aligned` average show together.
 
@@ -150,7 +176,8 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     nearer to what it is without the factor or, of an order that has told the errors, to the raw
     one. An order whose phase is uncertain by more than `_UNCERTAIN` has none.
 
-    The second result (channel, order) is the relative standard error that the factors add.
+    The second result (channel, order) is the relative standard error that the factors add, the
+    third the largest size of the amplitude: that with the whole factor.
     """
     variance = variance_within(recovery.covariance, _U)
     left = (np.exp(-2.0 * (np.pi * raw.orders[:, None, None]) ** 2 * variance) @ _U_WEIGHT
@@ -184,7 +211,8 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     # the vibration shows of each.
     unsure_factor = lost / recovery.shown * math.sqrt(2.0 / raw.trigger_cycles)
     known = left > math.exp(-0.5 * _UNCERTAIN**2)
-    return np.where(known, amplitudes, np.nan), np.hypot(withheld, unsure_factor)
+    return (np.where(known, amplitudes, np.nan), np.hypot(withheld, unsure_factor),
+            np.where(known, np.fmax(np.abs(whole), np.abs(amplitudes)), np.nan))
 
 
 def _recovered(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
@@ -270,7 +298,8 @@ def _uncorrected(raw: Average, reason: str) -> Correction:
     unknown = np.full(raw.amplitudes.shape, np.nan)
     return Correction(
         raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
-        np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes)
+        np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes,
+        AmplitudeErrors.unknown(raw.amplitudes.shape))
 
 
 def _average_again(raw: Average, cycles: Sequence[CycleSamples],

@@ -26,7 +26,9 @@ FloatArray = NDArray[np.float64]
 
 AMPLITUDE_FIELDS = (
     'order', 'raw_amplitude', 'raw_phase', 'corrected_amplitude', 'corrected_phase',
-    'attenuation', 'attenuation_standard_error', 'noise_standard_deviation')
+    'attenuation', 'attenuation_standard_error', 'noise_standard_deviation',
+    'raw_standard_error', 'raw_phase_standard_error', 'corrected_standard_error',
+    'corrected_phase_standard_error', 'upper_95')
 PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
 
 
@@ -122,6 +124,8 @@ def amplitude_table(average: Average) -> FloatArray:
     table[..., 1] = np.abs(average.amplitudes)
     table[..., 2] = np.angle(average.amplitudes)
     table[..., 7] = average.noise
+    errors = average.amplitude_errors
+    table[..., 8], table[..., 9], table[..., 12] = errors.amplitude, errors.phase, errors.upper_95
     if average.correction is not None and average.correction.accepted:
         correction = average.correction
         table[..., 3] = np.abs(correction.amplitudes)
@@ -129,4 +133,7 @@ def amplitude_table(average: Average) -> FloatArray:
         table[..., 5] = correction.attenuation
         table[..., 6] = correction.attenuation_standard_error
         table[..., 7] = correction.noise  # without the scatter that jitter causes
+        errors = correction.amplitude_errors
+        table[..., 10], table[..., 11] = errors.amplitude, errors.phase
+        table[..., 12] = np.where(np.isnan(errors.upper_95), table[..., 12], errors.upper_95)
     return table

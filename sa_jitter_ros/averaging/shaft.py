@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.amplitude_errors import Repeatability
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleSamples, exact_cycles, first_points, grid_points, joined,
@@ -239,7 +240,7 @@ class ShaftAverager:
         self._taken = self._counted = self._noise_due = 0  # those that wait are not yet counted
         self._waiting: list[CycleSamples] = []
         self._waiting_size = 0  # samples times channels
-        self._noise: FloatArray = np.empty((0, 0))
+        self._noise: tuple[FloatArray, Repeatability] | None = None
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))
         self._amplitudes: ComplexArray = np.empty((0, 0, 0), np.complex128)
@@ -344,6 +345,7 @@ class ShaftAverager:
             count = min(count, max(window, 1))
         pulses, used, seconds = self._edges()
         cycles, numbers = self._window(), np.array(self._numbers)
+        amplitudes, (noise, scatter) = self._amplitude_mean.mean, self._estimated_noise()
         average = Average(
             start_time=float(pulses[0]), end_time=float(pulses[-1]), sequence=self._sequence,
             trigger_cycles=len(cycles), fundamental_cycles=count,
@@ -351,9 +353,11 @@ class ShaftAverager:
             trigger_speed=numbers.size * settings.revolutions_per_trigger / seconds,
             angle=np.arange(shape[0]) / max(shape[0], 1), waveform=waveform.T,
             standard_error=error.T, orders=np.array(settings.orders),
-            amplitudes=self._amplitude_mean.mean, noise=self._estimated_noise(),
+            amplitudes=amplitudes, noise=noise,
             first_angle=float(self._angle(self._numbers[0])), pulses=pulses, used=used,
-            cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles)
+            cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles,
+            amplitude_errors=scatter.errors(
+                amplitudes, settings.declared_jitter(seconds / numbers.size)))
         self._sequence += 1
         return average
 
@@ -366,13 +370,14 @@ class ShaftAverager:
         gaps = float(np.sum(begins[breaks + 1] - ends[breaks]))
         return pulses, used, float(pulses[-1] - pulses[0]) - gaps
 
-    def _estimated_noise(self) -> FloatArray:
-        """Return the noise of the mean; a sliding window renews it after every eighth of it."""
-        if self._counted >= self._noise_due:
+    def _estimated_noise(self) -> tuple[FloatArray, Repeatability]:
+        """Return noise and repeatability; a sliding window renews them after an eighth of it."""
+        if self._noise is None or self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
-            amplitudes = self._window()
-            angles = cycle_length * np.array(self._numbers)
-            self._noise = radial_noise(without_leakage(amplitudes, orders, cycle_length, angles))
+            cycles = self._window()
+            clean = without_leakage(cycles, orders, cycle_length,
+                                    cycle_length * np.array(self._numbers))
+            self._noise = radial_noise(clean), Repeatability.of(cycles, clean, np.array(orders))
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise
 

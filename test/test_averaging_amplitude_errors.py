@@ -1,0 +1,143 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Standard errors of amplitudes and phases against the truth that a simulation knows."""
+
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.amplitude_errors import Repeatability, upper_limit
+
+ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
+AMPLITUDES = np.array([1.0, 0.3, 0.5, 0.0, 0.0])
+ABSENT, WEAK = 3, 4
+STRONG = slice(0, 3)
+
+
+def cycles_of(rng, count, *, noise, turn):
+    """
+    Return amplitudes (cycle, 1, order) of single trigger cycles between jittery pulses, and true.
+
+    `noise` is that of the mean of all, `turn` (rad) the standard deviation of order 16's phase.
+    """
+    true = AMPLITUDES * np.exp(2j * np.pi * rng.uniform(size=ORDERS.size))
+    true[WEAK] = 10 ** 0.5 * noise
+    errors = rng.uniform(-1.0, 1.0, count + 1) * np.sqrt(3.0) * turn / (2.0 * np.pi * ORDERS[0])
+    phasors = np.exp(1j * np.pi * np.multiply.outer(errors[:-1] + errors[1:], ORDERS)) * np.sinc(
+        np.multiply.outer(np.diff(errors), ORDERS))
+    white = rng.standard_normal((count, ORDERS.size, 2)) @ (1.0, 1.0j)
+    return (true * phasors + noise * np.sqrt(count) * white)[:, None], true
+
+
+def shares(z):
+    """Return the shares of z (trial, order) within 1 and within 1.96."""
+    return np.array([np.mean(np.abs(z) < width, axis=0) for width in (1.0, 1.96)])
+
+
+def hold(found, trials):
+    """Whether shares are 68 % and 95 % within 3 points and the error of so many trials."""
+    wanted = np.array([0.683, 0.950]).reshape(2, *(1,) * (found.ndim - 1))
+    return np.abs(found - wanted) < 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
+
+
+@pytest.mark.parametrize(('count', 'noise', 'turn'), [
+    (6, 0.01, 0.3), (10, 0.01, 0.02), (10, 0.05, 0.3), (40, 0.01, 0.3), (40, 0.01, 0.8),
+    (160, 0.01, 0.3)])
+def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
+    trials, rng = 1000, np.random.default_rng(count)
+    means, along, phase, upper, turned = [], [], [], [], []
+    for _ in range(trials):
+        cycles, true = cycles_of(rng, count, noise=noise, turn=turn)
+        mean = cycles.mean(axis=0)
+        errors = Repeatability.of(cycles, cycles, ORDERS).errors(mean)
+        means.append(mean[0])
+        turned.append(mean[0] * np.conj(true))
+        along.append(errors.amplitude[0])
+        phase.append(errors.phase[0])
+        upper.append(errors.upper_95[0])
+    size = np.abs(means)
+    present = np.array([0, 1, 2, WEAK])
+    z = ((size - size.mean(axis=0)) / along)[:, present]
+    assert hold(shares(z), trials).all()
+    strong = np.angle(turned)[:, STRONG] / np.array(phase)[:, STRONG]
+    assert hold(shares(strong), trials).all()
+    # an absent order: its real part
+    z = np.real(means)[:, ABSENT] / np.array(along)[:, ABSENT]
+    assert hold(shares(z), trials).all()
+    limits = np.array(upper)
+    assert np.mean(limits[:, WEAK] > np.sqrt(10.0) * noise) > 0.92
+    assert np.all(limits[:, ABSENT] > 0.0)
+
+
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+def test_corrected_errors_are_the_distance_from_the_truth():
+    """Also of the phase, which the mean of the pulse errors turns, and which no one can know."""
+    rng, trials, count = np.random.default_rng(4), 250, 10
+    orders, size = np.array([8.0, 16.0, 21.0, 11.0]), np.array([0.5, 1.0, 0.04, 0.0])
+    rate, speed, clock = 4000.0, 25.0, 1200.0
+    times = np.arange(round(17 / speed * rate)) / rate
+    true = (2.0 + np.arange(14.0)) / speed
+    wave = np.exp(2j * np.pi * speed * np.outer(orders, times - true[0]))
+    amplitude, phase, limits = [], [], []
+    for _ in range(trials):
+        turn = np.exp(2j * np.pi * rng.uniform(size=orders.size))
+        samples = ((size * turn) @ wave).real + 0.25 * rng.standard_normal(times.size)
+        pulses = true + rng.uniform(-0.5, 0.5, true.size) / clock
+        average, *_ = sa.average(
+            samples, rate, pulses, orders=orders, trigger_cycles=count, correct_jitter=True,
+            keyphasor_rate=clock, interval_tolerance=0.45)
+        correction = average.correction
+        assert correction.accepted
+        errors = correction.amplitude_errors
+        amplitude.append((np.abs(correction.amplitudes[0]) - size) / errors.amplitude[0])
+        phase.append(np.angle(correction.amplitudes[0] / turn) / errors.phase[0])
+        limits.append(errors.upper_95[0] >= size)
+    assert hold(shares(np.array(amplitude)[:, :3]), trials).all()
+    assert hold(shares(np.array(phase)[:, :2]), trials).all()
+    assert np.all(np.mean(limits, axis=0) > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials))
+
+
+@pytest.mark.parametrize('true', [0.5, 1.0, 2.0, 5.0])
+def test_upper_limit_holds_for_any_amplitude(true):
+    noise = np.random.default_rng(2).standard_normal((20000, 2)) @ (1.0, 1.0j)
+    above = upper_limit(np.abs(true + noise), np.ones(noise.size)) >= true
+    if true > 0.5:  # that of which the lowest limit is
+        assert above.mean() == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / noise.size))
+    else:
+        assert above.mean() == 1.0
+
+
+def test_upper_limit_without_correction_is_that_before_the_loss():
+    rng, upper = np.random.default_rng(3), []
+    for _ in range(200):
+        cycles, _ = cycles_of(rng, 40, noise=0.01, turn=0.8)
+        upper.append(Repeatability.of(cycles, cycles, ORDERS).errors(cycles.mean(axis=0)).upper_95)
+    assert np.all(np.mean(np.array(upper)[:, 0] >= AMPLITUDES, axis=0) > 0.92)
+    # which the declared jitter tells, too, where no order shows it
+    quiet = Repeatability.of(cycles, cycles, ORDERS, 0.0)
+    declared = 0.8 / (2.0 * np.pi * ORDERS)
+    ratio = [quiet.errors(cycles.mean(axis=0), jitter).upper_95[0, line]
+             / quiet.errors(cycles.mean(axis=0)).upper_95[0, line]
+             for line, jitter in enumerate(declared)]
+    np.testing.assert_allclose(ratio, 1.0 / 0.8088, rtol=1e-3)  # E X of normal jitter
+
+
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+def test_errors_of_one_cycle_of_silence_and_above_nyquist_are_no_numbers():
+    cycles, _ = cycles_of(np.random.default_rng(1), 1, noise=0.1, turn=0.1)
+    errors = Repeatability.of(cycles, cycles, ORDERS).errors(cycles[0])
+    assert np.isnan([errors.amplitude, errors.phase, errors.upper_95]).all()
+    time = np.arange(4000) / 1000.0
+    average, = sa.average(np.stack((0.0 * time, np.cos(time))), 1000.0, np.arange(1, 39) / 10.0,
+                          orders=[1.0, 40.0, 60.0])
+    errors = average.amplitude_errors
+    for item in (errors.amplitude, errors.phase, errors.upper_95):
+        assert np.isnan(item[:, 2]).all()
+        assert np.isfinite(item[:, :2]).all()
