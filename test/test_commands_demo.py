@@ -125,8 +125,14 @@ def test_demo_corrects_the_amplitudes_of_a_recording(recording, process_environm
         assert float(raw) < float(corrected)
         assert float(attenuation) == pytest.approx(float(raw) / float(corrected), abs=0.01)
         assert 0.0 < float(predicted) < 1.0
-    for name in ('waveform.png', 'orders.png'):
-        assert (tmp_path / 'out' / name).read_bytes().startswith(b'\x89PNG')
+    for name in ('waveform', 'orders', 'spectrum', 'order_map', 'tracked_orders'):
+        assert (tmp_path / 'out' / f'{name}.png').read_bytes().startswith(b'\x89PNG')
+    arrays = np.load(tmp_path / 'out' / 'averages.npz')
+    assert arrays['shaft_order_amplitude'].shape == (
+        arrays['sequence'].size, 1, len(table), arrays['shaft_order_amplitude_fields'].size)
+    assert arrays['shaft_corrected_average'].shape == arrays['shaft_waveform'].shape
+    assert len((tmp_path / 'out' / 'averages.csv').read_text().splitlines()) == (
+        1 + arrays['sequence'].size * len(table))
 
 
 @pytest.mark.processes

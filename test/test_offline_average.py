@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import signal
 
+from matplotlib.image import imread
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
@@ -178,6 +179,24 @@ def test_recording_that_ends_in_the_middle_keeps_what_came_before(rig, tmp_path,
     captured = capsys.readouterr()
     assert len(captured.err.splitlines()) == 1
     assert 'rig.csv' in captured.err
+
+
+def test_figures_of_a_run_up_with_gear(tmp_path):
+    machine = Gearbox(mesh('shaft', 11, harmonics=(1.0, 0.5)), RATE,
+                      speed=((0.0, 10.0), (4.0, 20.0)), seed=1, effects=(AdditiveNoise(0.1),))
+    write_npz(tmp_path / 'run up.npz', Recording(
+        ArraySource(machine.vibration(0, round(4.0 * RATE))), RATE, orders=(11.0, 22.0),
+        pulse_times=machine.pulses(0.0, 4.0).times))
+    before = signal.getsignal(signal.SIGTERM)
+    assert average.main([
+        str(tmp_path / 'run up.npz'), '--output', str(tmp_path / 'out'), '--quiet',
+        '-p', 'trigger_cycles:=8', '-p', 'shaft.mesh_orders:=[11]']) == 0
+    signal.signal(signal.SIGTERM, before)
+    figures = {path.stem: path for path in (tmp_path / 'out' / 'run up').glob('*.png')}
+    assert set(figures) == {'waveform', 'orders', 'spectrum', 'order_map', 'tracked_orders',
+                            'gear_signals'}
+    width, height = imread(figures['order_map']).shape[1::-1]
+    assert width > height  # over time, and over speed beside it
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [

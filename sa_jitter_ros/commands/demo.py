@@ -35,11 +35,12 @@ from sa_jitter_ros.commands.command_line import (
     add_recording_options, discard_output, Parser, player_options, read_options)
 from sa_jitter_ros.commands.demo_plan import (
     Plan, plan_doubts, plan_recording, plan_simulation, with_machine)
-from sa_jitter_ros.commands.demo_report import draw_orders, draw_waveform, text_table
+from sa_jitter_ros.commands.demo_report import write_results
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.base import LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.messages import (
     AverageMessage, decode_average, decode_prediction, PredictionMessage)
+from sa_jitter_ros.offline.files import ARRAYS, TABLE
 from sa_jitter_ros.parameter_file import shipped
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.channel_check import usable_channels
@@ -51,6 +52,10 @@ SILENCE_TIMEOUT = 60.0  # s without a status of the node that plays the signals
 STOP_TIMEOUT = 20.0  # s until a node has ended
 LAST_AVERAGE = 3.0  # s without a new average after the end of the signals
 PULSE_BLOCKS = 'std_msgs/Float64MultiArray'  # a waveform may contain thousands of pulses a second
+# Topics of a shaft, and those without which an average is not complete.
+RESULTS = ('synchronous_average', 'standard_error', 'order_amplitude', 'corrected_average',
+           'pulse_error', 'condition_indicator')
+NEEDED = {'synchronous_average', 'standard_error', 'order_amplitude'}
 LIVE_ACQUISITIONS = 4  # averages in a residual
 
 
@@ -59,29 +64,35 @@ class Watcher(Node):
 
     def __init__(self, **node_kwargs: Any) -> None:
         super().__init__('demo', **node_kwargs)
-        self.averages: dict[str, list[AverageMessage]] = {
-            kind: [] for kind in ('synchronous_average', 'corrected_average', 'order_amplitude',
-                                  'pulse_error', 'standard_error')}
-        self.prediction: PredictionMessage | None = None
+        self.results: dict[str, dict[tuple[int, float], dict[str, AverageMessage]]] = {}
+        self.predictions: dict[str, PredictionMessage] = {}
         self.speed = float('nan')
         self.status: dict[str, dict[str, str]] = {}
         self.status_time: dict[str, float] = {}
         self.create_subscription(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
 
-    def subscribe(self, shaft: str) -> None:
-        """Receive the results of a shaft."""
-        for kind in self.averages:
-            self.create_subscription(Float64MultiArray, f'{shaft}/{kind}', self._add_to(kind),
-                                     RESULT_QOS)
-        for topic in ('prediction', f'{shaft}/prediction'):  # of one shaft, of several
-            self.create_subscription(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
+    def subscribe(self, shafts: Sequence[str]) -> None:
+        """Receive the results of the shafts."""
+        for shaft in shafts:
+            self.results[shaft] = {}
+            for kind in RESULTS:
+                self.create_subscription(Float64MultiArray, f'{shaft}/{kind}',
+                                         self._add_to(shaft, kind), RESULT_QOS)
+            self._predicted(shaft, f'{shaft}/prediction')
+        self._predicted(shafts[0], 'prediction')  # of one shaft
 
-    def _add_to(self, kind: str) -> Callable[[Float64MultiArray], None]:
-        return lambda message: self.averages[kind].append(decode_average(kind, message))
+    def _add_to(self, shaft: str, kind: str) -> Callable[[Float64MultiArray], None]:
+        def add(message: Float64MultiArray) -> None:
+            result = decode_average(kind, message)
+            key = result.header.sequence, result.header.start_time
+            self.results[shaft].setdefault(key, {})[kind] = result
+        return add
 
-    def _on_prediction(self, message: Float64MultiArray) -> None:
-        self.prediction = decode_prediction(message)
+    def _predicted(self, shaft: str, topic: str) -> None:
+        def add(message: Float64MultiArray) -> None:
+            self.predictions[shaft] = decode_prediction(message)
+        self.create_subscription(Float64MultiArray, topic, add, LATCHED_QOS)
 
     def _on_speed(self, message: Float64) -> None:
         self.speed = message.data
@@ -92,18 +103,21 @@ class Watcher(Node):
             self.status[status.name] = {
                 'message': status.message, **{item.key: item.value for item in status.values}}
 
-    def amplitudes(self) -> list[AverageMessage]:
-        """Return the order amplitudes received so far."""
-        return self.averages['order_amplitude']
+    def averages(self) -> dict[str, list[dict[str, AverageMessage]]]:
+        """Return the averages of each shaft whose results have all come, in order."""
+        return {shaft: [found[key] for key in sorted(found, key=lambda key: key[1])
+                        if NEEDED <= found[key].keys()]
+                for shaft, found in self.results.items()}
 
     def progress(self) -> str:
         """Return one line: speed, averages so far, dropped pulses and cycles, strongest orders."""
         dropped = {key: sum(int(values.get(key, 0)) for values in self.status.values())
                    for key in ('pulses_dropped', 'cycles_dropped')}
-        parts = [f'speed {self.speed:8.3f} Hz', f'averages {len(self.amplitudes()):3d}',
+        averages = next(iter(self.averages().values()))
+        parts = [f'speed {self.speed:8.3f} Hz', f'averages {len(averages):3d}',
                  *(f'{key.replace("_", " ")} {count}' for key, count in dropped.items())]
-        if self.amplitudes():
-            table = self.amplitudes()[-1].values
+        if averages:
+            table = averages[-1]['order_amplitude'].values
             channel = int(np.argmax(np.nansum(table[:, :, 1], axis=1)))
             strongest = np.argsort(-np.nan_to_num(table[channel, :, 1]))[:3]
             parts.append('strongest: ' + ', '.join(
@@ -178,7 +192,7 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
             if ended:
                 raise SaJitterError(f'a node ended with status {ended[0].returncode}')
 
-    watcher.subscribe(plan.shaft)
+    watcher.subscribe(plan.shafts)
     print('waiting for the nodes ...', flush=True)
     end = time.monotonic() + START_TIMEOUT
     inputs = ['vibration', 'tach_pulse', *(['tach_waveform'] if plan.waveform else [])]
@@ -189,7 +203,8 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
         # The source waits for its subscribers itself; the detector of its pulses cannot.
         heard = not plan.waveform or watcher.status.get('tach_detector', {}).get(
             'subscribers', '0') != '0'
-        return (heard and watcher.prediction is not None and source.services_are_ready() and all(
+        predicted = plan.shaft in watcher.predictions
+        return (heard and predicted and source.services_are_ready() and all(
             watcher.count_subscribers(topic) and watcher.count_publishers(topic)
             for topic in inputs))
 
@@ -209,8 +224,9 @@ def watch(plan: Plan, watcher: Watcher, executor: SingleThreadedExecutor,
         spin(1.0)
         print(watcher.progress(), flush=True)
         now = time.monotonic()
-        if len(watcher.amplitudes()) > count:
-            last, count = now, len(watcher.amplitudes())
+        received = sum(map(len, watcher.averages().values()))
+        if received > count:
+            last, count = now, received
         ended = watcher.status.get(plan.source, {}).get('message', '').startswith('ended')
         if live and now - start > plan.seconds + LAST_AVERAGE:
             break
@@ -248,16 +264,17 @@ def stop(children: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def report(plan: Plan, watcher: Watcher, output: Path) -> None:
-    """Print the table and draw the figures."""
-    amplitudes = watcher.amplitudes()
-    if not amplitudes:
+    """Print the table and write the files."""
+    averages = watcher.averages()
+    if not any(averages.values()):
         raise SaJitterError('no average was completed: ' + '; '.join(
             f'{name}: {values["message"]}' for name, values in watcher.status.items()))
-    print('\n' + text_table(plan, amplitudes, watcher.prediction))
-    pulses = watcher.averages['pulse_error']
+    print('\n' + write_results(plan, averages, watcher.predictions, output))
+    pulses = [item['pulse_error'].values[:, 1] for item in averages[plan.shaft]
+              if 'pulse_error' in item]
     if pulses:
-        errors = np.concatenate([item.values[:, 1] for item in pulses])
-        std, declared = np.sqrt(np.mean(errors**2)), 1.0 / plan.keyphasor_rate / 12**0.5
+        std = np.sqrt(np.nanmean(np.concatenate(pulses) ** 2))
+        declared = 1.0 / plan.keyphasor_rate / 12**0.5
         print(f'\nstandard deviation of the pulse errors: {1e6 * std:.3g} us recovered from the '
               f'vibration, {1e6 * declared:.3g} us declared')
     averager = watcher.status.get('synchronous_averager', {})
@@ -269,13 +286,7 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
     for note in (plan.note, end if end.startswith('ended early') else ''):
         if note:
             print(f'note: {note}')
-    last = {kind: items[-1] if items else None for kind, items in watcher.averages.items()}
-    raw = last['synchronous_average']
-    assert raw is not None
-    draw_waveform(plan, raw, last['standard_error'], last['corrected_average'],
-                  output / 'waveform.png')
-    draw_orders(plan, amplitudes, watcher.prediction, output / 'orders.png')
-    print(f'figures: {output / "waveform.png"} {output / "orders.png"}')
+    print(f'written: {ARRAYS}, {TABLE} and figures in {output}')
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -293,7 +304,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--live', action='store_true',
                         help='show all results live on a web page, until Ctrl-C')
     parser.add_argument('--output', type=Path, default=Path('out'),
-                        help='folder for the figures (out)')
+                        help='folder for arrays, table and figures (out)')
     add_recording_options(parser)
     options = parser.parse_args(args)
     children: list[subprocess.Popen[bytes]] = []

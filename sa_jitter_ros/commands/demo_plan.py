@@ -15,22 +15,13 @@ from dataclasses import dataclass, replace
 import math
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from sa_jitter_ros.averaging.average import KeyphasorParameters
-from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.keyphasor_check.plausibility import doubts
+from sa_jitter_ros.offline.settings import choose
 from sa_jitter_ros.parameter_file import read_parameters
-from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import Recording
 
-FloatArray = NDArray[np.float64]
-
-FIRST_SECONDS = 10.0  # part of a recording from which its plan is made
-ORDERS = 6  # orders to show if the recording names none
-AVERAGES = 8  # averages to make of a recording
 SIMULATED_SECONDS = 20.0
 
 
@@ -61,13 +52,13 @@ class Plan:
     pulses_per_trigger: int = 0
     missing_teeth: int = 0
     note: str = ''
-    shaft: str = 'shaft'
+    shafts: tuple[str, ...] = ('shaft',)
     params: Path | None = None
 
     @property
-    def unit_label(self) -> str:
-        """Return the unit of the vibration in brackets, empty if it is unknown."""
-        return f'[{self.unit}]' if self.unit and self.unit != 'unknown' else ''
+    def shaft(self) -> str:
+        """Return the first shaft, which ratio and orders are of."""
+        return self.shafts[0]
 
 
 def plan_simulation(params: Path) -> Plan:
@@ -87,12 +78,13 @@ def plan_simulation(params: Path) -> Plan:
 
 
 def with_machine(plan: Plan, params: Path) -> Plan:
-    """Return a plan for the first shaft of a machine file; raises SaJitterError."""
-    shaft, model = next(iter(read_declaration(params).models.items()))
+    """Return a plan for the machine of a file, with numbers of its first shaft; SaJitterError."""
+    models = read_declaration(params).models
+    model = next(iter(models.values()))
     declared = {name: getattr(model, name) for name in (
         'keyphasor_rate', 'pulses_per_revolution', 'pulses_per_trigger', 'ratio',
         'trigger_cycles', 'orders')}
-    return replace(plan, params=params, shaft=shaft, note='', **declared)
+    return replace(plan, params=params, shafts=tuple(models), note='', **declared)
 
 
 def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 0.0,
@@ -104,18 +96,7 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
     `keyphasor_rate` (Hz) its pulse times are rounded up to a clock of that rate, as if the
     keyphasor had been sampled with it. Raises `RecordingError` if the recording cannot be used.
     """
-    first, pulses = _first_seconds(recording)
-    triggers = _keyphasor(recording).validator().update(pulses)
-    cycles = np.diff(triggers.times)[~triggers.starts_run[1:]]
-    if len(cycles) < 4:
-        mistake = likely_mistake(
-            recording.keyphasor_pulses(), recording.start_time,
-            recording.start_time + recording.duration, recording.sample_rate)
-        raise RecordingError(mistake or f'{len(pulses)} pulses give {len(cycles)} trigger cycles '
-                             f'in the first {FIRST_SECONDS:g} s: at least 4 are needed; check '
-                             'pulses_per_revolution, or the threshold of the tach waveform')
-    period = float(np.median(cycles))
-    trigger_cycles = int(np.clip(recording.duration / period // AVERAGES, 2, 100))
+    choice = choose(recording)
     waveform = recording.pulse_times is None and recording.tach is not None
     if keyphasor_rate and waveform:
         raise RecordingError('--keyphasor-rate rounds recorded pulse times, but the recording has '
@@ -130,10 +111,9 @@ def plan_recording(path: Path, recording: Recording, *, keyphasor_rate: float = 
                            **(parameters or {})},
         title=path.name, seconds=recording.duration,
         channels=recording.channel_names, unit=recording.units[0] if recording.units else '',
-        speed=_keyphasor(recording).revolutions_per_trigger / period, keyphasor_rate=rate,
+        speed=choice.speed, keyphasor_rate=rate,
         pulses_per_revolution=recording.pulses_per_revolution, ratio=recording.ratio,
-        trigger_cycles=trigger_cycles,
-        orders=recording.orders or _strongest_orders(recording, first, pulses, trigger_cycles),
+        trigger_cycles=choice.trigger_cycles, orders=choice.orders,
         waveform=waveform, pulses_per_trigger=recording.pulses_per_trigger or 0,
         missing_teeth=recording.missing_teeth, note=note)
 
@@ -148,32 +128,3 @@ def plan_doubts(plan: Plan, recording: Recording) -> tuple[str, ...]:
         jitter_std=1.0 / math.sqrt(12.0) / plan.keyphasor_rate
         if declared and not plan.waveform and not plan.source_parameters.get('keyphasor_rate')
         else None)
-
-
-def _keyphasor(recording: Recording) -> KeyphasorParameters:
-    return KeyphasorParameters(pulses_per_revolution=recording.pulses_per_revolution,
-                               pulses_per_trigger=recording.pulses_per_trigger,
-                               missing_teeth=recording.missing_teeth)
-
-
-def _first_seconds(recording: Recording) -> tuple[FloatArray, FloatArray]:
-    """Return vibration and pulse times of the first seconds."""
-    samples = next(recording.blocks(round(FIRST_SECONDS * recording.sample_rate)))
-    return samples, recording.keyphasor_pulses(duration=samples.shape[1] / recording.sample_rate)
-
-
-def _strongest_orders(recording: Recording, samples: FloatArray, pulses: FloatArray,
-                      trigger_cycles: int) -> tuple[float, ...]:
-    """Return the orders with the largest amplitudes in the first average."""
-    averages = Averager(
-        recording.sample_rate, start_time=recording.start_time, ratio=recording.ratio,
-        pulses_per_revolution=recording.pulses_per_revolution,
-        pulses_per_trigger=recording.pulses_per_trigger,
-        missing_teeth=recording.missing_teeth, trigger_cycles=trigger_cycles,
-    ).update(samples, pulses)
-    if not averages:
-        return (1.0, 2.0, 3.0)
-    waveform = averages[0].waveform
-    amplitude = np.abs(np.fft.rfft(waveform, axis=1)).max(axis=0)[1:waveform.shape[1] // 3]
-    strongest = np.sort(np.argsort(amplitude)[-ORDERS:]) + 1
-    return tuple(float(order) for order in strongest)

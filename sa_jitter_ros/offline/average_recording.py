@@ -226,6 +226,10 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
         row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
         row = replace(row, remarks=tuple(remarks[:_MOST_REMARKS]))
         write_averages(folder, signals, series, {'settings': settings, 'row': asdict(row)})
+        if job.figures:
+            from sa_jitter_ros.offline.figures import write_figures
+            write_figures(folder, signals, series, {
+                name: gear_settings(values, name) for name in values['shafts']})
     return row
 
 

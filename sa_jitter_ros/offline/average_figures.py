@@ -1,0 +1,112 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Figures of averages: waveform of the latest one, and orders with their attenuation."""
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from sa_jitter_ros.offline.files import Signals
+from sa_jitter_ros.offline.plotting import (
+    Array, CORRECTED, heading, legend_under, MEASURED, RAW, rows_of_channels, strongest_channels)
+from sa_jitter_ros.offline.series import ShaftSeries
+
+
+def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
+    """Draw the latest synchronous average of the strongest channels over the angle."""
+    channels = strongest_channels(series)
+    figure, panels = rows_of_channels(signals, channels)
+    angle, raw = 360.0 * series['angle'], series['waveform'][-1]
+    error = 2.0 * series['standard_error'][-1]
+    for axes, channel in zip(panels[:, 0], channels):
+        axes.fill_between(angle, raw[channel] - error[channel], raw[channel] + error[channel],
+                          color=RAW, alpha=0.25, linewidth=0.0, label='raw, ± 2 standard errors')
+        axes.plot(angle, raw[channel], color=RAW, linewidth=0.8, label='raw')
+        if 'corrected_average' in series:
+            axes.plot(angle, series['corrected_average'][-1, channel], color=CORRECTED,
+                      linewidth=0.8, label='corrected')
+        axes.margins(x=0.0)
+    shown = f'{len(channels)} strongest of {raw.shape[0]} channels, ' if (
+        raw.shape[0] > len(channels)) else ''
+    figure.suptitle(heading(signals, series, (
+        f'{shown}last average, {series["fundamental_cycles"][-1]:.0f} revolutions, tach shaft at '
+        f'{series["trigger_speed"][-1]:.4g} Hz')), fontsize='medium')
+    panels[-1, 0].set_xlabel('angle of the shaft [degrees]')
+    legend_under(panels[-1, 0])
+    return figure
+
+
+def strongest_lines(series: ShaftSeries) -> Array:
+    """Return the channel (order,) on which each order is strongest."""
+    amplitude = np.nan_to_num(series.field('raw_amplitude'))
+    return np.asarray(np.argmax(amplitude.mean(axis=0), axis=0))
+
+
+def on_strongest(series: ShaftSeries, name: str) -> Array:
+    """Return a field (average, order), of each order on its strongest channel."""
+    values = series.field(name)
+    return np.asarray(values[:, strongest_lines(series), np.arange(values.shape[2])])
+
+
+def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | None = None
+                  ) -> Figure:
+    """
+    Draw the amplitudes of the orders and their attenuation, each on its strongest channel.
+
+    `prediction` (order, 3) is mean attenuation and its 5 % and 95 % quantile, if it is known.
+    """
+    figure = Figure(figsize=(9.0, 6.2), layout='constrained')
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    position = np.arange(series.orders.size)
+    for shift, name, colour, label in ((-0.08, 'raw_amplitude', RAW, 'raw'),
+                                       (0.08, 'corrected_amplitude', CORRECTED, 'corrected')):
+        values = on_strongest(series, name)
+        if np.isfinite(values).any():
+            _stems(top, position + shift, values, colour, label)
+    top.set_yscale('log')
+    unit = {signals.units[channel] for channel in strongest_lines(series).tolist()}
+    top.set_ylabel(f'amplitude [{" / ".join(sorted(unit)) or "unit unknown"}]')
+    top.legend(fontsize='small')
+    figure.suptitle(heading(signals, series, (
+        f'{len(series)} averages of {np.median(series["trigger_cycles"]):.0f} trigger cycles, '
+        'each order on its strongest channel')), fontsize='medium')
+    if prediction is not None:
+        mean, low, high = prediction.T
+        bottom.bar(position, high - low, bottom=low, width=0.6, color='tab:gray', alpha=0.35,
+                   label='predicted, 5 % to 95 %')
+        bottom.hlines(mean, position - 0.3, position + 0.3, color='tab:gray',
+                      label='predicted mean')
+    measured = on_strongest(series, 'attenuation')
+    if np.isfinite(measured).any():
+        bottom.plot(np.broadcast_to(position, measured.shape).ravel(), measured.ravel(), 'o',
+                    color=MEASURED, markersize=3.0, alpha=0.6,
+                    label='measured, single averages')
+    else:
+        bottom.text(0.5, 0.5, 'no average was corrected', ha='center', va='center',
+                    transform=bottom.transAxes)
+    bottom.use_sticky_edges = False
+    bottom.margins(y=0.08)
+    bottom.set_ylabel('attenuation\n(1: no loss)')
+    bottom.set_xticks(position, [f'{order:g}' for order in series.orders],
+                      rotation=0 if position.size <= 20 else 90)
+    bottom.set_xlabel('order (multiple of the shaft speed)')
+    if bottom.get_legend_handles_labels()[0]:
+        bottom.legend(fontsize='small', loc='lower left')
+    return figure
+
+
+def _stems(axes: Axes, position: Array, values: Array, color: str, label: str) -> None:
+    """Draw the mean of each order, and the scatter of the averages as its bar."""
+    known = np.isfinite(values).any(axis=0)
+    mean, spread = np.full(known.shape, np.nan), np.full(known.shape, np.nan)
+    mean[known] = np.nanmean(values[:, known], axis=0)
+    spread[known] = np.nanstd(values[:, known], axis=0)
+    axes.errorbar(position, mean, yerr=np.minimum(spread, 0.9 * mean), fmt='o', color=color,
+                  markersize=4.0, capsize=3.0, label=f'{label}: mean, scatter of the averages')

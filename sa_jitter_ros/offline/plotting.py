@@ -1,0 +1,59 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Colours, panels and labels that the figures of averages share."""
+
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.offline.files import Signals
+from sa_jitter_ros.offline.series import ShaftSeries
+
+Array = NDArray[Any]
+
+RAW, CORRECTED, MEASURED, MARK = 'tab:red', 'tab:blue', 'black', 'tab:orange'
+MOST_CHANNELS = 3
+VARIES = 0.02  # relative change of speed from which on results are shown over speed, too
+
+
+def strongest_channels(series: ShaftSeries) -> list[int]:
+    """Return the places of the channels with the largest waveforms of the latest average."""
+    size = np.nan_to_num(np.std(series['waveform'][-1], axis=1))
+    return sorted(np.argsort(-size)[:MOST_CHANNELS].tolist())
+
+
+def speed_varies(series: ShaftSeries) -> bool:
+    """Return whether the averages are at different speeds."""
+    speed = series['trigger_speed']
+    return bool(np.ptp(speed) > VARIES * np.mean(speed))
+
+
+def heading(signals: Signals, series: ShaftSeries, text: str) -> str:
+    """Return the title of a figure: recording, shaft, and what it shows."""
+    return f'{signals.recording}, {series.shaft}: {text}'
+
+
+def rows_of_channels(signals: Signals, channels: list[int], *, height: float = 2.4,
+                     columns: int = 1) -> tuple[Figure, Any]:
+    """Return a figure with a row of panels for each channel, (channel, column)."""
+    figure = Figure(figsize=(9.0, height * len(channels) + 0.8), layout='constrained')
+    panels = figure.subplots(len(channels), columns, sharex='col', squeeze=False)
+    for row, channel in zip(panels, channels):
+        row[0].set_ylabel(signals.label(channel))
+    return figure, panels
+
+
+def legend_under(axes: Axes, columns: int = 4) -> None:
+    """Add the legend below the axis of a panel, where it hides no data."""
+    axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.25), ncols=columns, fontsize='small',
+                frameon=False)
