@@ -499,8 +499,8 @@ def diagnostic_keys():
 ORDINARY = {
     'ros2', 'foxglove_bridge', 'joint_states', 'nan', 'diagnostic_aggregator', 'diagnostics_agg',
     *(f'config/{path.name}' for path in (ROOT / 'config').iterdir()),
-    'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'indicator', 'time_ref', 'source',
-    'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
+    'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'mark', 'indicator', 'time_ref',
+    'source', 'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
     'qos_overrides.<topic>.subscription.reliability', 'std_msgs/Float64MultiArray'}
 
 

@@ -26,9 +26,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
-from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, INPUT_QOS
+from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, INPUT_QOS, LATCHED_QOS
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sensor_msgs.msg import Imu
+from std_msgs.msg import Float64MultiArray
 
 MACHINE = Machine()
 ORDERS = [1.0, 7.0, 23.0]
@@ -599,3 +600,43 @@ def test_main_says_in_one_line_what_is_wrong(process_environment, argument, says
     assert all('[rcl]' in item for item in logged), errors
     assert line.startswith('error: ')
     assert says in line
+
+
+def test_the_geometry_of_the_target_is_published_and_kept_for_later_subscribers(bench, ros_graph):
+    late = np.array([0.012, -0.004, 0.0, -0.008])
+
+    class Uneven(Machine):
+
+        def pulses(self, seconds, start=0.0):
+            numbers = np.arange(int(seconds * self.speed * 4))
+            return start + (numbers / 4 + late[numbers % 4] / (2.0 * np.pi)) / self.speed
+
+    b = bench(pulses_per_revolution=4, pulses_per_trigger=1, trigger_cycles=40,
+              target_geometry='learn')
+    b.play(Uneven(), 6.0)
+    assert len(b.amplitudes()) == 19
+    np.testing.assert_allclose([item.header.mean_trigger_speed for item in b.amplitudes()],
+                               Machine().speed, rtol=1e-6)
+    received = ros_graph.capture('target_geometry', Float64MultiArray, qos=LATCHED_QOS)
+    assert b.spin(lambda: received)
+    assert [item.label for item in received[-1].layout.dim] == [
+        'mark', 'field:angle,standard_error']
+    geometry = messages.decode_geometry(received[-1])
+    np.testing.assert_allclose(geometry.angles, late, atol=1e-5)
+    assert (geometry.standard_errors < 1e-5).all()
+    assert geometry.revolutions > 50
+    text = b.diagnostics()[2]['target_geometry']
+    assert text.startswith('4 marks off by 0.00748 rad RMS, with a standard error of')
+    assert 'a ripple of the speed with the revolution looks the same in the pulses' in text
+
+
+def test_angles_of_another_target_are_refused_with_a_warning(bench):
+    b = bench(pulses_per_revolution=2, pulses_per_trigger=1, target_geometry='given',
+              target_angles=[0.05, -0.05])
+    b.play(Machine(speed=50.0), 4.5)
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'the pulses show other marks than those known' in text
+    assert values['pulses_geometry_refused'] == '1'
+    assert b.set_parameter('target_angles', [0.05]) == (
+        False, 'target_angles has 1 angles for a target of 2 marks: give one for each, in rad')

@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
-from sa_jitter_ros.pulses.validation import MissingPulses, PulseValidator
+from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses, PulseValidator
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -126,11 +126,14 @@ class KeyphasorParameters:
     minimum_interval: float = 0.0
     time_tolerance: float = 0.01
     path_delay: float = 0.0
+    target_geometry: GeometryMode = 'none'
+    target_angles: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check what `PulseValidator` does not check."""
         for name in ('interval_tolerance', 'minimum_interval', 'time_tolerance', 'path_delay'):
             object.__setattr__(self, name, number(name, getattr(self, name)))
+        object.__setattr__(self, 'target_angles', numbers('target_angles', self.target_angles))
         for name in ('pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth',
                      'maximum_missing'):
             if getattr(self, name) is not None:

@@ -28,8 +28,9 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import listed, number
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.unit_check import likely_mistake
-from sa_jitter_ros.pulses.validation import MissingPulses
+from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
@@ -88,6 +89,7 @@ class Averager:
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
         interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
         time_tolerance: float = 0.01, path_delay: float = 0.0,
+        target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
         buffer_seconds: float = math.inf,
     ) -> None:
         sample_rate = number('sample_rate', sample_rate)
@@ -108,7 +110,8 @@ class Averager:
             missing_teeth=missing_teeth, missing_pulses=missing_pulses,
             maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
             minimum_interval=minimum_interval, time_tolerance=time_tolerance,
-            path_delay=path_delay)
+            path_delay=path_delay, target_geometry=target_geometry,
+            target_angles=tuple(target_angles))
         settings = keyphasor.average(
             ratio=ratio, orders=orders, averaging=averaging, angle_law=angle_law,
             trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
@@ -139,6 +142,11 @@ class Averager:
             'trigger_cycles': stream.counts.cycles, **stream.totals,
             'samples_non_finite': stream.timeline.counts.non_finite,
             **{f'pulses_{name}': count for name, count in vars(stream.pulse_counts).items()}}
+
+    @property
+    def geometry(self) -> TargetGeometry | None:
+        """Return what `target_geometry` takes from the pulses of each mark, None for nothing."""
+        return self._stream.geometry
 
     def update(self, vibration: ArrayLike | None = None, pulse_times: ArrayLike | None = None,
                ) -> tuple[Average, ...]:
@@ -197,6 +205,7 @@ def average(
     missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
     interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
     time_tolerance: float = 0.01, path_delay: float = 0.0,
+    target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
 ) -> tuple[Average, ...]:
     """
     Return the synchronous averages of a recording of vibration (channel, sample) or (sample,).
@@ -236,7 +245,8 @@ def average(
         samples_per_revolution=samples_per_revolution, missing_teeth=missing_teeth,
         missing_pulses=missing_pulses, maximum_missing=maximum_missing,
         interval_tolerance=interval_tolerance, minimum_interval=minimum_interval,
-        time_tolerance=time_tolerance, path_delay=path_delay)
+        time_tolerance=time_tolerance, path_delay=path_delay, target_geometry=target_geometry,
+        target_angles=target_angles)
     samples, pulses = _array(vibration), np.asarray(pulse_times)
     if pulse_times is None:
         raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '

@@ -23,6 +23,7 @@ from sa_jitter_ros.parameters import (
     Values)
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
 from sa_jitter_ros.pulses.resampling import METHODS
+from sa_jitter_ros.pulses.validation import GEOMETRY_MODES
 
 PARAMETERS = (
     *sample_parameters('vibration'),
@@ -50,6 +51,11 @@ PARAMETERS = (
               unit='s', minimum=0.0),
     Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, of filters and '
               'converters; it is subtracted from their times', unit='s'),
+    Parameter('target_geometry', 'none', 'what is taken from the pulses because the marks of the '
+              'target are uneven: learn (measure how late each mark is), given (by '
+              'target_angles), none', choices=GEOMETRY_MODES),
+    Parameter('target_angles', [], 'how late each mark of the target is, but those of missing '
+              'teeth, which have none; with target_geometry given', unit='rad'),
     TRIGGER_CYCLES,
     Parameter('maximum_discarded', 0.0, 'largest number of discarded trigger cycles between those '
               'of an average, as a share of trigger_cycles; 0: a discarded cycle ends the average',

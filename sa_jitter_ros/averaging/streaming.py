@@ -25,10 +25,12 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
 from sa_jitter_ros.averaging.shaft import TOGETHER
 from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -37,9 +39,10 @@ FloatArray = NDArray[np.float64]
 
 #: A trigger pulse at `time` (s). `starts_run`: no trigger cycle ends here; `skipped` are the
 #: discarded ones since the pulse before, 0 if their number is not known. `epoch` is how often time
-#: ran back before; `elapsed` the time (s) since the first pulse, without the steps back.
+#: ran back before; `elapsed` the time (s) since the first pulse, without the steps back. `mark` is
+#: that of the target where its geometry is known and not all taken from the time yet, else -1.
 TRIGGER = np.dtype([('time', np.float64), ('elapsed', np.float64), ('epoch', np.int64),
-                    ('skipped', np.int64), ('starts_run', np.bool_)])
+                    ('skipped', np.int64), ('starts_run', np.bool_), ('mark', np.int64)])
 
 
 class TriggerQueue:
@@ -125,10 +128,12 @@ class StreamingAverager:
         self._run = 0  # where the run of the next cycle begins
         self._pulse_epoch = 0
         self._last_count = 0  # of the trigger cycles at the last pulse
+        self._last_time = 0.0  # s, of the last pulse as it came
         self._lead = np.inf  # s of samples before a cycle that its interpolation reads
         self._speed = 0, 0.0  # cycles and seconds since the last take_speed
         self._messages: list[str] = []
         self._keep_unfinished = keep_unfinished
+        self._recovered = RecoveredMarks(validator.pulses_per_revolution)
         self._due: list[tuple[str, Average]] = []
         self._ended = False
 
@@ -137,6 +142,12 @@ class StreamingAverager:
         """Return the counts of the pulses so far, of all validators."""
         validator = self.validator
         return self._pulse_counts + (validator.finish() if self._ended else validator.counts)
+
+    @property
+    def geometry(self) -> TargetGeometry | None:
+        """Return what is taken from the pulses of each mark of the target, None for nothing."""
+        found = self.validator.geometry
+        return None if found is None else self._recovered.added_to(found, self.validator.teeth)
 
     @property
     def totals(self) -> dict[str, int]:
@@ -199,6 +210,7 @@ class StreamingAverager:
         """Continue with another validator: waiting pulses are dropped, the angle begins at 0."""
         self._pulse_counts += self.validator.finish()
         self.validator = validator
+        self._recovered = RecoveredMarks(validator.pulses_per_revolution)
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
         self._triggers = TriggerQueue()
         self._next = 0
@@ -221,6 +233,7 @@ class StreamingAverager:
         items['time'], items['epoch'], items['starts_run'] = times, epochs, triggers.starts_run
         items['starts_run'][0] |= epochs[0] != self._pulse_epoch
         items['starts_run'][1:] |= epochs[1:] != epochs[:-1]
+        items['mark'] = triggers.mark
         items['skipped'] = 0
         if items['starts_run'].any():
             # Behind a gap of unknown length the count begins at 0 again.
@@ -233,11 +246,12 @@ class StreamingAverager:
         steps[1:] = times[1:] - times[:-1]
         if len(self._triggers):
             last = self._triggers.items[-1]
-            steps[0] = last['elapsed'] + max(times[0] - last['time'], 0.0)
+            steps[0] = last['elapsed'] + max(times[0] - self._last_time, 0.0)
         else:
             steps[0], items['starts_run'][0], items['skipped'][0] = 0.0, True, 0
         np.maximum(steps[1:], 0.0, out=steps[1:])
         np.cumsum(steps, out=steps)
+        self._last_time = float(times[-1])
         self._triggers.append(items)
 
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
@@ -285,6 +299,8 @@ class StreamingAverager:
             ready = self._ready(stop)
             if ready < 1:
                 break
+            if self.validator.corrects_marks:
+                self._take_marks(stop)
             start, end = float(times[self._next]), float(times[self._next + 1])
             segment = self._locate(int(items['epoch'][self._next]), start, end)
             if segment is None:
@@ -301,6 +317,17 @@ class StreamingAverager:
         self._forget_used()
         due, self._due = self._due, []
         return due
+
+    def _take_marks(self, stop: int) -> None:
+        """Take from the pulses up to the next average what is known of their marks."""
+        shafts = self.shafts.values()
+        last = min(stop, self._next + 1 + min(item.room for item in shafts)
+                   + self._law.after_first)
+        settings = [item.settings for item in shafts]
+        self._recovered.take_from(
+            self._triggers.items, self._next, last,
+            revolutions=settings[0].revolutions_per_trigger,
+            remember=any(item.correct_jitter for item in settings))
 
     def _run_end(self) -> int:
         """Return the number of the pulse behind the last one of the next cycle's run."""
@@ -406,6 +433,7 @@ class StreamingAverager:
                 continue
             if average is not None:
                 self._due.append((name, average))
+                self._recovered.learn(average)
         if failed:
             self.counts.cycles_dropped += 1
             self._messages.append(f'{failed}: trigger cycle discarded')

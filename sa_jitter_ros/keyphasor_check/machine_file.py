@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 
 _MOST_CYCLES, _AVERAGES = 100, 8
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
@@ -53,6 +54,11 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
     if tick > _COARSE * pitch:  # intervals scatter by a tick to either side
         nodes['synchronous_averager']['interval_tolerance'] = min(
             _WIDEST, _TICKS * tick / pitch)
+    target = TargetGeometry(np.array(check.findings['marks'].value),
+                            np.array(check.findings['marks'].standard_error or 0.0))
+    if target.standard_errors.all() and target.significant:
+        nodes['synchronous_averager'] |= {
+            'target_geometry': 'given', 'target_angles': target.angles.tolist()}
     delay = check.findings['path_delay']
     if delay.value is not None and abs(delay.value) > _CLEAR * delay.standard_error:
         nodes['synchronous_averager']['path_delay'] = float(delay.value)

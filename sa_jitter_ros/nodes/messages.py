@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging import results
 from sa_jitter_ros.errors import MessageError, ParameterError
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.recordings import message_layouts
 from sa_jitter_ros.recordings.message_layouts import (
     decode_array, FLOAT32, FLOAT64, IMU, INDEX_BASE, TIME_REFERENCE, whole)
@@ -40,6 +41,7 @@ ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
 AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS
 PULSE_ERROR_FIELDS = results.PULSE_ERROR_FIELDS
+GEOMETRY_FIELDS = ('angle', 'standard_error')
 PREDICTION_FIELDS = (
     'order', 'mean_attenuation', 'variance', 'standard_deviation',
     'quantile_05', 'quantile_50', 'quantile_95')
@@ -172,6 +174,7 @@ _AVERAGE_FIELDS = {'order_amplitude': AMPLITUDE_FIELDS, 'pulse_error': PULSE_ERR
 
 # Fields of the first version, by the last one of this version.
 _FIRST_FIELDS = {AMPLITUDE_FIELDS[-1]: 8, PULSE_ERROR_FIELDS[-1]: 3, PREDICTION_FIELDS[-1]: 7,
+                 GEOMETRY_FIELDS[-1]: 2,
                  RESIDUAL_FIELDS[-1]: 6}
 
 
@@ -214,6 +217,20 @@ def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
                       whole('fundamental cycles', fundamental), speed,
                       0 if math.isnan(discarded) else whole('discarded cycles', discarded)),
         values, names)
+
+
+def encode_geometry(geometry: TargetGeometry) -> Float64MultiArray:
+    """Encode where the marks of a target stand."""
+    return encode_array(
+        np.stack((geometry.angles, geometry.standard_errors), axis=1),
+        ('mark', f'field:{",".join(GEOMETRY_FIELDS)}'), (geometry.revolutions,))
+
+
+def decode_geometry(message: Float64MultiArray) -> TargetGeometry:
+    """Decode where the marks of a target stand."""
+    header, values, names = _decode_result(message, ('mark', 'field'), 1)
+    angles, errors = _with_fields(values, names, GEOMETRY_FIELDS).T
+    return TargetGeometry(angles, errors, header[0])
 
 
 def encode_prediction(prediction: PredictionMessage) -> Float64MultiArray:

@@ -22,12 +22,13 @@ from sa_jitter_ros.averaging.averager_parameters import (
     streaming_averager)
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
-from sa_jitter_ros.nodes.base import MonitoringNode, run_node
+from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
-from sa_jitter_ros.nodes.messages import (decode_pulse_array, decode_pulse_reference, known_type,
-                                          PULSE_TYPES)
+from sa_jitter_ros.nodes.messages import (
+    decode_pulse_array, decode_pulse_reference, encode_geometry, known_type, PULSE_TYPES)
 from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from std_msgs.msg import Float64, Float64MultiArray
 
 FloatArray = NDArray[np.float64]
@@ -61,6 +62,8 @@ class SynchronousAverager(MonitoringNode):
         self._samples = SampleInput(self, values)
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
+        self._target = self.create_output(Float64MultiArray, 'target_geometry', LATCHED_QOS)
+        self._geometry: TargetGeometry | None = None  # the latest that was published
         self.create_input(self._samples.message_type, 'vibration', self._on_vibration)
         self._tach = self.create_input(pulse_type, 'tach_pulse',
                                        self._on_pulse_array if pulse_type is Float64MultiArray
@@ -140,6 +143,10 @@ class SynchronousAverager(MonitoringNode):
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
             self._cycles_per_second = speed / revolutions
+        geometry = self._averager.geometry
+        if geometry is not None and geometry is not self._geometry:
+            self._target.publish(encode_geometry(geometry))
+            self._geometry = geometry
         for line in self._averager.take_messages():
             self._average_flow.look_at = line
             self.warn(line)
@@ -167,6 +174,8 @@ class SynchronousAverager(MonitoringNode):
                   'keyphasor': self._keyphasor or '',
                   **{f'pulses_{key}': str(count)
                      for key, count in asdict(averager.pulse_counts).items()}}
+        if averager.geometry is not None:
+            values['target_geometry'] = str(averager.geometry)
         refused = {name: shaft.refused for name, shaft in self._shafts.items() if shaft.refused}
         for name, count in refused.items():
             values[f'{name}.corrections_refused'] = str(count)

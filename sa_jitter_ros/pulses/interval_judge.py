@@ -40,7 +40,7 @@ from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.mark_pattern import mark_pattern, regular_start, repeating
 from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
 from sa_jitter_ros.pulses.target import EvenTarget, Lock, Target
-from sa_jitter_ros.pulses.trigger_counter import TriggerCounter
+from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter
 
 FloatArray = npt.NDArray[np.float64]
 _MOST_WAITING = 10  # doubtful pulses, until the interval is learnt again
@@ -97,7 +97,7 @@ class IntervalJudge:
     `last` is the latest pulse (s) not dropped, `confirmed` the latest that was accepted.
     """
 
-    def __init__(self, target: Target, counter: TriggerCounter, options: JudgeOptions) -> None:
+    def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions) -> None:
         self._target, self._counter, self._options = target, counter, options
         self._rehearses = False  # it stops where the match is lost
         self.counts = dict.fromkeys(

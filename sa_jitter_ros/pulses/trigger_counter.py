@@ -11,6 +11,7 @@
 """From accepted pulses to trigger pulses, by counting teeth."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +30,9 @@ class TriggerPulses:
     `count` is the number of trigger cycles since the first pulse. It includes cycles with missing
     pulses, also where these break a run, and restarts at 0 where the number of cycles is unknown.
     `measured` is False for a missing pulse that was interpolated between its neighbours.
-    `doubtful`: a pulse was dropped in the trigger cycle that ends here.
+    `doubtful`: a pulse was dropped in the trigger cycle that ends here. `mark` is the tooth of
+    the pulse where the geometry of the target is known, else -1. Teeth that were numbered anew
+    have numbers that are larger by those of a revolution.
     """
 
     times: FloatArray
@@ -38,6 +41,7 @@ class TriggerPulses:
     count: IntArray
     measured: BoolArray
     doubtful: BoolArray
+    mark: IntArray
 
     @classmethod
     def joined(cls, parts: 'list[TriggerPulses]') -> 'TriggerPulses':
@@ -45,10 +49,35 @@ class TriggerPulses:
         if len(parts) == 1:
             return parts[0]
         if not parts:
-            none = np.empty(0, np.bool_)
-            return cls(np.empty(0), none, none, np.empty(0, np.int64), none, none)
+            none, no_numbers = np.empty(0, np.bool_), np.empty(0, np.int64)
+            return cls(np.empty(0), none, none, no_numbers, none, none, no_numbers)
         return cls(*(np.concatenate([getattr(part, name) for part in parts])
                      for name in cls.__dataclass_fields__))
+
+
+class PulseSink(Protocol):
+    """What takes accepted pulses: a `TriggerCounter`, or what stands in front of it."""
+
+    def begin(self, time: float, tooth: int, *, passed: int | None = None) -> None:
+        """Begin a run at a pulse (s) of this tooth, `passed` teeth after the last run's end."""
+
+    def extend(self, times: list[float], steps: list[int]) -> None:
+        """Add pulses (s) to the run, each `steps` teeth after the one before."""
+
+    def drop(self) -> None:
+        """Record that a pulse behind the latest one was dropped."""
+
+    def stop(self, *, known: bool = True) -> None:
+        """End the run; `known`: the last pulse is valid."""
+
+    def restart(self) -> None:
+        """Mark the next run as one that starts after time ran back."""
+
+    def take(self) -> TriggerPulses:
+        """Return the new trigger pulses."""
+
+    def flush(self) -> TriggerPulses:
+        """Return the last trigger pulses, because none follows."""
 
 
 class TriggerCounter:
@@ -72,6 +101,7 @@ class TriggerCounter:
         self._waiting: list[TriggerPulses] = []  # the first trigger pulse of a run
         self._found: list[TriggerPulses] = []
         self._restarted = False
+        self._numbering: int | None = None  # of the teeth
         self.discarded = 0
 
     @property
@@ -115,6 +145,16 @@ class TriggerCounter:
         """Mark the next run as one that starts after time ran back."""
         self._restarted = True
 
+    def know_marks(self, numbering: int | None) -> None:
+        """Take the number of the numbering of teeth from the next pulse on, None if not known."""
+        if numbering != self._numbering and self.running:
+            self._count()
+        self._numbering = numbering
+
+    def flush(self) -> TriggerPulses:
+        """Return the last trigger pulses: none waits here."""
+        return self.take()
+
     def take(self) -> TriggerPulses:
         """Return the new trigger pulses."""
         if self.running:
@@ -151,8 +191,11 @@ class TriggerCounter:
         doubtful[0] |= self._doubtful
         self._doubtful = bool(doubtful[-1])
         starts, restarts = np.zeros((2, targets.size), np.bool_)
+        marks = np.full(targets.size, -1)
+        if self._numbering is not None:
+            marks = targets % self._teeth + self._numbering * self._teeth
         # Missing teeth are interpolated between their neighbours.
         return TriggerPulses(
             np.interp(targets, numbers, self._times), starts, restarts,
             targets // self._per_trigger, numbers[np.searchsorted(numbers, targets)] == targets,
-            doubtful[:-1])
+            doubtful[:-1], marks)

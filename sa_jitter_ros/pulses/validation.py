@@ -20,7 +20,9 @@ they begin a new run. If no regular pulse confirmed the last pulse before time r
 pulse is the one out of order.
 """
 
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
+import math
 from operator import add
 from typing import Literal
 
@@ -28,13 +30,18 @@ import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.interval_judge import IntervalJudge, intervals, JudgeOptions
+from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
-from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter, TriggerPulses
 
-__all__ = ['MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
+__all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
 
 FloatArray = npt.NDArray[np.float64]
 MissingPulses = Literal['break', 'bridge']
+GeometryMode = Literal['none', 'learn', 'given']
+GEOMETRY_MODES = ('none', 'learn', 'given')
+_NO_TEETH = np.empty(0, np.int64)
 _PIECE = 4096  # pulses judged at once
 _RESTART = 3  # pulses after time ran back that begin a new run
 _WHEEL_TOLERANCE = 0.25  # of the intervals in which the gaps of a wheel are found
@@ -49,7 +56,8 @@ class PulseCounts:
     arrive: interpolated (`missing_bridged`) or the end of a run (`missing_broken`). `late` pulses
     start a run. All others were dropped; `unlocked` ones because no steady interval was known yet.
     `relearnt` counts changes of speed within one or two intervals, `cycles_discarded` trigger
-    cycles that began and were lost, `restarts` how often time ran back.
+    cycles that began and were lost, `restarts` how often time ran back, `geometry_refused` how
+    often the pulses did not fit what was known of the target's marks.
     """
 
     accepted: int = 0
@@ -64,6 +72,7 @@ class PulseCounts:
     unlocked: int = 0
     relearnt: int = 0
     cycles_discarded: int = 0
+    geometry_refused: int = 0
 
     def __add__(self, other: 'PulseCounts') -> 'PulseCounts':
         """Return the counts of both."""
@@ -90,6 +99,11 @@ class PulseValidator:
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
     :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
     :param path_delay: delay (s) of the pulses behind the vibration, which is taken from them.
+    :param target_geometry: 'learn' measures how late each mark of the target is, 'given' takes it
+        from `target_angles`; either is taken from the pulses. These wait for 100 revolutions at
+        first, and behind an interruption until their pattern shows which mark is which, but 3 s at
+        most (`mark_corrector`).
+    :param target_angles: how late (rad) each mark is, but those of missing teeth, which have none.
     :raises ParameterError: an option is out of range, or cycles do not fit the wheel.
 
     One pulse of eight is missing, and one is doubled:
@@ -108,6 +122,7 @@ class PulseValidator:
         missing_teeth: int = 0, missing_pulses: MissingPulses = 'break',
         interval_tolerance: float = 0.0, maximum_missing: int = 3,
         minimum_interval: float = 0.0, time_tolerance: float = 0.01, path_delay: float = 0.0,
+        target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
     ) -> None:
         teeth = pulses_per_revolution
         per_trigger = teeth if pulses_per_trigger is None else pulses_per_trigger
@@ -137,11 +152,16 @@ class PulseValidator:
             target = ToothedWheel(teeth=teeth, missing=missing_teeth,
                                   tolerance=interval_tolerance or _WHEEL_TOLERANCE)
         self._counter = TriggerCounter(teeth=teeth, teeth_per_trigger=per_trigger)
-        self._judge = IntervalJudge(target, self._counter, JudgeOptions(
+        self._sink: PulseSink = self._counter
+        self._corrector: MarkCorrector | None = None
+        given = _given_angles(target_geometry, target_angles, target.marks, teeth)
+        if target_geometry != 'none' and target.marks > 1:
+            self._sink = self._corrector = MarkCorrector(self._counter, count=teeth, given=given)
+        self._judge = IntervalJudge(target, self._sink, JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
             pulses_per_trigger=per_trigger))
-        self.pulses_per_trigger = per_trigger
+        self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
         self._out_of_order = self._restarts = self._non_finite = 0
@@ -151,7 +171,23 @@ class PulseValidator:
         """Return the counts so far."""
         return PulseCounts(
             **self._judge.counts, out_of_order=self._out_of_order, restarts=self._restarts,
-            non_finite=self._non_finite, cycles_discarded=self._counter.discarded)
+            non_finite=self._non_finite, cycles_discarded=self._counter.discarded,
+            geometry_refused=0 if self._corrector is None else self._corrector.refused)
+
+    @property
+    def corrects_marks(self) -> bool:
+        """Whether the geometry of the target is taken from the pulses, as far as it is known."""
+        return self._corrector is not None
+
+    @property
+    def geometry(self) -> TargetGeometry | None:
+        """Return what is taken from the pulses of each mark, None for nothing."""
+        return None if self._corrector is None else self._corrector.geometry
+
+    @property
+    def teeth(self) -> npt.NDArray[np.int64]:
+        """Return the numbers of the teeth that are there (mark,), as far as they are known."""
+        return _NO_TEETH if self._corrector is None else self._corrector.teeth
 
     def finish(self) -> PulseCounts:
         """Return the counts at the end of the stream: pulses that still wait are unlocked."""
@@ -185,17 +221,20 @@ class PulseValidator:
                 self._take(float(pulses[ahead]))
                 ahead += 1
             pulses = pulses[ahead:]
-        return self._counter.take()
+        return self._sink.take()
 
     def take_messages(self) -> list[str]:
-        """Return changes of the interval that no shaft makes, a sentence each, and forget them."""
+        """Return what pulses cannot do and did, a sentence each, and forget it."""
         found, self._judge.messages = self._judge.messages, []
+        if self._corrector is not None:
+            found += self._corrector.messages
+            self._corrector.messages = []
         return found
 
     def flush(self) -> TriggerPulses:
         """Return the trigger pulses that were not certain, because no pulse follows."""
         self._judge.flush()
-        return self._counter.take()
+        return self._sink.flush()
 
     def _take(self, pulse: float) -> None:
         judge = self._judge
@@ -229,6 +268,24 @@ class PulseValidator:
             self._restarts += 1
             self._judge.flush()
             self._judge.forget()
-            self._counter.restart()
+            self._sink.restart()
             held, self._held = self._held, []
             self._judge.take(np.array(held))
+
+
+def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
+                  ) -> Sequence[float] | None:
+    """Return the angles (mark,) in rad that are given, None for none; raise ParameterError."""
+    if mode not in GEOMETRY_MODES:
+        raise ParameterError(f'target_geometry {mode!r}: use one of {", ".join(GEOMETRY_MODES)}')
+    if mode != 'given':
+        return None
+    if len(angles) != marks:
+        raise ParameterError(f'target_angles has {len(angles)} angles for a target of {marks} '
+                             f'marks: give one for each, in rad')
+    most = math.pi / teeth
+    for angle in angles:
+        if not abs(angle) < most:
+            raise ParameterError(f'target_angles {angle} rad must be within {most:.4g} rad, half '
+                                 f'the angle between the {teeth} marks')
+    return angles

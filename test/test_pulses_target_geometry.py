@@ -1,0 +1,228 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The geometry of a target: measured, given, found again, and taken from the pulses."""
+
+import numpy as np
+import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.pulses.target_geometry import measured_geometry
+from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
+from sa_jitter_ros.pulses.validation import PulseValidator
+
+pytestmark = pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+
+SPEED, ERROR = 50.0, 5e-6
+LATE = np.array([0.012, -0.004, 0.0, -0.008])  # rad
+#: standard error (rad) of a mark by white errors of all pulses of 100 revolutions
+WHITE = 2.0 * np.pi * SPEED * ERROR / np.sqrt(100)
+
+
+def pulses_of(revolutions, *, late=LATE, teeth=4, first=0, start=0.0, rng, error=ERROR):
+    """Return pulses at 50 Hz; `first` is the tooth of the first one, which comes at `start`."""
+    numbers = np.arange(first, first + round(revolutions * teeth))
+    numbers = numbers[numbers % teeth < len(late)]
+    turns = (numbers - first) / teeth + np.asarray(late)[numbers % teeth] / (2.0 * np.pi)
+    return start + turns / SPEED + rng.normal(0.0, error, numbers.size)
+
+
+def validated(pulses, *, pieces=30, **options):
+    """Feed pulses in so many pieces; return validator, trigger pulses and messages."""
+    validator = PulseValidator(**{'pulses_per_revolution': 4, 'pulses_per_trigger': 1, **options})
+    found, lines = [], []
+    for piece in np.array_split(pulses, pieces):
+        found.append(validator.update(piece))
+        lines += validator.take_messages()
+    found.append(validator.flush())
+    return validator, TriggerPulses.joined(found), lines + validator.take_messages()
+
+
+def scatter(found):
+    """Return how far trigger cycles are from their median, in s."""
+    cycles = np.diff(found.times)[~found.starts_run[1:]]
+    return np.std(cycles - np.median(cycles))
+
+
+@pytest.mark.parametrize('speeds', [(50.0, 50.0), (40.0, 60.0)])
+@pytest.mark.parametrize(('teeth', 'present'), [(2, 2), (4, 4), (36, 35)])
+def test_standard_errors_are_those_of_white_jitter(rng, teeth, present, speeds):
+    off, stated = [], []
+    there = np.arange(present)
+    for _ in range(20):
+        late = rng.normal(0.0, 0.01 / teeth, present)
+        late -= late.mean()
+        numbers = np.arange(100 * teeth + 1)
+        numbers = numbers[numbers % teeth < present]
+        turns = numbers / teeth + late[numbers % teeth] / (2.0 * np.pi)
+        slope = (speeds[1]**2 - speeds[0]**2) / 200.0
+        times = 2.0 * turns / (speeds[0] + np.sqrt(speeds[0]**2 + 2.0 * slope * turns))
+        geometry = measured_geometry(times + rng.normal(0.0, ERROR, times.size), numbers, there,
+                                     teeth)
+        off.append(geometry.angles - late)
+        stated.append(geometry.standard_errors)
+    off, stated = np.array(off), np.array(stated)
+    assert np.sqrt(np.mean(off**2)) < 1.3 * WHITE
+    assert np.max(stated.mean(axis=0)) < 1.3 * WHITE
+    # 20 angles of each mark, but one of them follows from the others
+    free = 20.0 * (present - 1)
+    assert np.mean((off / stated)**2) == pytest.approx(1.1, abs=0.1 + 4.0 * np.sqrt(2.0 / free))
+
+
+@pytest.mark.parametrize(('teeth', 'present'), [(4, 4), (36, 35)])
+def test_order_60_of_uneven_marks_is_that_of_even_ones(rng, teeth, present):
+    late = rng.normal(0.0, 0.08 / teeth, present)
+    late -= late.mean()
+    uneven, even = (pulses_of(500, late=item, teeth=teeth, start=0.003, error=4.0 / teeth * ERROR,
+                              rng=np.random.default_rng(5))
+                    for item in (late, np.zeros(present)))
+    vibration = np.cos(2.0 * np.pi * 60 * SPEED * np.arange(200_000) / 20e3)
+    options = {'pulses_per_revolution': teeth, 'missing_teeth': teeth - present,
+               'pulses_per_trigger': 1, 'trigger_cycles': 60 * teeth, 'orders': [60.0]}
+    true = sa.average(vibration, 20e3, even, **options)
+    raw = sa.average(vibration, 20e3, uneven, **options)
+    learnt = sa.average(vibration, 20e3, uneven, target_geometry='learn', **options)
+    given = sa.average(vibration, 20e3, uneven, target_geometry='given', target_angles=late,
+                       **options)
+    assert len(true) == len(learnt) == len(given) >= 7
+    for average, one, other, uncorrected in zip(true, learnt, given, raw):
+        expected = average.amplitudes[0, 0]
+        assert abs(one.amplitudes[0, 0] - expected) < 1e-3 * abs(expected)
+        assert abs(other.amplitudes[0, 0] - expected) < 1e-3 * abs(expected)
+        assert abs(uncorrected.amplitudes[0, 0]) < 0.998 * abs(expected)
+
+
+def test_the_result_does_not_depend_on_the_pieces(rng):
+    pulses = np.concatenate((pulses_of(230, rng=rng), pulses_of(
+        120, first=2, start=9.123, rng=rng)))
+    kept = pulses[rng.random(pulses.size) > 0.02]
+    _, whole, _ = validated(kept, pieces=1, target_geometry='learn')
+    for pieces in (7, kept.size):
+        _, found, _ = validated(kept, pieces=pieces, target_geometry='learn')
+        for name in TriggerPulses.__dataclass_fields__:
+            np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+
+
+@pytest.mark.parametrize('mode', ['learn', 'given'])
+def test_marks_are_found_again_behind_a_gap(rng, mode):
+    before = pulses_of(150, rng=rng)
+    behind = pulses_of(150, first=3, start=7.0071, rng=rng)
+    validator, found, lines = validated(
+        np.concatenate((before, behind)), pulses_per_trigger=4, target_geometry=mode,
+        target_angles=LATE)
+    assert not lines
+    assert validator.counts.geometry_refused == 0
+    assert found.starts_run.sum() == 2
+    # the same mark begins trigger cycles: the first one after the gap is the second pulse
+    first = found.times[np.flatnonzero(found.starts_run)[1]]
+    assert first == pytest.approx(behind[1] - (LATE[0]) / (2.0 * np.pi * SPEED), abs=2e-6)
+    np.testing.assert_allclose(validator.geometry.angles, LATE - LATE.mean(), atol=5.0 * WHITE)
+
+
+def test_a_pattern_that_is_another_one_is_refused_with_the_reason(rng):
+    pulses = pulses_of(300, rng=rng)
+    validator, found, lines = validated(
+        pulses, target_geometry='given', target_angles=LATE[::-1])
+    assert validator.geometry is None
+    assert validator.counts.geometry_refused == 1
+    assert len(lines) == 1
+    assert lines[0].startswith('target_geometry: the pulses show other marks than those known')
+    assert lines[0].endswith('no angles are subtracted')
+    np.testing.assert_array_equal(found.times, pulses)
+
+
+def test_a_pattern_hidden_by_jitter_is_refused(rng):
+    pulses = pulses_of(300, rng=rng)
+    _, found, lines = validated(pulses, target_geometry='given', target_angles=0.01 * LATE)
+    assert 'their errors hide the pattern' in lines[0] or 'other marks' in lines[0]
+    np.testing.assert_array_equal(found.times, pulses)
+
+
+@pytest.mark.parametrize('mode', ['learn', 'given'])
+def test_a_wheel_that_changes_its_pattern_is_named_once(rng, mode):
+    other = np.array([0.0, 0.01, -0.02, 0.01])
+    pulses = np.concatenate((pulses_of(300, rng=rng),
+                             pulses_of(300, late=other, start=300 / SPEED, rng=rng)))
+    validator, found, lines = validated(pulses, target_geometry=mode, target_angles=LATE)
+    assert len(lines) == validator.counts.geometry_refused == 1
+    assert 'the marks are no longer where they were' in lines[0]
+    assert found.times.size > 1190
+    if mode == 'learn':
+        assert scatter(TriggerPulses(*(item[-800:] for item in vars(found).values()))) < 2 * ERROR
+
+
+def test_an_even_target_is_never_refused(rng):
+    even = np.zeros(4)
+    pulses = np.concatenate((pulses_of(250, late=even, rng=rng), pulses_of(
+        250, late=even, first=1, start=8.3217, rng=rng)))
+    validator, found, lines = validated(pulses, target_geometry='learn')
+    assert not lines
+    assert not validator.geometry.significant
+    assert scatter(found) < 1.1 * np.sqrt(2.0) * ERROR
+
+
+def test_bridged_and_missing_pulses_do_not_disturb_the_marks(rng):
+    pulses = pulses_of(300, rng=rng)
+    pulses = pulses[rng.random(pulses.size) > 0.1]
+    for missing in ('break', 'bridge'):
+        validator, found, _ = validated(pulses, target_geometry='learn', missing_pulses=missing)
+        late = validator.geometry.angles - (LATE - LATE.mean())
+        turned = min(np.abs(np.roll(late + LATE, turn) - LATE).max() for turn in range(4))
+        assert turned < 5.0 * WHITE
+        measured = TriggerPulses(*(item[found.measured] for item in vars(found).values()))
+        assert scatter(measured) < 2e-3 if missing == 'bridge' else 2.0 * ERROR
+
+
+def test_few_pulses_pass_as_they_are(rng):
+    for count in (0, 1, 3, 12):
+        pulses = pulses_of(100, rng=rng)[:count]
+        validator, found, _ = validated(pulses, pieces=1, target_geometry='learn')
+        assert found.times.tolist() == pulses.tolist()[:found.times.size]
+        assert validator.geometry is None
+
+
+def test_the_vibration_tells_late_marks_from_a_ripple_of_the_speed(rng):
+    speed, ripple, late = 20.0, 2e-3, np.array([0.003, -0.001, 0.002, -0.004])
+    numbers = np.arange(1600)
+
+    def time_of(turns):
+        return turns / speed + ripple / (2.0 * np.pi * speed) * np.sin(2.0 * np.pi * turns)
+
+    pulses = time_of(numbers / 4 + late[numbers % 4] / (2.0 * np.pi)) + rng.normal(
+        0.0, ERROR, numbers.size)
+    fine = np.linspace(-1.0, 401.0, 402 * 100)
+    turns = np.interp(np.arange(400_000) / 20e3, time_of(fine), fine)
+    vibration = sum(np.cos(2.0 * np.pi * g * turns) for g in (20, 40, 60))
+    vibration += rng.normal(0.0, 0.1, turns.size)
+    options = {'pulses_per_revolution': 4, 'pulses_per_trigger': 1, 'trigger_cycles': 200,
+               'orders': [60.0], 'keyphasor_rate': 20e3, 'target_geometry': 'learn'}
+    alone, helped = (sa.Averager(20e3, correct_jitter=correct, **options)
+                     for correct in (False, True))
+    by_pulses = alone.update(vibration, pulses) + alone.flush()
+    both = helped.update(vibration, pulses) + helped.flush()
+    assert not alone.geometry.by_vibration
+    assert 'ripple' in alone.geometry.remark
+    assert helped.geometry.by_vibration
+    # the ripple moves marks 1 and 3 by 2 mrad; the straight angle law adds a part of it again
+    off = [abs(item.geometry.angles - late)[[1, 3]].mean() for item in (alone, helped)]
+    assert off[0] > 1.8e-3 > 0.8e-3 > off[1]
+    assert abs(by_pulses[-1].amplitudes[0, 0]) < 0.997
+    assert abs(both[-1].amplitudes[0, 0]) > 0.998
+
+
+@pytest.mark.parametrize(('options', 'words'), [
+    ({'target_geometry': 'given'}, 'target_angles has 0 angles for a target of 4 marks'),
+    ({'target_geometry': 'given', 'target_angles': [0.0, 0.0, 0.0, 0.9]}, 'must be within 0.7854'),
+    ({'target_geometry': 'measure'}, "target_geometry 'measure'"),
+    ({'target_geometry': 'given', 'target_angles': [0.0] * 4, 'missing_teeth': 1},
+     'target_angles has 4 angles for a target of 3 marks')])
+def test_angles_that_cannot_be_used_are_refused(options, words):
+    with pytest.raises(ParameterError, match=words):
+        PulseValidator(pulses_per_revolution=4, **options)
