@@ -187,7 +187,7 @@ def test_expected_errors_are_as_small_as_noise_demands(rng):
 
 def test_noise_that_leaves_errors_unknown_is_refused(rng):
     errors = jitter(rng, 0.02)
-    cycles, pulses = simulate(rng, errors, MESH, noise=3.0)
+    cycles, pulses = simulate(rng, errors, MESH, noise=4.0)
     found = recover(cycles, pulses, declared=declared(0.02))
     assert not found.accepted
     assert not found.errors.any()

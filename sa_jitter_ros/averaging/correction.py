@@ -310,12 +310,18 @@ def _average_again(raw: Average, cycles: Sequence[CycleSamples],
     begins = np.flatnonzero(raw.used)
     first = round(raw.first_angle / settings.cycle_length)
     shaft, average, run = ShaftAverager(again, first_cycle=first), None, 0
-    for index, cycle in enumerate(cycles):
+    index = 0
+    while index < len(cycles):
         if index and begins[index] != begins[index - 1] + 1:
             shaft.skip(int(raw.cycle_numbers[index] - raw.cycle_numbers[index - 1]) - 1)
             run = begins[index]
         stop = run + int(np.argmin(raw.used[run:])) + 1
-        average = shaft.update(replace(
-            cycle, pulses=pulses[run:stop], first=int(begins[index] - run)))
+        end = index + 1  # of the cycles that were cut out together: they are resampled together
+        while end < len(cycles) and cycles[end].samples is cycles[index].samples and (
+                begins[end] < stop - 1):
+            end += 1
+        average = shaft.update(replace(cycles[index], pulses=pulses[run:stop],
+                                       first=int(begins[index] - run), count=end - index))
+        index = end
     assert average is not None
     return replace(average, sequence=raw.sequence)

@@ -174,7 +174,7 @@ def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = L
     There are as many points as a cycle of `period` (s) needs, the longest of the cycles if None.
     """
     longest = max(cycle.periods.max() for cycle in cycles) if period is None else period
-    points = int(grid_points(longest, cycles[0].rate))
+    points = next_fast_len(int(grid_points(longest, cycles[0].rate)), real=True)
     u = np.arange(points) / points
     return np.stack([cycle.at(law, u, method=method) for cycle in cycles])
 

@@ -43,6 +43,9 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _NODE_ERROR = 1e-4
+# A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
+# of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
+_PANEL_CYCLES, _PANEL_DEGREES, _LEAST_GAIN = 6.0, 44, 2
 _MOST_NODES = 20
 _ITERATIONS = 25
 # Iterations in which the size of the errors is estimated, and the change of an amplitude, over its
@@ -162,17 +165,46 @@ def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, or
         wave = np.exp(2j * pi * g * cycle_length * u)[:, None] * through_nodes
         nodes.append(x)
         columns += [wave.real, -wave.imag]
-    basis, triangle = qr(np.concatenate(columns, axis=1), mode='economic', overwrite_a=True,
-                         check_finite=False)
+    rows, flat = np.concatenate(columns, axis=1), samples.reshape(len(u), -1)
+    panels = _panels(len(u), cycle_length * float(orders.max()))
+    if panels is not None:
+        rows, flat = _projected(rows, panels), _projected(flat, panels)
+    basis, triangle = qr(rows, mode='economic', overwrite_a=True, check_finite=False)
     basis, triangle = basis[:, 1:], triangle[1:, 1:]  # the part orthogonal to a constant
     widths = np.array([len(x) for x in nodes])
     ends = 2 * np.cumsum(widths)
     mixing = tuple(triangle[:end, end - 2 * w:end - w] - 1j * triangle[:end, end - w:end]
                    for end, w in zip(ends, widths))
-    coefficients = (basis.T @ samples.reshape(len(u), -1)).reshape(-1, count, channels)
+    coefficients = (basis.T @ flat).reshape(-1, count, channels)
     start = np.multiply.outer(first_angle + cycle_length * np.arange(count), orders) % 1.0
     return CompressedCycles(np.ascontiguousarray(coefficients.transpose(1, 0, 2)), orders,
                             ends - 2 * widths, tuple(nodes), mixing, start)
+
+
+def _panels(samples: int, cycles: float) -> FloatArray | None:
+    """
+    Return an orthonormal basis (sample, degree) of polynomials in a panel of a trigger cycle.
+
+    It holds orders up to `cycles` in the trigger cycle, with all that varies slowly, to rounding.
+    None where `samples` are too few for a basis that is much smaller.
+    """
+    length = int(_PANEL_CYCLES * samples / (cycles + _PANEL_CYCLES))
+    if length < _LEAST_GAIN * _PANEL_DEGREES:
+        return None
+    x = np.linspace(-1.0, 1.0, length)
+    return np.asarray(np.linalg.qr(legendre.legvander(x, _PANEL_DEGREES - 1))[0])
+
+
+def _projected(rows: FloatArray, panels: FloatArray) -> FloatArray:
+    """
+    Return rows (sample, column) in the basis of the panels, the last ones as they are.
+
+    Products of columns stay as they are, of all that the panels hold.
+    """
+    length, degrees = panels.shape
+    whole = len(rows) // length
+    inside = np.matmul(panels.T, rows[:whole * length].reshape(whole, length, -1))
+    return np.concatenate((inside.reshape(whole * degrees, -1), rows[whole * length:]))
 
 
 def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -245,6 +245,8 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
         else:
             candidates, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
+            if clearest.size:
+                candidates = candidates[search.plausible(errors, candidates, cycles=len(cycles))]
         # at most half as many unknowns as a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])

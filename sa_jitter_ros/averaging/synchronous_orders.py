@@ -37,6 +37,9 @@ ComplexArray = NDArray[np.complex128]
 
 # Probability that noise alone passes as a synchronous order in any of the orders and channels.
 _FALSE_ALARM = 1e-3
+# Share of the level of that test which an order reaches in a search if it passes the test: the
+# windows of the search cost a factor of 1.5, and as much again may be chance.
+_FAR_BELOW = 0.3
 # Share of an order's power that must be coherent from cycle to cycle.
 _COHERENCE = 0.15
 # Orders that need more cycles than these to be found are too weak to show the error of a pulse.
@@ -110,6 +113,23 @@ class LineSearch:
         best = best[np.lexsort((-contrast[best] * share, -telling[best] * share))[:most]]
         return g[best], g[best[contrast[best] > _CLEAR]]
 
+    def plausible(self, errors: FloatArray, g: FloatArray, *, cycles: int) -> NDArray[np.bool_]:
+        """
+        Return which orders may be significant in all `cycles`, as the searched ones show them.
+
+        What is far below the level of `significant_orders` need not be fitted.
+        """
+        count = self.spectra.shape[1]
+        series = self._series(errors, g, _taper(count))
+        if count < 2:
+            return np.ones(len(g), np.bool_)
+        mean = series.mean(axis=1)
+        scatter = np.maximum(np.sum(np.abs(series - mean[:, None]) ** 2, axis=1) / (count - 1),
+                             np.finfo(float).tiny)
+        power = np.abs(mean) ** 2 - scatter / count
+        limit = _significance(len(self.orders) * series.shape[2], cycles)
+        return np.asarray((cycles * power > _FAR_BELOW * limit * scatter).any(axis=1))
+
     def _shown(self, errors: FloatArray, g: FloatArray) -> ComplexArray:
         """Return what (row) orders show of unit lines at each order (column)."""
         count = self.spectra.shape[1]
@@ -140,20 +160,26 @@ class LineSearch:
         return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
 
     def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
+        taper = _taper(self.spectra.shape[1])
+        return np.asarray(self._series(errors, g, 1.0 if tapered else taper).sum(axis=1))
+
+    def _series(self, errors: FloatArray, g: FloatArray, divisor: FloatArray | float
+                ) -> ComplexArray:
+        """Return the lines (order, cycle, channel) of the single cycles."""
         count = self.spectra.shape[1]
         errors = errors[self.first:self.first + count + 1]
         angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
         position = np.outer(g, self.cycle_length + np.diff(errors))
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
-        phase = np.exp(-2j * pi * np.outer(g, angle)) / (1.0 if tapered else _taper(count))
-        line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
+        phase = np.exp(-2j * pi * np.outer(g, angle)) / divisor
+        line = np.zeros((len(g), *self.spectra.shape[1:]), np.complex128)
         for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
             bins = nearest + offset
             x = position - bins[:, None]
             lobe = 0.5 * np.sinc(x) + 0.25 * (np.sinc(x - 1.0) + np.sinc(x + 1.0))
             weight = phase * lobe * np.exp(-1j * pi * x)
             weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
-            line += np.einsum('gk,gkc->gc', weight, self.spectra.take(bins, axis=0, mode='clip'))
+            line += weight[:, :, None] * self.spectra.take(bins, axis=0, mode='clip')
         return line
 
 
@@ -182,9 +208,14 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
     in_phase = (deviation * np.exp(-1j * np.angle(amplitudes))).real
     ringing = np.maximum(scatter, 2.0 * _long_run_variance(in_phase))
-    limit = stats.f.isf(_FALSE_ALARM / (tests * channels), 2, 2 * (count - 1))
+    limit = _significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
+
+
+def _significance(tests: int, cycles: int) -> float:
+    """Return the level of the F test of one of so many orders and channels."""
+    return float(stats.f.isf(_FALSE_ALARM / tests, 2, 2 * (cycles - 1)))
 
 
 def _long_run_variance(series: FloatArray) -> FloatArray:
