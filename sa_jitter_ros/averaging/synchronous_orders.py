@@ -20,7 +20,7 @@ as coherent from cycle to cycle as the order, and passes the test more often tha
 (with a quality factor of 500 at order 19, in 7 % of averages of 100 cycles).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import pi
 
@@ -120,7 +120,9 @@ class LineSearch:
         What is far below the level of `significant_orders` need not be fitted.
         """
         count = self.spectra.shape[1]
-        series = self._series(errors, g, _taper(count))
+        series = np.zeros((len(g), *self.spectra.shape[1:]), np.complex128)
+        for weight, spectra in self._lobes(errors, g, tapered=False):
+            series += weight[:, :, None] * spectra
         if count < 2:
             return np.ones(len(g), np.bool_)
         mean = series.mean(axis=1)
@@ -160,27 +162,27 @@ class LineSearch:
         return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
 
     def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
-        taper = _taper(self.spectra.shape[1])
-        return np.asarray(self._series(errors, g, 1.0 if tapered else taper).sum(axis=1))
+        line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
+        for weight, spectra in self._lobes(errors, g, tapered=tapered):
+            line += np.einsum('gk,gkc->gc', weight, spectra)
+        return line
 
-    def _series(self, errors: FloatArray, g: FloatArray, divisor: FloatArray | float
-                ) -> ComplexArray:
-        """Return the lines (order, cycle, channel) of the single cycles."""
+    def _lobes(self, errors: FloatArray, g: FloatArray, *, tapered: bool
+               ) -> Iterator[tuple[ComplexArray, ComplexArray]]:
+        """Yield weights (order, cycle) and bins (order, cycle, channel), whose products add up."""
         count = self.spectra.shape[1]
         errors = errors[self.first:self.first + count + 1]
         angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
         position = np.outer(g, self.cycle_length + np.diff(errors))
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
-        phase = np.exp(-2j * pi * np.outer(g, angle)) / divisor
-        line = np.zeros((len(g), *self.spectra.shape[1:]), np.complex128)
+        phase = np.exp(-2j * pi * np.outer(g, angle)) / (1.0 if tapered else _taper(count))
         for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
             bins = nearest + offset
             x = position - bins[:, None]
             lobe = 0.5 * np.sinc(x) + 0.25 * (np.sinc(x - 1.0) + np.sinc(x + 1.0))
             weight = phase * lobe * np.exp(-1j * pi * x)
             weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
-            line += weight[:, :, None] * self.spectra.take(bins, axis=0, mode='clip')
-        return line
+            yield weight, self.spectra.take(bins, axis=0, mode='clip')
 
 
 def _taper(count: int) -> FloatArray:
