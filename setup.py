@@ -80,6 +80,7 @@ setup(
             'catkin_pkg',
             'colcon-bash',
             'colcon-ros',
+            'distributed>=2023.5',
             'flake8>=7,<8',
             'flake8-blind-except',
             'flake8-builtins',

@@ -103,6 +103,8 @@ def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
                 known = row.error.startswith(row.path)
                 progress.say(row.error if known else f'{row.path}: {row.error}')
             progress.show(done / len(jobs), f'{done} of {len(jobs)} done')
+        for job in jobs:  # of workers that died
+            remove_unfinished(Path(job.folder))
     finally:
         progress.clear()
         if any(row.averages for row in rows):

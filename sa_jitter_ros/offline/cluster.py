@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
+import logging
 from typing import Any, TypeVar
 
 from sa_jitter_ros.errors import ParameterError, SaJitterError
@@ -35,8 +36,12 @@ def run_on_cluster(function: Callable[[Job], Result], jobs: Sequence[Job], addre
     except ImportError:
         raise ParameterError("--scheduler needs Dask: pip install 'sa_jitter_ros[fleet]'"
                              ) from None
-    client = _connected(Client, address)
+    log = logging.getLogger('distributed.client')  # what it says of a lost cluster, we say, too
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    client = None
     try:
+        client = _connected(Client, address)
         futures = {client.submit(attempt, function, job, pure=False): job for job in jobs}
         for future in as_completed(futures):
             try:
@@ -54,13 +59,15 @@ def run_on_cluster(function: Callable[[Job], Result], jobs: Sequence[Job], addre
                 found = Failure(f'{type(error).__name__}: {" ".join(str(error).split())}')
             yield futures[future], found
     finally:
-        client.close(timeout=ANSWER)
+        if client is not None:
+            client.close(timeout=ANSWER)
+        log.setLevel(level)
 
 
 def _connected(connect: Callable[..., Any], address: str) -> Any:
     """Return a client of the cluster; raises ParameterError unless it answers and has a worker."""
     try:
-        client = connect(address, timeout=ANSWER, set_as_default=False)
+        client = connect(address, timeout=ANSWER)
     except (OSError, ValueError, TypeError) as error:  # a timeout is an OSError, too
         reason = ' '.join(str(error).split())
         raise ParameterError(f'--scheduler {address}: no answer within {ANSWER:g} s: check host '

@@ -1,0 +1,110 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Many recordings: processes and workers that die, full disks, clusters that do not answer."""
+
+import os
+from pathlib import Path
+import signal
+import sys
+import time
+
+import pytest
+from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
+from sa_jitter_ros.offline.processes import Failure
+
+
+def work(job):
+    """Return the job, or what its name says."""
+    name, _, folder = job.partition('@')
+    if name == 'dies':
+        os.kill(os.getpid(), signal.SIGKILL)
+    if name == 'dies once':
+        mark = Path(folder, 'died')
+        if not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+    if name == 'is wrong':
+        raise SaJitterError('a value')
+    if name == 'has a bug':
+        return {}['key']
+    if name == 'is full':
+        raise OSError(28, 'No space left on device')
+    time.sleep(0.01)
+    return name
+
+
+@pytest.fixture
+def address():
+    """Return the address of a cluster with two workers, which restarts those that die."""
+    distributed = pytest.importorskip(
+        'distributed', reason="Dask is not installed: pip install '.[fleet]'")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None,
+                                  host='127.0.0.1') as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.parametrize('processes', [1, 2])
+def test_each_job_has_a_result_or_a_reason(processes):
+    jobs = ['a', 'is wrong', 'b', 'has a bug', *(['dies'] if processes > 1 else []), 'c']
+    found = {job: str(result) for job, result in run_jobs(work, jobs, processes=processes)}
+    assert list(found) == jobs or processes > 1
+    assert {job: found[job] for job in 'abc'} == {'a': 'a', 'b': 'b', 'c': 'c'}
+    assert found['is wrong'] == 'a value'
+    assert found['has a bug'] == "KeyError: 'key'"
+    if processes > 1:
+        assert found['dies'].startswith('its process was ended by SIGKILL')
+
+
+@pytest.mark.parametrize('processes', [1, 2])
+def test_full_disk_ends_the_run(processes):
+    with pytest.raises(OSError, match='No space left'):
+        list(run_jobs(work, ['a', 'is full', 'b', 'c'], processes=processes))
+
+
+def test_names_of_recordings_are_their_paths_below_the_folder(tmp_path):
+    for name in ('b/rig.npz', 'a/rig.npz', 'a/rig.mat', 'bag/metadata.yaml', 'bag/0.mcap',
+                 'out/rig/averages.csv', '.hidden/rig.npz', 'a/notes.txt'):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).touch()
+    found = find_recordings([tmp_path, tmp_path / 'b' / 'rig.npz'], leave_out=tmp_path / 'out')
+    assert [(item.name, bool(item.error)) for item in found] == [
+        ('a/rig', False), ('a/rig', True), ('b/rig', False), ('bag', False)]
+    same = find_recordings([tmp_path / 'b' / 'rig.npz', tmp_path / 'a' / 'rig.npz'])
+    assert [item.name for item in same] == ['rig', 'rig']
+    assert same[1].error == (
+        f'{tmp_path}/a/rig.npz: its results would have the name rig, as those of '
+        f'{tmp_path}/b/rig.npz: rename one of the two, or give the folder that holds both')
+
+
+def test_cluster_without_dask_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    with pytest.raises(ParameterError, match=r"pip install 'sa_jitter_ros\[fleet\]'"):
+        list(run_jobs(work, ['a'], scheduler='tcp://127.0.0.1:8786'))
+
+
+def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
+    pytest.importorskip('distributed', reason="Dask is not installed: pip install '.[fleet]'")
+    monkeypatch.setattr('sa_jitter_ros.offline.cluster.ANSWER', 1.0)
+    for address in ('tcp://127.0.0.1:9', 'nonsense', 'tcp://'):
+        with pytest.raises(ParameterError, match='no answer within 1 s') as error:
+            list(run_jobs(work, ['a'], scheduler=address))
+        assert '\n' not in str(error.value)
+
+
+@pytest.mark.processes
+def test_a_worker_that_is_killed_loses_nothing(address, tmp_path):
+    jobs = ['a', f'dies once@{tmp_path}', 'b', 'is wrong', 'c', 'd']
+    found = dict(run_jobs(work, jobs, scheduler=address))
+    assert (tmp_path / 'died').exists()
+    assert found.keys() == set(jobs)
+    assert found[jobs[1]] == 'dies once'
+    assert [job for job, result in found.items() if isinstance(result, Failure)] == ['is wrong']
