@@ -84,6 +84,11 @@ SHAFTS = {('direct', 'tach'): 'direct/tach', ('direct', 'gear'): 'direct/gear',
 KINDS = ('order_amplitude', 'synchronous_average', 'corrected_average', 'pulse_error')
 
 
+def _without_ages(status: dict[str, str]) -> dict[str, str]:
+    """Return a status without the ages of data, which grow while nothing comes."""
+    return {key: value for key, value in status.items() if not key.endswith('_age')}
+
+
 def shown(value: Any) -> str:
     """Return a parameter's value as the command line takes it."""
     return str(value).lower() if isinstance(value, bool) else str(value)
@@ -292,8 +297,8 @@ class Graph:
     def quiet_status(self, role: str) -> dict[str, str]:
         """Return a node's status once it says the same twice: it has had all that was sent."""
         life, last = self.lives[role], {'': ''}
-        while life.status != last:
-            last, status_time = life.status, life.status_time
+        while _without_ages(life.status) != last:
+            last, status_time = _without_ages(life.status), life.status_time
             if not self.spin(lambda status_time=status_time: life.status_time > status_time, 20.0):
                 self.died.append(f'{role} is silent')
                 break

@@ -181,7 +181,8 @@ class Correction:
     measured minus true times with mean 0, as the vibration alone tells them; NaN where it leaves
     an error ambiguous. `jitter_std` in s is the standard deviation of the true jitter that the
     vibration shows, the declared one where it shows too little, NaN where the correction is not
-    accepted. `amplitudes` are NaN where the phase of an order stays unknown. `attenuation`
+    accepted. `refitted` pulses counted as missing, because no jitter explains their errors.
+    `amplitudes` are NaN where the phase of an order stays unknown. `attenuation`
     (channel, order) is the raw over the corrected amplitude, NaN without an accepted correction.
     Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
     `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
@@ -219,6 +220,7 @@ class Correction:
     cycle_amplitudes: ComplexArray
     amplitude_errors: AmplitudeErrors
     jitter_std: float = math.nan
+    refitted: int = 0
 
     def __repr__(self) -> str:
         """Return one line: whether it was accepted, the size of the errors, what is left."""

@@ -22,6 +22,7 @@ from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected
                                                       Repeatability)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
+from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
@@ -31,6 +32,7 @@ from scipy.signal import resample
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+_ROUNDS = 2  # of the search for displaced pulses
 _REPETITIONS = 4  # of the recovery where cycles were discarded
 _FINE = 8  # points of a waveform between two of its own, where it is interpolated
 _REACH = 0.06  # largest correction of a pulse, a fraction of a trigger cycle
@@ -140,7 +142,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     if raw.discarded_cycles and not np.isfinite(raw.waveform).all():
         return _uncorrected(raw, 'cycles were discarded, and what is left has no whole '
                                  'fundamental cycle that tells what they were: average more')
-    recovery = _recovered(raw, cycles, settings)
+    recovery, refitted = _refitted(raw, cycles, settings)
     periods = raw.periods
     largest, reach = np.abs(recovery.expected).max(), _REACH * periods.min()
     reason = recovery.reason if largest <= reach else (
@@ -161,7 +163,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
             cycles_again, _clean(raw, cycles_again, settings), raw.orders, amplitudes=amplitudes,
             unsure=unsure, largest=whole, jitter=_in_cycles(recovery.std, raw, settings)),
-        recovery.std)
+        recovery.std, refitted)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
@@ -215,19 +217,54 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
             np.where(known, np.fmax(np.abs(whole), np.abs(amplitudes)), np.nan))
 
 
+def _refitted(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
+              ) -> tuple[PulseErrorRecovery, int]:
+    """
+    Recover the pulse errors, where needed again without the pulses that no jitter explains.
+
+    The second result is the number of these.
+    """
+    recovery, grid = _recovered(raw, cycles, settings)
+    begins = np.flatnonzero(raw.used)
+    moved = np.zeros(raw.pulses.size)
+    for _ in range(_ROUNDS):
+        late = displacements(
+            grid, recovery, raw.cycle_numbers, begins, cycle_length=settings.cycle_length,
+            period=float(np.mean(raw.periods)), first_angle=raw.first_angle,
+            declared=_declared(cycles, settings))
+        if not late.any():
+            break
+        if np.abs(late).max() > _REACH * raw.periods.min():  # which is refused
+            return replace(recovery, expected=recovery.expected + late), 0
+        moved += late
+        if np.any(np.diff(raw.pulses - moved) <= 0.0):
+            return recovery, 0
+        again = replace(raw, pulses=raw.pulses - moved)
+        recovery, grid = _recovered(again, _between(raw, cycles, again.pulses), settings)
+    if not moved.any():
+        return recovery, 0
+    shift = moved - moved.mean()
+    return replace(recovery, errors=recovery.errors + shift, expected=recovery.expected + shift
+                   ), int(np.count_nonzero(moved))
+
+
+def _declared(cycles: Sequence[CycleSamples], settings: AverageSettings) -> float:
+    """Return the standard deviation (s) of the declared jitter."""
+    return 1.0 / (math.sqrt(12.0) * (settings.keyphasor_rate or cycles[0].rate))
+
+
 def _recovered(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
-               ) -> PulseErrorRecovery:
-    """Recover the errors of the pulses of `raw` from its trigger `cycles`."""
+               ) -> tuple[PulseErrorRecovery, FloatArray]:
+    """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
     grid = cycle_grid(cycles, method=settings.interpolation)
-    clock = settings.keyphasor_rate or cycles[0].rate
     recover = partial(
         recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
         additional_orders=settings.orders,
-        declared_standard_deviation=1.0 / (math.sqrt(12.0) * clock))
+        declared_standard_deviation=_declared(cycles, settings))
     if not raw.discarded_cycles:
-        return recover(grid, periods=raw.periods)
-    return _recovered_over_gaps(raw, grid, recover, settings.cycle_length)
+        return recover(grid, periods=raw.periods), grid
+    return _recovered_over_gaps(raw, grid, recover, settings.cycle_length), grid
 
 
 def _recovered_over_gaps(raw: Average, grid: FloatArray,
@@ -300,6 +337,18 @@ def _uncorrected(raw: Average, reason: str) -> Correction:
         raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
         np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes,
         AmplitudeErrors.unknown(raw.amplitudes.shape))
+
+
+def _between(raw: Average, cycles: Sequence[CycleSamples], pulses: FloatArray
+             ) -> list[CycleSamples]:
+    """Return the trigger cycles of `raw` between other pulses (pulse,)."""
+    begins, run, found = np.flatnonzero(raw.used), 0, []
+    for index, cycle in enumerate(cycles):
+        if index and begins[index] != begins[index - 1] + 1:
+            run = begins[index]
+        stop = run + int(np.argmin(raw.used[run:])) + 1
+        found.append(replace(cycle, pulses=pulses[run:stop], first=int(begins[index] - run)))
+    return found
 
 
 def _average_again(raw: Average, cycles: Sequence[CycleSamples],

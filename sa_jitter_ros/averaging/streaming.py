@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.correction import CorrectingAverager
 from sa_jitter_ros.averaging.cycle import CycleSamples
+from sa_jitter_ros.averaging.error_ramp import ErrorRamp
 from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
 from sa_jitter_ros.averaging.shaft import TOGETHER
 from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
@@ -84,6 +85,7 @@ class StreamCounts:
     cycles_dropped: int = 0
     pulses_dropped: int = 0
     averages_dropped: int = 0
+    pulses_refitted: int = 0
 
 
 class StreamingAverager:
@@ -134,6 +136,7 @@ class StreamingAverager:
         self._messages: list[str] = []
         self._keep_unfinished = keep_unfinished
         self._recovered = RecoveredMarks(validator.pulses_per_revolution)
+        self._ramps = {name: ErrorRamp() for name in shafts}
         self._due: list[tuple[str, Average]] = []
         self._ended = False
 
@@ -142,6 +145,11 @@ class StreamingAverager:
         """Return the counts of the pulses so far, of all validators."""
         validator = self.validator
         return self._pulse_counts + (validator.finish() if self._ended else validator.counts)
+
+    @property
+    def doubts(self) -> dict[str, str]:
+        """Return how the pulses run away from the vibration, by shaft; '' where they do not."""
+        return {name: ramp.doubt for name, ramp in self._ramps.items()}
 
     @property
     def geometry(self) -> TargetGeometry | None:
@@ -157,6 +165,7 @@ class StreamingAverager:
             'samples_dropped': samples.samples_dropped, 'samples_lost': samples.samples_lost,
             'pulses_dropped': (self.counts.pulses_dropped + pulses.doubles + pulses.early
                                + pulses.out_of_order + pulses.non_finite + pulses.unlocked),
+            'pulses_refitted': self.counts.pulses_refitted,
             'cycles_dropped': self.counts.cycles_dropped + pulses.cycles_discarded,
             'averages_dropped': self.counts.averages_dropped, 'gaps': samples.gaps,
             'restarts': max(samples.restarts, pulses.restarts), 'repeats': samples.repeats,
@@ -203,6 +212,7 @@ class StreamingAverager:
     def change(self, shafts: dict[str, AverageSettings]) -> None:
         """Continue with other settings of the same shafts; unfinished averages count as lost."""
         lost = [self.shafts[name].change(settings) for name, settings in shafts.items()]
+        self._ramps = {name: ErrorRamp() for name in shafts}
         self.counts.averages_dropped += sum(lost)
         self._law = angle_law(next(iter(shafts.values())).angle_law)
 
@@ -211,6 +221,7 @@ class StreamingAverager:
         self._pulse_counts += self.validator.finish()
         self.validator = validator
         self._recovered = RecoveredMarks(validator.pulses_per_revolution)
+        self._ramps = {name: ErrorRamp() for name in self.shafts}
         self.counts.cycles_dropped += max(len(self._triggers) - self._next - 1, 0)
         self._triggers = TriggerQueue()
         self._next = 0
@@ -434,12 +445,29 @@ class StreamingAverager:
             if average is not None:
                 self._due.append((name, average))
                 self._recovered.learn(average)
+                self._look_at_errors(name, average)
         if failed:
             self.counts.cycles_dropped += 1
             self._messages.append(f'{failed}: trigger cycle discarded')
         self.counts.cycles += count
         self._speed = (self._speed[0] + count,
                        self._speed[1] + float(pulses[first + count] - pulses[first]))
+
+    def _look_at_errors(self, name: str, average: Average) -> None:
+        """Count the pulses that the correction of an average left out, and look for a ramp."""
+        ramp, settings = self._ramps[name], self.shafts[name].settings
+        before = ramp.doubt
+        ramp.update(average, ratio=settings.cycle_length / settings.revolutions_per_trigger)
+        if ramp.doubt and not before:
+            self._messages.append(f'{name}: the pulses come {ramp.doubt}')
+        correction = average.correction
+        if correction is not None and correction.refitted:
+            self.counts.pulses_refitted += correction.refitted
+            self._messages.append(
+                f'{correction.refitted} pulses from {average.start_time:.6f} s to '
+                f'{average.end_time:.6f} s have errors that no jitter explains: the correction '
+                'takes them for missing ones, the raw average does not; check the tach, and set '
+                'interval_tolerance to 0')
 
     def _discard(self, count: int, why: str) -> None:
         """Discard the next `count` cycles."""

@@ -143,6 +143,8 @@ class SynchronousAverager(MonitoringNode):
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
             self._cycles_per_second = speed / revolutions
+        for name, doubt in self._averager.doubts.items():
+            self.set_missing(f'pulses against the vibration of {name}', doubt)
         geometry = self._averager.geometry
         if geometry is not None and geometry is not self._geometry:
             self._target.publish(encode_geometry(geometry))
