@@ -42,8 +42,8 @@ CORE = {
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'pulses', 'recordings'},
     'offline': SCIENCE | {
-        'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'matplotlib',
-        'parameter_file', 'parameters', 'pulses', 'recordings', 'samples'},
+        'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop',
+        'matplotlib', 'parameter_file', 'parameters', 'pulses', 'recordings', 'samples'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib', 'prediction',
         'pulses', 'recordings'},

@@ -10,6 +10,7 @@
 
 """Many recordings: processes and workers that die, full disks, clusters that do not answer."""
 
+import csv
 import os
 from pathlib import Path
 import signal
@@ -17,9 +18,13 @@ import sys
 import time
 
 import pytest
+from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
+from sa_jitter_ros.recordings.npz_format import write_npz
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
 
 
 def work(job):
@@ -98,6 +103,38 @@ def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
         with pytest.raises(ParameterError, match='no answer within 1 s') as error:
             list(run_jobs(work, ['a'], scheduler=address))
         assert '\n' not in str(error.value)
+
+
+def test_loops_of_a_folder_have_a_report_and_a_row_each(tmp_path, capfd):
+    machine = Gearbox(mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6)), 5000.0, speed=((0.0, 25.0),),
+                      seed=3, effects=(DeclaredJitter('normal', 8e-5), AdditiveNoise(0.02)))
+    data, out = tmp_path / 'data', tmp_path / 'out'
+    data.mkdir()
+    write_npz(data / 'good.npz', Recording(
+        ArraySource(machine.vibration(0, 36_000)), 5000.0,
+        pulse_times=machine.pulses(0.0, 7.2).times))
+    (data / 'broken.npz').write_bytes(b'PK')
+    (tmp_path / 'model.yaml').write_text(
+        'jitter_predictor:\n  ros__parameters: {keyphasor_rate: 20000.0, trigger_speed: 25.0, '
+        'trigger_cycles: 20, orders: [8, 16, 24], noise_std: 0.02}\n')
+    command = [str(data), '--declared', str(tmp_path / 'model.yaml'), '--output', str(out),
+               '--quiet']
+    before, times = signal.getsignal(signal.SIGTERM), []
+    for _ in range(2):
+        assert close_loop.main(command) == 0
+        captured = capfd.readouterr()
+        assert captured.out == (
+            f'1 traced of 1 recording; 1 could not be used\ntable: {out}/loops.csv\n')
+        assert len(captured.err.splitlines()) == 1
+        times.append((out / 'good' / 'report.json').stat().st_mtime_ns)
+    signal.signal(signal.SIGTERM, before)
+    assert times[0] == times[1]
+    with (out / 'loops.csv').open(newline='') as file:
+        broken, good = csv.DictReader(file)
+    assert broken['error'].startswith(f'{data}/broken.npz: ')
+    assert good['verdict'] == 'traced'
+    assert good['missing_effects'].startswith('excess_jitter std ')
+    assert float(good['rms_after']) < float(good['rms_before'])
 
 
 @pytest.mark.processes

@@ -25,13 +25,11 @@ import sys
 
 from sa_jitter_ros.commands.command_line import (
     add_fleet_options, add_recording_options, Parser, read_options, require_writable, show)
+from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
-from sa_jitter_ros.offline.files import remove_unfinished
-from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
-from sa_jitter_ros.offline.processes import Failure
 from sa_jitter_ros.offline.settings import MachineFile
 from sa_jitter_ros.offline.tables import RECORDINGS, write_tables
 from sa_jitter_ros.recordings.fields import fields_of
@@ -64,10 +62,7 @@ def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     if machine.unknown:
         print(f'average: {options.params}: ignored, because synchronous_averager has no such '
               f'parameters: {", ".join(machine.unknown)}', file=sys.stderr)
-    found = find_recordings(options.recordings, leave_out=options.output)
-    if not found:
-        raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
-                             'folder: give one with .npz, .mat, .wav, .csv or rosbag2')
+    found = recordings_of(options)
     output = options.output.absolute()
     keywords, fields = read_options(options), tuple(fields_of(options.fields))
     return [AverageJob(
@@ -79,34 +74,18 @@ def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
 def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
     """Average the recordings and write the tables; raises SaJitterError, OSError."""
     jobs, rows = jobs_of(options)
-    for row in rows:
-        progress.say(row.error)
-    for job in jobs:
-        remove_unfinished(Path(job.folder))
 
     def alone(job: AverageJob) -> Row:
+        done = len(rows)
         return average_file(job, lambda share: progress.show(
             (done + share) / len(jobs), job.name if len(jobs) == 1 else
             f'{job.name}, {done} of {len(jobs)} done'))
 
-    done = 0
     in_this = not options.scheduler and options.jobs in (None, 1)
     try:
-        for job, result in run_jobs(alone if in_this else average_file, jobs,
-                                    processes=options.jobs or 1, scheduler=options.scheduler):
-            row = Row(job.name, job.path, str(result)) if isinstance(result, Failure) else result
-            done += 1
-            rows.append(row)
-            for remark in row.remarks:
-                progress.say(f'warning: {row.recording}: {remark}')
-            if row.error:
-                known = row.error.startswith(row.path)
-                progress.say(row.error if known else f'{row.path}: {row.error}')
-            progress.show(done / len(jobs), f'{done} of {len(jobs)} done')
-        for job in jobs:  # of workers that died
-            remove_unfinished(Path(job.folder))
+        work_through(alone if in_this else average_file, jobs, rows, failed=Row, options=options,
+                     progress=progress)
     finally:
-        progress.clear()
         if any(row.averages for row in rows):
             write_tables(options.output, rows)
     return rows

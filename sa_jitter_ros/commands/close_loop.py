@@ -14,21 +14,35 @@ Command `close_loop`: find which effects the declared jitter model of a machine 
 It compares the attenuation that recordings show with the one that the declared model predicts. If
 the residual is significant, it finds the effect that causes it. Errors are those of acquisitions
 that were not used for fitting.
+
+Several recordings are those of one machine and make one report. With a folder, --jobs or
+--scheduler each recording makes a report of its own, in a folder, with a row in loops.csv;
+recordings that were finished before are skipped.
 """
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+import os
 from pathlib import Path
+import signal
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, Parser, plain_warnings, read_options, require_writable, show)
-from sa_jitter_ros.declaration import read_declaration
-from sa_jitter_ros.errors import ParameterError, SaJitterError
+    add_fleet_options, add_recording_options, Parser, plain_warnings, read_options,
+    require_writable, show)
+from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
+from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.declaration import Declaration, read_declaration
+from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop
-from sa_jitter_ros.parameter_file import read_parameters
-from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
+from sa_jitter_ros.offline.files import write_rows
+from sa_jitter_ros.offline.fleet import is_folder
+from sa_jitter_ros.offline.loop_recording import loop_file, LoopJob, LoopRow, on_target
+from sa_jitter_ros.recordings import read
+
+LOOPS = 'loops.csv'
 
 
 def make_parser() -> Parser:
@@ -36,12 +50,14 @@ def make_parser() -> Parser:
     parser = Parser(prog='close_loop', description=__doc__,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='recordings of one machine: .npz, .mat, .wav, .csv or rosbag2')
+                        help='recordings of one machine: .npz, .mat, .wav, .csv or rosbag2; or '
+                        'folders of recordings')
     parser.add_argument('--declared', '--params', type=Path, required=True, metavar='MODEL.yaml',
                         help='ROS parameter file of jitter_predictor, or of the whole machine')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for report.json, report.html and the figures')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
+    add_fleet_options(parser)
     add_recording_options(parser)
     return parser
 
@@ -52,31 +68,67 @@ def run(options: argparse.Namespace) -> Loop:
         if not options.quiet:
             print(f'close_loop: {text}', file=sys.stderr, flush=True)
 
-    recordings = [_on_target(read(path, **read_options(options)), options.declared)
+    recordings = [on_target(read(path, **read_options(options)), options.declared)
                   for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
-    if declaration.unknown:
-        print(f'close_loop: {options.declared}: ignored, because jitter_predictor has no such '
-              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
+    _tell_unknown(options.declared, declaration)
     return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
                       progress=progress)
 
 
-def _on_target(recording: Recording, params: Path) -> Recording:
-    """Return a recording with the missing teeth that the machine file gives to the averager."""
+def _tell_unknown(path: Path, declaration: Declaration) -> None:
+    if declaration.unknown:
+        print(f'close_loop: {path}: ignored, because jitter_predictor has no such '
+              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
+
+
+def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
+    """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
+    _tell_unknown(options.declared, read_declaration(options.declared, sample_rate=1e9))
+    output, keywords = options.output.absolute(), read_options(options)
+    found = recordings_of(options)
+    jobs = [LoopJob(item.name, os.path.abspath(item.path), str(output / item.name),
+                    os.path.abspath(options.declared), keywords)
+            for item in found if not item.error]
+    rows = [LoopRow(item.name, str(item.path), item.error) for item in found if item.error]
     try:
-        averager = read_parameters(params, 'synchronous_averager')
-    except ParameterError:  # a file for jitter_predictor only
-        return recording
-    target = {name: averager[name] for name in ('pulses_per_revolution', 'missing_teeth')
-              if name in averager}
-    return recording if recording.missing_teeth or not target.get('missing_teeth') else replace(
-        recording, **target)
+        work_through(loop_file, jobs, rows, failed=LoopRow, options=options, progress=progress)
+    finally:
+        if any(row.verdict for row in rows):
+            write_rows(options.output / LOOPS, sorted(
+                rows, key=lambda row: (row.recording, row.path)))
+    return rows
+
+
+def _show_fleet(options: argparse.Namespace, progress: Progress) -> int:
+    """Close the loop on each recording; return the exit status."""
+    use_one_thread()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        require_writable(options.output)
+        rows = run_fleet(options, progress)
+    except (SaJitterError, OSError) as error:
+        progress.say(' '.join(str(error).split()))
+        return 2
+    except KeyboardInterrupt:
+        progress.say('stopped; what was finished stays, the same command goes on from there')
+        return 130
+    closed = [row for row in rows if row.verdict]
+    if not closed:
+        return 2
+    counts = Counter(row.verdict for row in closed)
+    failed = len(rows) - len(closed)
+    return show('close_loop', ', '.join(f'{count} {verdict}' for verdict, count in counts.items())
+                + f' of {len(closed)} recording{"s" * (len(closed) > 1)}'
+                + (f'; {failed} could not be used' if failed else ''),
+                f'table: {options.output / LOOPS}')
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)
+    if options.scheduler or options.jobs or any(map(is_folder, options.recordings)):
+        return _show_fleet(options, Progress('close_loop', quiet=options.quiet))
     try:
         require_writable(options.output)
         with plain_warnings('close_loop'):

@@ -23,8 +23,10 @@ from sa_jitter_ros.averaging.averager_parameters import gear_settings, streaming
 from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
+from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
-from sa_jitter_ros.offline.files import finished_together, read_about, Signals, write_averages
+from sa_jitter_ros.offline.files import (
+    finished_together, read_about, Signals, stamp, write_averages)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
@@ -189,16 +191,9 @@ def _row(values: Mapping[str, Any]) -> Row:
 
 def _settings(job: AverageJob) -> dict[str, Any]:
     """Return all that decides the files, as values of JSON; raises RecordingError."""
-    path = Path(job.path)
-    try:
-        files = [path] if not path.is_dir() else sorted(path.iterdir())
-        sizes = [[item.name, item.stat().st_size, item.stat().st_mtime_ns] for item in files]
-    except OSError as error:
-        raise RecordingError(f'{path}: {error.strerror}: check the path') from None
-    return {'version': _VERSION, 'files': sizes, 'figures': job.figures, 'path': job.path,
-            'averager': dict(job.machine.averager), 'detector': dict(job.machine.detector),
-            'options': {name: list(value) if isinstance(value, tuple) else value
-                        for name, value in job.options.items()}}
+    return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
+            'figures': job.figures, 'options': json_values(job.options),
+            'averager': dict(job.machine.averager), 'detector': dict(job.machine.detector)}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:

@@ -18,7 +18,7 @@ without a shaft: of the first one. `averages.csv` has a row for each average, ch
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 import csv
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 import json
 import os
 from pathlib import Path
@@ -27,6 +27,7 @@ import tempfile
 from typing import Any, TextIO
 
 import numpy as np
+from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.offline.series import ShaftSeries
 
@@ -113,8 +114,8 @@ def _typed(name: str, array: Any) -> Any:
 
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
-    fields = series[0]['order_amplitude_fields'].tolist()
-    writer.writerow([*_COLUMNS, *fields, 'channel_name'])
+    of_order = series[0]['order_amplitude_fields'].tolist()
+    writer.writerow([*_COLUMNS, *of_order, 'channel_name'])
     for item in series:
         header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
         for row, table in enumerate(item['order_amplitude']):
@@ -158,6 +159,31 @@ def join_tables(path: Path, folders: Sequence[Path], failures: Sequence[tuple[st
             writer.writerow([*columns, 'error'])
         for name, reason in failures:
             writer.writerow([name, *[''] * (len(columns) - 1), reason])
+
+    write_lines(path, lines)
+
+
+def stamp(path: Path) -> list[list[Any]]:
+    """
+    Return name, size and time of change (ns) of a file, or of all files of a bag.
+
+    Raises RecordingError for a file that is not there.
+    """
+    try:
+        files = sorted(path.iterdir()) if path.is_dir() else [path]
+        return [[item.name, item.stat().st_size, item.stat().st_mtime_ns] for item in files]
+    except OSError as error:
+        raise RecordingError(f'{path}: {error.strerror}: check the path') from None
+
+
+def write_rows(path: Path, rows: Sequence[Any]) -> None:
+    """Write dataclasses of one type as a table; raises OSError."""
+    def lines(file: TextIO) -> None:
+        writer = csv.writer(file, lineterminator='\n')
+        writer.writerow(item.name for item in fields(rows[0]))
+        for row in rows:
+            writer.writerow('; '.join(value) if isinstance(value, tuple) else value
+                            for value in asdict(row).values())
 
     write_lines(path, lines)
 

@@ -44,7 +44,7 @@ def find_recordings(paths: Sequence[Path], *, leave_out: Path | None = None) -> 
     names: dict[str, Path] = {}
     hidden = leave_out.resolve() if leave_out is not None else None
     for given in paths:
-        for path in _below(given, hidden) if _is_folder(given) else [given]:
+        for path in _below(given, hidden) if is_folder(given) else [given]:
             place = path.resolve()
             if place in found:
                 continue
@@ -58,7 +58,7 @@ def find_recordings(paths: Sequence[Path], *, leave_out: Path | None = None) -> 
     return tuple(found.values())
 
 
-def _is_folder(path: Path) -> bool:
+def is_folder(path: Path) -> bool:
     """Return whether a path is a folder of recordings, and no rosbag2 folder."""
     return path.is_dir() and not (path / 'metadata.yaml').exists()
 
@@ -67,7 +67,7 @@ def _below(folder: Path, hidden: Path | None) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if path.name.startswith('.') or path.resolve() == hidden:
             continue
-        if _is_folder(path):
+        if is_folder(path):
             yield from _below(path, hidden)
         elif path.is_dir() or path.suffix.lower() in SUFFIXES:
             yield path

@@ -11,13 +11,10 @@
 """The tables of a run: all rows of all recordings, and a row for each recording."""
 
 from collections.abc import Sequence
-import csv
-from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TextIO
 
 from sa_jitter_ros.offline.average_recording import Row
-from sa_jitter_ros.offline.files import join_tables, TABLE, write_lines
+from sa_jitter_ros.offline.files import join_tables, TABLE, write_rows
 
 RECORDINGS = 'recordings.csv'
 
@@ -32,12 +29,4 @@ def write_tables(output: Path, rows: Sequence[Row]) -> None:
     ordered = sorted(rows, key=lambda row: (row.recording, row.path))
     join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
                 [(row.recording, row.error) for row in ordered if row.error])
-
-    def lines(file: TextIO) -> None:
-        writer = csv.writer(file, lineterminator='\n')
-        writer.writerow(item.name for item in fields(Row))
-        for row in ordered:
-            values = {**asdict(row), 'remarks': '; '.join(row.remarks)}
-            writer.writerow(values.values())
-
-    write_lines(output / RECORDINGS, lines)
+    write_rows(output / RECORDINGS, ordered)

@@ -1,0 +1,122 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""One recording: its loop closed, by a function of a job that any process can do."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+import json
+import math
+from pathlib import Path
+from typing import Any
+import warnings
+
+from sa_jitter_ros.errors import DataWarning, ParameterError, SaJitterError
+from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.loop import close_loop, Loop
+from sa_jitter_ros.offline.files import stamp
+from sa_jitter_ros.parameter_file import read_parameters
+from sa_jitter_ros.recordings import read, Recording
+
+_VERSION = 1  # of the files: those of another one are written again
+_JOB = 'job.json'  # what a finished folder is of
+
+
+@dataclass(frozen=True)
+class LoopJob:
+    """One recording: `name` in the results, `path`, folder of its report, parameter file."""
+
+    name: str
+    path: str
+    folder: str
+    declared: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LoopRow:
+    """
+    What became of one recording: `error`, or `verdict` and what was found.
+
+    With several shafts the RMS errors are those of the worst one.
+    """
+
+    recording: str
+    path: str
+    error: str = ''
+    verdict: str = ''
+    missing_effects: tuple[str, ...] = ()
+    rms_before: float = math.nan
+    rms_after: float = math.nan
+    remarks: tuple[str, ...] = ()
+
+
+def on_target(recording: Recording, params: Path) -> Recording:
+    """Return a recording with the missing teeth that the machine file gives to the averager."""
+    try:
+        averager = read_parameters(params, 'synchronous_averager')
+    except ParameterError:  # a file for jitter_predictor only
+        return recording
+    target = {name: averager[name] for name in ('pulses_per_revolution', 'missing_teeth')
+              if name in averager}
+    return recording if recording.missing_teeth or not target.get('missing_teeth') else replace(
+        recording, **target)
+
+
+def loop_file(job: LoopJob) -> LoopRow:
+    """
+    Close the loop on one recording, unless that was done before with the same settings.
+
+    A recording that cannot be used gives a row with the reason. Raises OSError where the folder
+    cannot be written.
+    """
+    done = Path(job.folder, _JOB)
+    try:
+        settings = json_values({
+            'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
+            'declared': Path(job.declared).read_text(encoding='utf-8'), 'options': job.options})
+        found = _finished(done)
+        if found.get('settings') == settings:
+            values: dict[str, Any] = {
+                name: tuple(value) if isinstance(value, list) else
+                math.nan if value is None else value for name, value in found['row'].items()}
+            return LoopRow(**values)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter('always', DataWarning)
+            recording = on_target(read(job.path, **job.options), Path(job.declared))
+            loop = close_loop(recording, job.declared, names=[job.name])
+    except SaJitterError as error:
+        return LoopRow(job.name, job.path, error=str(error))
+    loop.write(job.folder)
+    row = _row(job, loop, tuple(' '.join(str(item.message).split()) for item in caught))
+    done.write_text(json.dumps(json_values({'settings': settings, 'row': asdict(row)}), indent=1,
+                               allow_nan=False) + '\n', encoding='utf-8')
+    return row
+
+
+def _finished(path: Path) -> Mapping[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _row(job: LoopJob, loop: Loop, remarks: tuple[str, ...]) -> LoopRow:
+    effects = [(f'{shaft}: ' if len(loop.shafts) > 1 else '') + effect['name'] + ''.join(
+        f' {name} {item["value"]:.4g} +- {item["standard_error"]:.2g} {item["unit"]}'.rstrip()
+        for name, item in effect['parameters'].items()
+        if item['value'] is not None and item['standard_error'] is not None)
+        for shaft, content in loop.shafts.items() for effect in content['missing_effects']]
+    before, after = (max((content[name]['rms'] for content in loop.shafts.values()
+                          if content[name]['rms'] is not None), default=math.nan)
+                     for name in ('error_before', 'error_after'))
+    return LoopRow(job.name, job.path, verdict=loop.verdict, missing_effects=tuple(effects),
+                   rms_before=before, rms_after=after, remarks=remarks)
