@@ -13,9 +13,15 @@
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.indicators import (
     condition_indicators, gear_lines, GearSettings, INDICATORS, RunningIndicators, separate)
+from sa_jitter_ros.averaging.jackknife import WaveformParts
+from sa_jitter_ros.averaging.streaming import StreamingAverager
+from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.validation import PulseValidator
+from sa_jitter_ros.samples import SampleBlock
 
 
 def cosines(points, amplitudes):
@@ -99,10 +105,11 @@ class TestValues:
     def test_values_computed_by_hand(self):
         average = np.array([[1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -3.0]])
         found = condition_indicators(average)
-        assert found['rms'][0] == pytest.approx(np.sqrt(16.0 / 8.0))
-        assert found['peak'][0] == 3.0
-        assert found['crest_factor'][0] == pytest.approx(3.0 / np.sqrt(2.0))
         # Mean -1/4: deviations 5/4 four times, -3/4 three times, -11/4 once.
+        rms = np.sqrt(248.0 / 16.0 / 8.0)
+        assert found['rms'][0] == pytest.approx(rms)
+        assert found['peak'][0] == pytest.approx(2.75)
+        assert found['crest_factor'][0] == pytest.approx(2.75 / rms)
         second = (4 * 25 + 3 * 9 + 121) / 16.0 / 8.0
         fourth = (4 * 625 + 3 * 81 + 14641) / 256.0 / 8.0
         assert found['kurtosis'][0] == pytest.approx(fourth / second**2)
@@ -188,7 +195,8 @@ class TestUndefined:
     def test_constants_and_pure_mesh_give_nan_where_nothing_remains(self):
         flat = condition_indicators(np.full((1, 64), 0.1), GearSettings([19]))
         assert np.isnan(flat.values[0, 3:]).all()
-        assert flat.values[0, :3] == pytest.approx([0.1, 0.1, 1.0])
+        assert flat.values[0, :2] == pytest.approx([0.0, 0.0], abs=1e-15)
+        assert np.isnan(flat.values[0, 2])
         silent = condition_indicators(np.zeros((1, 64)), GearSettings([19]))
         assert silent.values[0, :2].tolist() == [0.0, 0.0]
         assert np.isnan(silent.values[0, 2:]).all()
@@ -221,6 +229,35 @@ class TestHistory:
             fourth = (centred[-1]**4).mean(axis=-1)
             variance = (centred**2).mean(axis=(0, 2))
             assert found['na4'][last] == pytest.approx(fourth / variance**2, rel=1e-12)
+
+    def test_starred_indicators_divide_by_the_nominal_variance(self, rng):
+        """Damage makes na4 rise and then fall; na4_star goes on, and comes back with it."""
+        history = rng.normal(size=(34, 2, 256))
+        history[20:30] *= 3.0
+        found = condition_indicators(history, self.settings)
+        signals = separate(history, self.settings)
+        nominal = np.r_[0:20, 30:34]
+        for last in (19, 25, 33):
+            before = nominal[nominal <= last]
+            residual = signals.residual[before].var(axis=-1).mean(axis=0)
+            difference = signals.difference[before].var(axis=-1).mean(axis=0)
+            r, d = signals.residual[last], signals.difference[last]
+            assert found['na4_star'][last] == pytest.approx((r**4).mean(axis=-1) / residual**2)
+            assert found['m6a_star'][last] == pytest.approx((d**6).mean(axis=-1) / difference**3)
+            assert found['m8a_star'][last] == pytest.approx((d**8).mean(axis=-1) / difference**4)
+        assert np.all(found['na4'][29] < 0.5 * found['na4'][20])
+        assert np.all(found['na4_star'][29] > 0.5 * found['na4_star'][20])
+
+    def test_nb4_is_that_of_the_envelope_of_the_mesh(self):
+        """A cosine modulated by m cos(theta): its envelope 1 + m cos has the kurtosis 1.5."""
+        healthy = cosines(512, {20: 1.0, 3: 0.5})
+        angle = 2.0 * np.pi * np.arange(512) / 512
+        tone = np.cos(20 * angle) * (1.0 + 0.3 * np.cos(angle)) + healthy - cosines(512, {20: 1.0})
+        deeper = np.cos(20 * angle) * (1.0 + 0.6 * np.cos(angle))
+        found = condition_indicators(
+            np.stack((tone, deeper))[:, None], GearSettings([20, 40], sidebands=1))['nb4'][:, 0]
+        assert found[0] == pytest.approx(1.5, rel=1e-9)
+        assert found[1] == pytest.approx(1.5 * 0.6**4 / (0.5 * (0.3**2 + 0.6**2))**2, rel=1e-9)
 
     def test_na4_follows_the_level_where_kurtosis_does_not(self, rng):
         average = rng.normal(size=(1, 256))
@@ -255,6 +292,70 @@ class TestHistory:
         average = rng.normal(size=(2, 64))
         running.update(average)
         assert running.get().averages == 2
+
+
+class TestOffset:
+
+    def test_an_offset_changes_nothing(self, rng):
+        """As that of gravity in the channel of an Imu."""
+        average = rng.normal(size=(2, 128)) + cosines(128, {19: 2.0})
+        found = condition_indicators(average, GearSettings([19]))
+        with_gravity = condition_indicators(average + 9.81, GearSettings([19]))
+        assert with_gravity.values == pytest.approx(found.values, rel=1e-9)
+
+
+class TestStandardErrors:
+
+    def test_they_hold(self, rng):
+        """Of averages of parts of different size, from the ninth average on, with an offset."""
+        points, channels, noise = 256, 250, 0.1
+        counts = np.array([13.0, 14.0, 13.0])
+        wave = 3.0 + cosines(points, {19: 1.0, 38: 0.5, 18: 0.1, 20: 0.05, 1: 0.2})
+        running = RunningIndicators(GearSettings([19]))
+        z = []
+        for count in range(1, 12):
+            parts = wave + noise * rng.standard_normal((3, channels, points)) / np.sqrt(
+                counts[:, None, None])
+            running.update(np.tensordot(counts / counts.sum(), parts, axes=1),
+                           WaveformParts(counts, parts))
+            latest = running.get()
+            if count >= 9:
+                z.append((latest.values - latest.values.mean(axis=0)) / latest.standard_errors)
+        for width, wanted in ((1.0, 0.683), (1.96, 0.95)):
+            found = dict(zip(INDICATORS, np.mean(np.abs(z) < width, axis=(0, 1))))
+            for name in ('rms', 'peak', 'crest_factor', 'kurtosis', 'energy_ratio',
+                         'sideband_ratio', 'sideband_level_factor'):
+                limit = 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / (3 * channels))
+                assert found[name] == pytest.approx(wanted, abs=limit), name
+            for name in ('fm0', 'fm4', 'm6a', 'na4', 'na4_star', 'nb4', 'm6a_star', 'm8a_star'):
+                assert found[name] == pytest.approx(wanted, abs=0.18), name
+
+    def test_without_parts_there_are_none(self, rng):
+        running = RunningIndicators()
+        running.update(rng.normal(size=(1, 64)))
+        assert np.isnan(running.get().standard_errors).all()
+
+    @pytest.mark.parametrize('cycles', [7, 40, 1 << 60])
+    def test_an_average_has_parts_of_its_cycles(self, rng, cycles):
+        """Their mean is that of all; without a number of cycles they are of any size."""
+        settings = AverageSettings(keep_parts=True, trigger_cycles=cycles)
+        averager = StreamingAverager(
+            {'shaft': settings}, validator=PulseValidator(), keep_unfinished=True,
+            timeline=VibrationTimeline(buffer_seconds=100.0))
+        averager.add_pulses(np.arange(60) / 10.0)
+        found = averager.add_samples(SampleBlock(rng.normal(size=(2, 6000)), 0.0, 1000.0, 0))
+        found += averager.finish()
+        assert found
+        for _, average in found:
+            if average.trigger_cycles < min(cycles, 59):  # an unfinished block
+                continue
+            parts = average.parts
+            assert parts.counts.sum() == average.fundamental_cycles
+            assert parts.counts.max() <= 2 * parts.counts.min()
+            mean = np.tensordot(parts.counts / parts.counts.sum(), parts.waveforms, axes=1)
+            assert mean == pytest.approx(average.waveform, abs=1e-12)
+            assert parts.without_one(average.waveform)[0] == pytest.approx(np.average(
+                parts.waveforms[1:], axis=0, weights=parts.counts[1:]), abs=1e-12)
 
 
 class TestBadInput:

@@ -29,6 +29,7 @@ import math
 from math import pi
 
 import numpy as np
+from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy import fft, stats
 from scipy.special import erf
@@ -58,6 +59,9 @@ _MODEL = 2.5e-4
 _LOWEST_LIMIT = 0.5
 # Noise below this fraction of an amplitude is a rounding error.
 _ROUNDING = 1e-9
+# No limit is more than so many times the amplitude: jitter that leaves less leaves no information.
+_LEAST_LEFT = 0.02
+_U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -271,9 +275,12 @@ class Repeatability:
 
 
 def _left(turn: FloatArray) -> FloatArray:
-    """Return what normal jitter of `turn` (rad) leaves of an order in the mean."""
+    """Return what normal or uniform jitter, whichever takes more, of `turn` (rad) leaves."""
     turn = np.clip(turn, 1e-6, 5.0)
-    return np.asarray(np.exp(-0.25 * turn**2) * np.sqrt(pi) * erf(0.5 * turn) / turn)
+    normal = np.exp(-0.25 * turn**2) * np.sqrt(pi) * erf(0.5 * turn) / turn
+    width = np.sqrt(3.0) / pi * turn[:, None]  # of the uniform jitter in turns
+    uniform = (np.sinc(width * (1.0 - _U)) * np.sinc(width * _U)) @ _U_WEIGHT
+    return np.asarray(np.maximum(np.minimum(normal, uniform), _LEAST_LEFT))
 
 
 def corrected_errors(cycles: ComplexArray, clean: ComplexArray, orders: FloatArray, *,

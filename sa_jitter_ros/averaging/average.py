@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import AmplitudeErrors
+from sa_jitter_ros.averaging.jackknife import WaveformParts
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
 from sa_jitter_ros.pulses.angle_law import ANGLE_LAWS
@@ -41,7 +42,8 @@ class AverageSettings:
     `correct_jitter` the pulse errors are recovered from the vibration (block averages only). They
     are expected to be of the size that a keyphasor sampled at `keyphasor_rate` (Hz) causes; 0 is
     the sampling rate of the vibration. Up to `maximum_discarded` times N_t discarded trigger
-    cycles may lie between those of an average, if their number is known. Raises `ParameterError`
+    cycles may lie between those of an average, if their number is known. With `keep_parts` a block
+    average has the waveforms of parts of its cycles, too. Raises `ParameterError`
     for values that cannot be used.
     """
 
@@ -56,6 +58,7 @@ class AverageSettings:
     correct_jitter: bool = False
     keyphasor_rate: float = 0.0
     maximum_discarded: float = 0.0
+    keep_parts: bool = False
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -186,7 +189,8 @@ class Correction:
     (channel, order) is the raw over the corrected amplitude, NaN without an accepted correction.
     Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
     `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
-    corrected pulses. `amplitude_errors` say how far `amplitudes` are from the truth.
+    corrected pulses. `amplitude_errors` say how far `amplitudes` are from the truth, `parts` are
+    the waveforms of parts of the cycles, None unless `keep_parts` was set.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
     20.3 Hz. The correction recovers these errors except for their mean:
@@ -219,6 +223,7 @@ class Correction:
     attenuation_standard_error: FloatArray
     cycle_amplitudes: ComplexArray
     amplitude_errors: AmplitudeErrors
+    parts: WaveformParts | None = None
     jitter_std: float = math.nan
     refitted: int = 0
 
@@ -250,7 +255,8 @@ class Average:
     `cycle_amplitudes` (cycle, channel, order)
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
     angle as those of their mean. `amplitude_errors` say how well another average would repeat
-    `amplitudes`. `correction` is None unless `correct_jitter` was set.
+    `amplitudes`. `parts` are the waveforms of parts of the cycles, None unless `keep_parts` was
+    set. `correction` is None unless `correct_jitter` was set.
 
     A shaft at 25 Hz with an order 3 of amplitude 2 and phase 1 rad, in a single channel:
 
@@ -286,6 +292,7 @@ class Average:
     cycle_numbers: NDArray[np.int64]
     cycle_amplitudes: ComplexArray
     amplitude_errors: AmplitudeErrors
+    parts: WaveformParts | None = None
     correction: Correction | None = None
 
     @property

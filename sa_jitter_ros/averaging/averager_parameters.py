@@ -104,7 +104,7 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
     try:
         return keyphasor_parameters(values).average(
             ratio=ratio, orders=values[f'{name}.orders'],
-            samples_per_revolution=values[f'{name}.samples_per_revolution'],
+            samples_per_revolution=values[f'{name}.samples_per_revolution'], keep_parts=True,
             **{key: values[key] for key in (
                 'trigger_cycles', 'averaging', 'angle_law', 'interpolation', 'correct_jitter',
                 'keyphasor_rate', 'maximum_discarded')})

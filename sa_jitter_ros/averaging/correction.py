@@ -163,7 +163,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
             cycles_again, _clean(raw, cycles_again, settings), raw.orders, amplitudes=amplitudes,
             unsure=unsure, largest=whole, jitter=_in_cycles(recovery.std, raw, settings)),
-        recovery.std, refitted)
+        corrected.parts, recovery.std, refitted)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
@@ -336,7 +336,7 @@ def _uncorrected(raw: Average, reason: str) -> Correction:
     return Correction(
         raw.waveform, raw.amplitudes, raw.noise, np.zeros(len(raw.pulses)),
         np.full(len(raw.pulses), np.nan), False, reason, unknown, unknown, raw.cycle_amplitudes,
-        AmplitudeErrors.unknown(raw.amplitudes.shape))
+        AmplitudeErrors.unknown(raw.amplitudes.shape), raw.parts)
 
 
 def _between(raw: Average, cycles: Sequence[CycleSamples], pulses: FloatArray

@@ -24,48 +24,75 @@ of the shaft only, so "shaft harmonics" means the first few; two are customary. 
 introduced these signals; Lebold et al., "Review of vibration analysis methods for gearbox
 diagnostics and prognostics", 54th MFPT (2000), says which indicator uses which signal.
 
-``x`` is the average, ``d`` the difference and ``r`` the residual signal, ``s(.)`` a standard
-deviation over one revolution (divisor n), ``mk(.)`` a central moment over one revolution and
-``A`` are peak amplitudes of orders. In the order of `INDICATORS`::
+``x`` is the average without its mean, ``d`` the difference and ``r`` the residual signal, ``e``
+the envelope of the lowest mesh order with the orders around it up to half its number of teeth
+away, ``s(.)`` a standard deviation over one revolution (divisor n), ``mk(.)`` a central moment
+over one revolution and ``A`` are peak amplitudes of orders. ``all`` is the mean over all averages
+so far, ``nominal`` that over the averages of the undamaged gear. In the order of `INDICATORS`::
 
-    rms, peak, crest_factor   sqrt(mean x^2); max |x|; peak / rms. An offset of x counts.
+    rms, peak, crest_factor   sqrt(mean x^2); max |x|; peak / rms
     kurtosis                  m4(x) / s(x)^4; 3 for Gaussian noise. Dyer and Stewart (1978)
     fm0                       (max x - min x) / sum of A over all mesh harmonics. Stewart (1977)
     fm4                       m4(d) / s(d)^4; 3 for Gaussian noise. Stewart (1977)
     m6a, m8a                  m6(d) / s(d)^6, m8(d) / s(d)^8; 15 and 105 for Gaussian noise.
                               Martin (1989)
-    na4                       m4(r) / (mean of s(r)^2 over all averages so far)^2: grows on with
-                              the damage. Zakrajsek, Townsend, Decker (1993)
+    na4                       m4(r) / (all s(r)^2)^2: grows on with the damage. Zakrajsek,
+                              Townsend, Decker (1993), NASA TM-105950
     energy_ratio              s(d) / s(regular signal). Swansson (1980)
     sideband_ratio            sum of A over the sidebands of the mesh orders / sum of A over the
                               mesh orders. Hanna, Hatch, Kalb, Weiss, Luo (2011), with as many
                               pairs as `GearSettings.sidebands` says (they take 6)
     sideband_level_factor     sum of A over the first sidebands of the mesh orders / s(x).
                               Vecer, Kreidl, Smid (2005)
+    na4_star                  m4(r) / (nominal s(r)^2)^2: na4 falls again when the damage has
+                              spread, because all s(r)^2 grow. Decker, Handschuh, Zakrajsek (1994),
+                              NASA TM-106553
+    nb4                       m4(e) / (all s(e)^2)^2. Zakrajsek, Handschuh, Decker (1994), NASA
+                              TM-106467
+    m6a_star, m8a_star        m6(d) / (nominal s(d)^2)^3, m8(d) / (nominal s(d)^2)^4: normalised as
+                              na4_star is. Decker (2002), NASA TM-2002-211492
+
+An average counts as nominal unless its variance is more than 3 standard deviations above the mean
+of the nominal ones before it; the first 8 do. Decker et al. choose the limit by a probability.
 
 Overviews: Lebold et al. (2000); Vecer, Kreidl, Smid, "Condition indicators for gearbox condition
 monitoring systems", Acta Polytechnica 45 (2005). A value is NaN where its denominator is zero
 within rounding (a constant signal for example). Without mesh orders all from fm0 on are NaN.
+
+Standard errors are by the jackknife over parts of the cycles of an average (`jackknife.py`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sa_jitter_ros.averaging.amplitude_errors import widened
+from sa_jitter_ros.averaging.jackknife import jackknife_variance, PARTS, WaveformParts
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 Array = NDArray[Any]
 
 INDICATORS: tuple[str, ...] = (
     'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',
-    'energy_ratio', 'sideband_ratio', 'sideband_level_factor')
+    'energy_ratio', 'sideband_ratio', 'sideband_level_factor', 'na4_star', 'nb4', 'm6a_star',
+    'm8a_star')
 
 # Fraction of the peak of the average, below which a value is a rounding error.
 _ROUNDING = 1e-13
 # Far above the range of any sensor; its square is far from overflow.
 _LARGEST_SAMPLE = 1e100
+# Averages that are nominal in any case, and standard deviations above their mean up to which
+# further ones are.
+_FIRST_NOMINAL, _NOMINAL = 8, 3.0
+# Averages over which the variance by the jackknife is smoothed: one alone has two degrees of
+# freedom.
+_SMOOTHED = 8
+# Points of the envelope in a period of its highest order.
+_ENVELOPE_POINTS = 8
+_CACHED = 1 << 14  # numbers
 
 
 @dataclass(frozen=True)
@@ -123,16 +150,19 @@ class GearSignals:
     """
     The gear signals of an average, of its shape (..., n), and the peak amplitudes of its orders.
 
-    `amplitudes` (..., n//2 + 1) is indexed by order and by the masks of `lines`.
+    `amplitudes` and the complex `spectrum` (numpy.fft.rfft), both (..., n//2 + 1), are indexed by
+    order and by the masks of `lines`.
     """
 
     regular: Array
     residual: Array
     difference: Array
     amplitudes: Array
+    spectrum: Array
     lines: GearLines
 
 
+@lru_cache(maxsize=16)
 def gear_lines(settings: GearSettings, points: int) -> GearLines:
     """
     Return the kinds of orders of an average with so many points.
@@ -198,7 +228,8 @@ def separate(average: ArrayLike, settings: GearSettings) -> GearSignals:
     return GearSignals(
         regular=samples - difference,
         residual=difference + np.fft.irfft(np.where(lines.sidebands, spectrum, 0.0), points),
-        difference=difference, amplitudes=weight * np.abs(spectrum), lines=lines)
+        difference=difference, amplitudes=weight * np.abs(spectrum),
+        spectrum=spectrum, lines=lines)
 
 
 @dataclass(frozen=True)
@@ -207,11 +238,13 @@ class ConditionIndicators:
     Condition indicators in the order of `names`: `values` (..., indicator), NaN where undefined.
 
     The leading dimensions are the average's: (channel, indicator) or (average, channel,
-    indicator). `averages` is the number of averages on which na4 is based.
+    indicator). `averages` is the number of averages on which na4 is based. `standard_errors` are
+    those of the values, NaN without parts of the average.
     """
 
     values: Array
     averages: int
+    standard_errors: Array
     names: tuple[str, ...] = INDICATORS
 
     def __getitem__(self, name: str) -> Array:
@@ -221,7 +254,7 @@ class ConditionIndicators:
 
 class RunningIndicators:
     """
-    Condition indicators of one average after another, with the history that na4 needs.
+    Condition indicators of one average after another, with the history that some of them need.
 
     The result after each update equals that of `condition_indicators` for all averages so far.
 
@@ -238,25 +271,44 @@ class RunningIndicators:
     def __init__(self, settings: GearSettings | None = None) -> None:
         """Start without history."""
         self._settings = settings or GearSettings()
-        self._variance_sum: Array = np.zeros(0)
-        self._latest = ConditionIndicators(np.zeros((0, len(INDICATORS))), 0)
+        self._history = _History()
+        self._variance: Array = np.zeros(0)
+        self._jackknifed = 0
+        empty = np.zeros((0, len(INDICATORS)))
+        self._latest = ConditionIndicators(empty, 0, empty)
 
-    def update(self, average: ArrayLike) -> None:
+    def update(self, average: ArrayLike, parts: WaveformParts | None = None) -> None:
         """
-        Take the next average, (channels, n).
+        Take the next average, (channels, n), and the `parts` of its cycles for standard errors.
 
         Raises SignalError and ParameterError as `condition_indicators` does, and SignalError if
         the number of channels changes. After an error the history is unchanged.
         """
         samples = np.asarray(average, float)
-        count = self._latest.averages
-        if samples.ndim != 2 or (count > 0 and samples.shape[0] != self._variance_sum.size):
-            expected = self._variance_sum.size if count else 'any number of'
+        count, channels = self._latest.averages, len(self._latest.values)
+        if samples.ndim != 2 or (count > 0 and samples.shape[0] != channels):
+            expected = channels if count else 'any number of'
             raise SignalError(f'average of shape {samples.shape}: expected {expected} channels x '
                               'points; make new RunningIndicators when the channels change')
-        values, self._variance_sum = _indicators(
-            samples[None], self._settings, count, self._variance_sum if count else np.zeros(()))
-        self._latest = ConditionIndicators(values[0], count + 1)
+        replicates = () if parts is None else parts.without_one(samples)
+        moments = _moments(np.stack((samples, *replicates)), self._settings)
+        if parts is not None:
+            moments = moments.levelled(parts.counts)
+        values = self._history.take(moments, self._settings)
+        error = np.full(values[0].shape, np.nan)
+        if parts is not None and len(replicates):
+            error = self._smoothed(jackknife_variance(values[0], values[1:], parts.counts))
+        self._latest = ConditionIndicators(values[0], count + 1, error)
+
+    def _smoothed(self, variance: Array) -> Array:
+        """Return the standard error from the variances of this average and of those before."""
+        if not self._jackknifed:
+            self._variance = variance
+        self._jackknifed += 1
+        share = max(1.0 / self._jackknifed, 1.0 / _SMOOTHED)
+        change = variance - self._variance
+        self._variance = np.where(np.isfinite(change), self._variance + share * change, variance)
+        return widened(np.sqrt(self._variance), (PARTS - 1.0) / share)
 
     def get(self) -> ConditionIndicators:
         """Return the indicators of the latest average; before the first one, of no channel."""
@@ -269,10 +321,10 @@ def condition_indicators(
     """
     Return the condition indicators of one average or of a history of averages.
 
-    `average` is (channels, n), or (averages, channels, n) from the oldest to the latest. na4 uses
-    an average and those before it; of a single average it is the kurtosis of the residual signal.
-    Raises SignalError for another shape or samples that are not finite, ParameterError for a mesh
-    order at or above the Nyquist order n/2.
+    `average` is (channels, n), or (averages, channels, n) from the oldest to the latest. na4 and
+    those that end in _star or b4 use an average and those before it; of a single average na4 is
+    the kurtosis of the residual signal. Raises SignalError for another shape or samples that are
+    not finite, ParameterError for a mesh order at or above the Nyquist order n/2.
 
     A sine has the kurtosis 1.5. A pulse in one place of the revolution, as of a damaged tooth,
     raises the indicators of the difference signal:
@@ -288,60 +340,201 @@ def condition_indicators(
     if samples.ndim not in (2, 3):
         raise SignalError(f'average of shape {samples.shape}: give channels x points, or '
                           'averages x channels x points')
-    history = samples if samples.ndim == 3 else samples[None]
-    values, _ = _indicators(history, settings or GearSettings(), 0, np.zeros(()))
-    return ConditionIndicators(values if samples.ndim == 3 else values[0], len(history))
+    settings = settings or GearSettings()
+    moments = _moments(samples if samples.ndim == 3 else samples[None], settings)
+    history = _History()
+    values = np.concatenate([history.take(moments.part(i), settings)
+                             for i in range(len(moments.peak))])
+    if samples.ndim == 2:
+        values = values[0]
+    return ConditionIndicators(values, len(moments.peak), np.full(values.shape, np.nan))
 
 
-def _indicators(
-    history: Array, settings: GearSettings, count: int, variance_sum: Array,
-) -> tuple[Array, Array]:
+class _Moments(NamedTuple):
     """
-    Return the values of (averages, channels, n), and the new sum of residual variances.
+    What the indicators of an average need, each an array (average, channel).
 
-    `variance_sum` is that of the `count` averages before these.
+    `own` (average, channel, indicator) are those that need no other average. `peak` is that of the
+    samples, by which all signals are divided before powers are taken; `residual`, `difference` and
+    `envelope` are the variances of these signals, divided by peak^2, with the central moments of
+    the named orders, divided by its powers.
     """
-    signals = separate(history, settings)
+
+    own: Array
+    peak: Array
+    residual: Array
+    residual_4: Array
+    difference: Array
+    difference_6: Array
+    difference_8: Array
+    envelope: Array
+    envelope_4: Array
+
+    def part(self, index: int) -> '_Moments':
+        """Return those of one average."""
+        return _Moments(*(item[index:index + 1] for item in self))
+
+    def levelled(self, counts: Array) -> '_Moments':
+        """
+        Return the moments of an average and of it without one part each, with the same noise.
+
+        `counts` (part,) is the number of cycles in each part. The mean of fewer cycles has more
+        noise, which m8a_star would show with its eighth power.
+        """
+        more = counts / (counts.sum() - counts)
+
+        def level(variance: Array) -> Array:
+            own = variance * self.peak**2
+            noise = np.clip((own[1:].mean(axis=0) - own[0]) / more.mean(), 0.0, own[0])
+            expected = own[0] + more[:, None] * noise
+            share = own[0] / np.maximum(expected, np.finfo(float).tiny)
+            return np.concatenate((np.ones((1, *share.shape[1:])), share))
+
+        residual, difference = level(self.residual), level(self.difference)
+        values = self.own.copy()
+        values[..., INDICATORS.index('energy_ratio')] *= np.sqrt(difference)
+        return self._replace(
+            own=values, residual=self.residual * residual,
+            residual_4=self.residual_4 * residual**2, difference=self.difference * difference,
+            difference_6=self.difference_6 * difference**3,
+            difference_8=self.difference_8 * difference**4)
+
+
+def _mean_product(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum('...i,...i->...', a, b) / a.shape[-1])
+
+
+def _moments(samples: Array, settings: GearSettings) -> _Moments:
+    """Return the moments of averages (average, channel, n)."""
+    together = max(_CACHED // max(samples[:, :1].size, 1), 1)
+    parts = [_moments_together(samples[:, first:first + together], settings)
+             for first in range(0, max(samples.shape[1], 1), together)]
+    return _Moments(*(np.concatenate(items, axis=1) for items in zip(*parts)))
+
+
+def _moments_together(samples: Array, settings: GearSettings) -> _Moments:
+    """Return the moments of averages of some channels, few enough for the cache."""
+    signals = separate(samples, settings)
     lines = signals.lines
-    peak = np.abs(history).max(axis=-1)
+    largest, smallest = samples.max(axis=-1), samples.min(axis=-1)
+    peak = np.maximum(np.maximum(largest, -smallest), np.sqrt(np.finfo(float).tiny))
+    mean = samples.mean(axis=-1)
 
     def defined(denominator: Array) -> Array:
-        return np.where(denominator > _ROUNDING * peak, denominator, np.nan)
-
-    def squares(signal: Array, deviation: Array) -> Array:
-        centred = signal - signal.mean(axis=-1, keepdims=True)
-        return np.asarray(np.square(centred / defined(deviation)[..., None]))
-
-    def mean_product(a: Array, b: Array) -> Array:
-        return np.asarray(np.einsum('...i,...i->...', a, b) / a.shape[-1])
+        return np.where(denominator > _ROUNDING, denominator, np.nan)
 
     def amplitude_sum(mask: Array) -> Array:
-        return np.asarray(signals.amplitudes[..., mask].sum(axis=-1) if mask.any()
+        return np.asarray(signals.amplitudes[..., mask].sum(axis=-1) / peak if mask.any()
                           else np.full(peak.shape, np.nan))
 
-    rms = np.sqrt(mean_product(history, history))
-    deviation = history.std(axis=-1)
-    square = squares(history, deviation)
-    difference_deviation = signals.difference.std(axis=-1)
-    difference_square = squares(signals.difference, difference_deviation)
-    difference_fourth = np.square(difference_square)
-    variance_sums = variance_sum + np.cumsum(signals.residual.var(axis=-1), axis=0)
-    counts = np.arange(count + 1, count + 1 + len(history))[:, None]
-    residual_square = squares(signals.residual, np.sqrt(variance_sums / counts))
-    values = np.stack([
-        rms,
-        peak,
-        peak / defined(rms),
-        mean_product(square, square),
-        np.ptp(history, axis=-1) / defined(amplitude_sum(lines.mesh)),
-        difference_fourth.mean(axis=-1),
-        mean_product(difference_fourth, difference_square),
-        mean_product(difference_fourth, difference_fourth),
-        mean_product(residual_square, residual_square),
-        difference_deviation / defined(signals.regular.std(axis=-1)),
+    def squares(signal: Array) -> Array:
+        scaled = signal / peak[..., None]
+        return np.asarray(np.square(scaled, out=scaled))
+
+    square = squares(samples - mean[..., None])
+    rms = np.sqrt(square.mean(axis=-1))
+    farthest = np.maximum(largest - mean, mean - smallest) / peak
+    fourth = _mean_product(square, square)
+    square = squares(signals.residual)
+    residual, residual_4 = square.mean(axis=-1), _mean_product(square, square)
+    square = squares(signals.difference)
+    difference = square.mean(axis=-1)
+    power = np.square(square)
+    deviation = defined(np.sqrt(difference))
+    difference_6, difference_8 = _mean_product(power, square), _mean_product(power, power)
+    envelope = _mesh_envelope(signals.spectrum, samples.shape[-1], settings)
+    square = squares(envelope - envelope.mean(axis=-1, keepdims=True))
+    regular = np.sqrt(np.maximum(rms**2 - difference, 0.0))
+    unknown = np.full(peak.shape, np.nan)
+    own = np.stack([
+        rms * peak,
+        farthest * peak,
+        farthest / defined(rms),
+        fourth / defined(rms) ** 4,
+        (largest - smallest) / peak / defined(amplitude_sum(lines.mesh)),
+        power.mean(axis=-1) / deviation**4,
+        difference_6 / deviation**6,
+        difference_8 / deviation**8,
+        unknown,
+        np.sqrt(difference) / defined(regular),
         amplitude_sum(lines.fundamental_sidebands) / defined(amplitude_sum(lines.fundamentals)),
-        amplitude_sum(lines.first_sidebands) / defined(deviation),
+        amplitude_sum(lines.first_sidebands) / defined(rms),
+        unknown, unknown, unknown, unknown,
     ], axis=-1)
+    return _Moments(own, peak, residual, residual_4, difference, difference_6, difference_8,
+                    square.mean(axis=-1), _mean_product(square, square))
+
+
+def _mesh_envelope(spectrum: Array, points: int, settings: GearSettings) -> Array:
+    """Return the envelope (..., angle) of the lowest mesh order and those around it."""
     if not settings.mesh_orders:
-        values[..., INDICATORS.index('fm0'):] = np.nan
-    return values, variance_sums[-1]
+        return np.full((*spectrum.shape[:-1], 1), np.nan)
+    mesh = min(int(order) for order in settings.mesh_orders)
+    reach = min(mesh // 2, mesh - 1, (points - 1) // 2 - mesh)
+    band = np.zeros((*spectrum.shape[:-1], _ENVELOPE_POINTS * (2 * reach + 1)), complex)
+    band[..., :2 * reach + 1] = spectrum[..., mesh - reach:mesh + reach + 1]
+    return np.asarray(np.abs(np.fft.ifft(band)) * (2.0 * band.shape[-1] / points))
+
+
+class _Reference:
+    """The mean of a variance over averages, all or the nominal ones, of each channel."""
+
+    def __init__(self, nominal: bool) -> None:
+        self._nominal = nominal
+        self._count: Array = np.zeros(())
+        self._mean: Array = np.zeros(())
+        self._squares: Array = np.zeros(())
+
+    def take(self, variance: Array) -> Array:
+        """
+        Take the variance of the next average; return the reference with it.
+
+        `variance` (replicate, channel) is that of the average and of replicates of it, for each of
+        which the reference is returned; the first counts.
+        """
+        counts = np.ones(variance.shape[1:], bool)
+        if self._nominal:
+            scatter = np.sqrt(self._squares / np.maximum(self._count - 1.0, 1.0))
+            counts = (self._count < _FIRST_NOMINAL) | (
+                variance[0] <= self._mean + _NOMINAL * scatter)
+        count = self._count + counts
+        step = np.where(counts, variance - self._mean, 0.0)
+        mean = self._mean + step / np.maximum(count, 1.0)
+        self._squares = self._squares + step[0] * (variance[0] - mean[0])
+        self._count, self._mean = count, mean[0]
+        return np.asarray(mean)
+
+
+class _History:
+    """What indicators need of earlier averages."""
+
+    def __init__(self) -> None:
+        self._residual, self._envelope = _Reference(False), _Reference(False)
+        self._nominal_residual, self._nominal_difference = _Reference(True), _Reference(True)
+
+    def take(self, moments: _Moments, settings: GearSettings) -> Array:
+        """
+        Return the indicators (replicate, channel, indicator) of the next average.
+
+        The first replicate is the average itself.
+        """
+        scale = moments.peak**2
+
+        def over(moment: Array, reference: Array, power: int) -> Array:
+            share = reference / scale
+            return np.asarray(moment / np.where(share > _ROUNDING**2, share, np.nan) ** power)
+
+        values = moments.own.copy()
+        residual, difference = moments.residual * scale, moments.difference * scale
+        nominal = self._nominal_difference.take(difference)
+        envelope = self._envelope.take(moments.envelope * scale)
+        for name, found in (
+                ('na4', over(moments.residual_4, self._residual.take(residual), 2)),
+                ('na4_star', over(moments.residual_4, self._nominal_residual.take(residual), 2)),
+                ('nb4', over(moments.envelope_4, envelope, 2)),
+                ('m6a_star', over(moments.difference_6, nominal, 3)),
+                ('m8a_star', over(moments.difference_8, nominal, 4))):
+            values[..., INDICATORS.index(name)] = found
+        if not settings.mesh_orders:
+            values[..., INDICATORS.index('fm0'):] = np.nan
+        return values

@@ -19,7 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
-from sa_jitter_ros.averaging.indicators import GearSettings, INDICATORS, RunningIndicators
+from sa_jitter_ros.averaging.indicators import GearSettings, RunningIndicators
+from sa_jitter_ros.averaging.jackknife import WaveformParts
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 FloatArray = NDArray[np.float64]
@@ -82,7 +83,8 @@ class ShaftResults:
         Return the arrays of the next average by the names of their topics.
 
         `corrected_average` and `pulse_error` are there if the correction was accepted,
-        `condition_indicator` if the waveform is finite and the mesh orders are in it.
+        `condition_indicator` and `condition_indicator_error` if the waveform is finite and the
+        mesh orders are in it.
         """
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
@@ -97,24 +99,27 @@ class ShaftResults:
             found['pulse_error'] = AverageMessage(header, np.stack(
                 (average.pulses, correction.pulse_errors, correction.standard_errors,
                  average.used), axis=1), PULSE_ERROR_FIELDS)
-        waveform = average.waveform if correction is None else correction.waveform
+        source = average if correction is None else correction
         self.problem = ''
-        if np.isfinite(waveform).all():
-            found |= self._indicate(header, waveform)
+        if np.isfinite(source.waveform).all():
+            found |= self._indicate(header, source.waveform, source.parts)
         return found
 
-    def _indicate(self, header: AverageHeader, waveform: FloatArray) -> dict[str, AverageMessage]:
+    def _indicate(self, header: AverageHeader, waveform: FloatArray, parts: WaveformParts | None
+                  ) -> dict[str, AverageMessage]:
         """Return the condition indicators of a waveform, none where it lacks a mesh order."""
         try:
-            self._indicators.update(waveform)
+            self._indicators.update(waveform, parts)
         except SignalError:  # the number of channels has changed
             self._indicators = RunningIndicators(self._gear)
-            self._indicators.update(waveform)
+            self._indicators.update(waveform, parts)
         except ParameterError as error:
             self.problem = str(error)
             return {}
-        return {'condition_indicator': AverageMessage(
-            header, self._indicators.get().values, INDICATORS)}
+        found = self._indicators.get()
+        return {'condition_indicator': AverageMessage(header, found.values, found.names),
+                'condition_indicator_error': AverageMessage(
+                    header, found.standard_errors, found.names)}
 
 
 def amplitude_table(average: Average) -> FloatArray:

@@ -123,6 +123,66 @@ class BlockMean:
         return np.asarray(np.sqrt(self._squares / (self.count - 1) / self.count))
 
 
+class PartsMean(BlockMean):
+    """
+    Mean of all arrays that also keeps the means of consecutive parts of them.
+
+    It keeps from `least` to twice as many parts of equal size, and the rest in one more; the size
+    begins at `size` and doubles when there are too many.
+
+    >>> mean = PartsMean(size=1, least=2)
+    >>> mean.update(np.arange(9.0)[:, None])
+    >>> [(part.count, part.mean.tolist()) for part in mean.parts()]
+    [(4, [1.5]), (4, [5.5]), (1, [8.0])]
+    >>> mean.mean, mean.count
+    (array([4.]), 9)
+    """
+
+    def __init__(self, *, size: int, least: int) -> None:
+        super().__init__()
+        self._size, self._least = size, least
+        self._parts: list[BlockMean] = []
+
+    def update(self, values: Array) -> None:
+        """Take one or more arrays (cycle, ...), at least one."""
+        self.count += len(values)
+        while len(values):
+            if not self._parts or self._parts[-1].count == self._size:
+                if len(self._parts) == 2 * self._least:
+                    self._double()
+                self._parts.append(BlockMean())
+            room = self._size - self._parts[-1].count
+            self._parts[-1].update(values[:room])
+            values = values[room:]
+
+    def _double(self) -> None:
+        for first, second in zip(self._parts[::2], self._parts[1::2]):
+            first.merge(second)
+        del self._parts[1::2]
+        self._size *= 2
+
+    def parts(self) -> list[BlockMean]:
+        """Return the parts, whose means must not be changed."""
+        return self._parts
+
+    def together(self) -> BlockMean:
+        """Return the mean of all parts."""
+        total = BlockMean()
+        for part in self._parts:
+            total.merge(part)
+        return total
+
+    @property
+    def mean(self) -> Array:
+        """Mean so far."""
+        return self.together().mean
+
+    @property
+    def standard_error(self) -> FloatArray:
+        """Return the standard error of the mean; NaN below two arrays."""
+        return self.together().standard_error
+
+
 class SlidingMean:
     """
     Mean of the latest arrays; the caller drops the oldest ones with `forget`.

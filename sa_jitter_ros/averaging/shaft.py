@@ -29,15 +29,18 @@ from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleSamples, exact_cycles, first_points, grid_points, joined,
     needed_margin, on_grid, project, waveform_cutoff)
+from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
-from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, RunningMean,
-                                                  SlidingMean)
+from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, PartsMean,
+                                                  RunningMean, SlidingMean)
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+# Cycles from which on it is not known how many come.
+_ALL_CYCLES = 1 << 40
 #: Samples times channels that are averaged together.
 TOGETHER = 1 << 18
 
@@ -242,7 +245,7 @@ class ShaftAverager:
         self._waiting_size = 0  # samples times channels
         self._noise: tuple[FloatArray, Repeatability] | None = None
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
-        self._wave_mean = self._new_mean(max(settings.trigger_cycles * settings.cycle_length, 1.0))
+        self._wave_mean = self._new_wave_mean()
         self._amplitudes: ComplexArray = np.empty((0, 0, 0), np.complex128)
         self._end = 0  # of those of cycles in `_amplitudes`
         # Of the latest N_t cycles: their pulses, and their numbers since the angle was 0.
@@ -279,6 +282,14 @@ class ShaftAverager:
         if self.settings.averaging == 'sliding':
             return SlidingMean()
         return BlockMean()
+
+    def _new_wave_mean(self) -> RunningMean:
+        settings = self.settings
+        cycles = max(settings.trigger_cycles * settings.cycle_length, 1.0)
+        if not settings.keep_parts or settings.averaging != 'block':
+            return self._new_mean(cycles)
+        size = max(int(cycles / PARTS), 1) if cycles < _ALL_CYCLES else 1
+        return PartsMean(size=size, least=PARTS)
 
     def _expect_from(self, angle: Fraction) -> None:
         """Begin with the first fundamental cycle that is whole from this angle on."""
@@ -337,9 +348,12 @@ class ShaftAverager:
         settings = self.settings
         shape = self._wave.shape
         count = self._wave_mean.count
-        waveform, error = np.full(shape, np.nan), np.full(shape, np.nan)
+        waveform, error, parts = np.full(shape, np.nan), np.full(shape, np.nan), None
         if count:
-            waveform, error = self._wave_mean.mean, self._wave_mean.standard_error
+            total = self._wave_mean
+            if isinstance(total, PartsMean):
+                parts, total = waveform_parts(total.parts()), total.together()
+            waveform, error = total.mean, total.standard_error
         if settings.averaging == 'exponential':
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
@@ -357,7 +371,7 @@ class ShaftAverager:
             first_angle=float(self._angle(self._numbers[0])), pulses=pulses, used=used,
             cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles,
             amplitude_errors=scatter.errors(
-                amplitudes, settings.declared_jitter(seconds / numbers.size)))
+                amplitudes, settings.declared_jitter(seconds / numbers.size)), parts=parts)
         self._sequence += 1
         return average
 

@@ -30,7 +30,8 @@ class ShaftOutput:
         self._publishers: dict[str, Publisher] = {
             kind: node.create_output(Float64MultiArray, f'{name}/{kind}')
             for kind in ('synchronous_average', 'standard_error', 'order_amplitude',
-                         'condition_indicator', 'corrected_average', 'pulse_error')}
+                         'condition_indicator', 'condition_indicator_error', 'corrected_average',
+                         'pulse_error')}
         self._results = ShaftResults()
         self.published = self.refused = 0
         self.refusal = ''

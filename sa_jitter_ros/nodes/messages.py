@@ -158,6 +158,7 @@ _AVERAGE_LABELS = {
     'order_amplitude': ('channel', 'order', 'field'),
     'pulse_error': ('pulse', 'field'),
     'condition_indicator': ('channel', 'indicator'),
+    'condition_indicator_error': ('channel', 'indicator'),
 }
 
 

@@ -1,0 +1,197 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Shares of published intervals that contain the truth of a simulation.
+
+`python benchmarks/coverage.py` prints the tables of `docs/theory.md` and
+`docs/condition_indicators.md`.
+The simulation knows no formula of the package: it adds cosines of known amplitude and white noise,
+and moves known pulse times by uniform errors.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.indicators import GearSettings, INDICATORS, RunningIndicators
+from sa_jitter_ros.averaging.jackknife import WaveformParts
+
+FloatArray = NDArray[np.float64]
+
+PERIOD, POINTS = 0.04, 160  # s of a trigger cycle, and samples in it
+#: Orders of the shaft: three strong ones, one 10 dB above its noise, one that is not there.
+STRONG, WEAK, ABSENT = (8.0, 16.0, 32.0), 21.0, 11.0
+AMPLITUDES = (0.5, 1.0, 0.3)
+_SPARE = 3  # pulses that the validation may take to learn the interval
+
+
+@dataclass(frozen=True)
+class Case:
+    """
+    Averages of `cycles` trigger cycles.
+
+    Order 16 stands `above` dB above the noise of the average, and the jitter turns it by `jitter`
+    rad (standard deviation); `correct` says whether pulses are corrected.
+    """
+
+    cycles: int
+    above: float
+    jitter: float
+    correct: bool = True
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """
+    Distances over standard errors, by kind of order: `strong`, `weak`, `absent`.
+
+    `amplitude` and `phase` hold arrays of them, `absent` being the real part of the amplitude;
+    `upper` holds whether the true amplitude is below the limit. `accepted` is the share of
+    accepted corrections, whose averages alone count for corrected values.
+    """
+
+    amplitude: dict[str, FloatArray]
+    phase: dict[str, FloatArray]
+    upper: dict[str, FloatArray]
+    accepted: float
+
+
+def coverage(case: Case, trials: int, seed: int) -> tuple[Coverage, Coverage]:
+    """Return the coverage of raw and of corrected values of so many averages."""
+    rng = np.random.default_rng(seed)
+    error = 10.0 ** (-case.above / 20.0)
+    orders = np.array([*STRONG, WEAK, ABSENT])
+    size = np.array([*AMPLITUDES, np.sqrt(10.0) * error, 0.0])
+    rate, noise = POINTS / PERIOD, np.sqrt(POINTS * case.cycles / 4.0) * error
+    std = case.jitter * PERIOD / (2.0 * np.pi * STRONG[1])
+    times = np.arange((case.cycles + 4 + _SPARE) * POINTS) / rate
+    pulses = PERIOD * (2.0 + np.arange(case.cycles + 1.0 + _SPARE))
+    wave = np.exp(2j * np.pi * np.outer(orders, (times - pulses[0]) / PERIOD))
+    found: list[tuple[NDArray[np.complex128], ...]] = []
+    for _ in range(trials):
+        turn = np.exp(2j * np.pi * rng.uniform(size=orders.size))
+        samples = ((size * turn) @ wave).real + noise * rng.standard_normal(times.size)
+        late = pulses + rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0) * std
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            average, *_ = sa.average(
+                samples, rate, late, orders=orders, trigger_cycles=case.cycles,
+                correct_jitter=case.correct, keyphasor_rate=1.0 / (np.sqrt(12.0) * std),
+                interval_tolerance=0.45)
+        row = []
+        for source in (average, average.correction or average):
+            errors = source.amplitude_errors
+            row += [source.amplitudes[0] / turn, errors.amplitude[0], errors.phase[0],
+                    errors.upper_95[0]]
+        found.append(tuple(row))
+    columns = [np.array(item) for item in zip(*found)]
+    accepted = np.isfinite(columns[5]).all(axis=1)
+    if not accepted.any():
+        accepted[:] = True  # NaN
+    raw = _coverage(columns[:4], None, size, 1.0)
+    return raw, _coverage([item[accepted] for item in columns[4:]], size, size,
+                          float(np.isfinite(columns[5]).all(axis=1).mean()))
+
+
+def _coverage(columns: list[NDArray[np.complex128]], truth: FloatArray | None,
+              true: FloatArray, accepted: float) -> Coverage:
+    """Return the coverage about a `truth` (order,), or about the mean of all trials."""
+    amplitudes, error, phase, upper = columns
+    mean = amplitudes.mean(axis=0)
+    wanted = np.abs(amplitudes).mean(axis=0) if truth is None else truth
+    along = (np.abs(amplitudes) - wanted) / error.real
+    across = np.angle(amplitudes * np.conj(mean if truth is None else 1.0)) / phase.real
+    below = upper.real >= true
+    kinds = {'strong': slice(0, 3), 'weak': slice(3, 4)}
+    return Coverage(
+        {**{kind: along[:, place].ravel() for kind, place in kinds.items()},
+         'absent': amplitudes[:, 4].real / error[:, 4].real},
+        {kind: across[:, place].ravel() for kind, place in kinds.items()},
+        {**{kind: below[:, place].ravel() for kind, place in kinds.items()},
+         'absent': below[:, 4]}, accepted)
+
+
+def shares(z: FloatArray) -> str:
+    """Return the shares in percent of `z` within 1 and within 1.96."""
+    return ' / '.join(f'{100.0 * np.mean(np.abs(z) < width):.1f}' for width in (1.0, 1.96))
+
+
+def amplitude_table(trials: int) -> Iterator[str]:
+    """Iterate over the lines of the table of amplitudes and phases."""
+    yield ('| N_t | order 16 above the noise, jitter | value | amplitude strong | weak | absent | '
+           'phase strong | below `upper_95`: strong | weak | absent |')
+    yield '|' + '---|' * 10
+    for cycles in (5, 10, 40, 160):
+        count = trials if cycles < 100 else trials // 3
+        for above, jitter in ((20.0, 0.1), (40.0, 0.3), (40.0, 0.8)):
+            pair = coverage(Case(cycles, above, jitter), count, seed=cycles + int(10 * jitter))
+            for name, item in zip(('raw', 'corrected'), pair):
+                if item.accepted < 0.1:
+                    continue
+                limits = (f'{100.0 * np.mean(item.upper[kind]):.1f}'
+                          for kind in ('strong', 'weak', 'absent'))
+                yield (f'| {cycles} | {above:g} dB, {jitter:g} rad | {name} | '
+                       + ' | '.join(shares(item.amplitude[kind])
+                                    for kind in ('strong', 'weak', 'absent'))
+                       + f' | {shares(item.phase["strong"])} | ' + ' | '.join(limits) + ' |')
+
+
+def indicator_coverage(noise: float, damage: float, cycles: int, channels: int, seed: int
+                       ) -> dict[str, FloatArray]:
+    """
+    Return distances over standard errors of the condition indicators, by their names.
+
+    `channels` channels have white `noise` in each cycle; `damage` is the amplitude of a burst.
+    The distance is that from the mean over channels, of the ninth to twelfth average.
+    """
+    rng, points = np.random.default_rng(seed), 512
+    theta = 2.0 * np.pi * np.arange(points) / points
+    wave = sum(size * np.cos(order * theta) for order, size in (
+        (19, 1.0), (38, 0.5), (18, 0.1), (20, 0.05), (1, 0.2)))
+    wave = wave + 3.0 + damage * np.exp(-0.5 * ((theta - 3.0) / 0.1) ** 2) * np.cos(60.0 * theta)
+    counts = np.diff(np.round(np.linspace(0.0, cycles, 4)))
+    running, z = RunningIndicators(GearSettings([19])), []
+    for number in range(12):
+        parts = wave + noise * rng.standard_normal((3, channels, points)) / np.sqrt(
+            counts[:, None, None])
+        running.update(np.tensordot(counts / cycles, parts, axes=1), WaveformParts(counts, parts))
+        if number >= 8:
+            latest = running.get()
+            z.append((latest.values - latest.values.mean(axis=0)) / latest.standard_errors)
+    return {name: np.array(z)[..., place].ravel() for place, name in enumerate(INDICATORS)}
+
+
+def indicator_table(channels: int) -> Iterator[str]:
+    """Iterate over the lines of the table of condition indicators."""
+    cases = {'noise 0.1': (0.1, 0.0), 'noise 1': (1.0, 0.0), 'noise 0.1, damage': (0.1, 0.5)}
+    yield '| indicator | ' + ' | '.join(
+        f'{name}, {cycles} cycles' for cycles in (10, 40) for name in cases) + ' |'
+    yield '|' + '---|' * (1 + 2 * len(cases))
+    columns = [indicator_coverage(*case, cycles, channels, seed=cycles + number)
+               for cycles in (10, 40) for number, case in enumerate(cases.values())]
+    for name in INDICATORS:
+        yield f'| `{name}` | ' + ' | '.join(shares(column[name]) for column in columns) + ' |'
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--trials', type=int, default=600)
+    trials = parser.parse_args().trials
+    print('\n'.join(amplitude_table(trials)), '', *indicator_table(trials), sep='\n', flush=True)
+
+
+if __name__ == '__main__':
+    main()
