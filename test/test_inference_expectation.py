@@ -11,16 +11,18 @@
 """What the loop scores with is what the predictor publishes, conditional on known pulses."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.inference.expectation import expect, Lines, RESOLUTION
+from sa_jitter_ros.inference.expectation import _leakage, expect, Lines, RESOLUTION
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.influence import Influence, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
+from sa_jitter_ros.pulses.angle_law import angle_law
 from scipy import stats
 from validation.monte_carlo import AveragedSignal
 
@@ -179,3 +181,21 @@ def test_orders_beside_scatter_by_jitter_too(correlated, rng):
     assert variance > 1.5 * least
     assert variance == pytest.approx(np.mean(powers), rel=4.0 * np.std(powers) / np.mean(powers)
                                      / np.sqrt(12.0))
+
+
+@pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
+@pytest.mark.parametrize('size', [1e-4, 1e-2])
+def test_leakage_from_few_places_is_that_of_all(law, size, rng):
+    """The wave that errors turn is a polynomial between few places; so is its mean."""
+    weights, count, r = angle_law(law).weights, 10, 1.0
+    orders, sources = np.array([1.0, 40.0]), np.array([1.0, 40.0, 41.0, 117.3])
+    model = SimpleNamespace(cycle_length=r, trigger_cycles=count, fundamental_frequency=1.0,
+                            weights=weights)
+    errors = size * rng.standard_normal((2, count - 1 + weights.pulses))
+    found = _leakage(SimpleNamespace(model=model, orders=orders, sources=sources), (), errors)
+    u = (np.arange(20000) + 0.5) / 20000  # r (source - order) is no whole number for 117.3
+    path, cycle = weights.path(errors, u, count), np.arange(count)[:, None]
+    for g, order in enumerate(orders):
+        for s, source in enumerate(sources):
+            wave = np.exp(2j * np.pi * (source * path + (source - order) * r * (cycle + u)))
+            assert found[:, g, s] == pytest.approx(wave.mean(axis=(1, 2)), abs=1e-7)

@@ -20,9 +20,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import chain
+import math
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.inference.cycle_reader import kept_apart
@@ -46,6 +48,7 @@ Distribution = AmplitudeDistribution | SampledDistribution
 #: Relative uncertainty of an amplitude that comes from resampling.
 RESOLUTION = 5e-4
 _NODES, _MOST_NODES = 32, 800
+_PLACES = 12  # in a cycle, where errors turn hardly
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
@@ -371,17 +374,37 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     turns = r * np.ptp(np.append(sources, observation.orders)) + float(
         np.ptp(np.diff(e), axis=1).max()) * sources.max()
     u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
-    offset = model.weights.path(e, u, count)
+    # errors turn a wave by little within a cycle: a polynomial through few places is exact
+    degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
+    places, gathered = _few_places(u, degree, 2.0 * np.pi * sources.max() * np.abs(e).max())
+    offset = model.weights.path(e, places, count)
     cycle = np.arange(count)[:, None]
     table = np.zeros((len(e), observation.orders.size, sources.size), complex)
     for s, source in enumerate(sources):
         first = joint_characteristic(processes, [np.array([source])], [u], [0]) * w
         shift = 2j * np.pi * r * (source - observation.orders)
         inside, between = np.exp(shift * u[:, None]) * first[:, None], np.exp(shift * cycle)
+        inside = gathered @ inside
         for a, row in enumerate(offset):
             wave = np.exp(2j * np.pi * source * row)
             table[a, :, s] = np.mean((wave @ inside) * between, axis=0)
     return table
+
+
+def _few_places(u: Array, degree: int, turn: float) -> tuple[Array, Array]:
+    """
+    Return places in a cycle, and the matrix (place, u) of the polynomial through values there.
+
+    It is exact for waves that a polynomial of some `degree` turns by up to `turn` rad: their
+    Legendre series ends there.
+    """
+    count = math.ceil(degree * (_PLACES + 2.0 * turn))
+    if count >= u.size:
+        return u, np.eye(u.size)
+    places, weights = _nodes(count)
+    series = legvander(2.0 * places - 1.0, count - 1) * weights[:, None]
+    series *= 2.0 * np.arange(count) + 1.0
+    return places, np.asarray(series @ legvander(2.0 * u - 1.0, count - 1).T)
 
 
 def _scatter(observation: Observation, processes: Sequence[AngleErrorProcess]) -> Array:
