@@ -72,6 +72,36 @@ def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
         assert raw[1] < -0.01
 
 
+@pytest.mark.campaign
+def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_path):
+    scale = benchmark('fleet_scale')
+    found = scale.fleet(6, 4, tmp_path)
+    assert {item.raw.size for item in found.values()} == {8}
+    for (width, order), item in found.items():
+        known = np.isfinite(item.corrected)
+        assert known.all() or width == scale.WIDTHS[-1]
+        distance = (item.corrected - item.true)[known] / item.error[known]
+        assert np.abs(distance).max() < 4.0
+        assert np.abs(distance.mean()) < 4.0 / np.sqrt(known.sum())
+        assert np.all(item.error[known] < 0.05 * item.true[known])
+        if width > 0.1:
+            assert np.all(item.raw < item.true - 4.0 * item.error[known].max()), order
+    assert '| 46 | 0.4 mesh periods | 8 |' in scale.fleet_table(found)
+    assert len(scale.fleet_figure(found).axes) == 4
+
+
+@pytest.mark.campaign
+def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, tmp_path):
+    scale = benchmark('fleet_scale')
+    found = scale.gearbox(shared_data / 'gear0_gearbox.npz', (3300.0, 9100.0), tmp_path)
+    for item in found.values():
+        assert np.all(np.abs(item.corrected - item.true) < 4.0 * item.error)
+    slow, fast = found['3300 Hz', 46.0], found['9100 Hz', 46.0]
+    assert np.median(slow.raw / fast.raw) < 0.9
+    assert np.median(np.abs(slow.corrected / fast.corrected - 1.0)) < 2e-3
+    assert scale.gearbox_figure(found).axes
+
+
 def test_methods_are_timed_in_turns(benchmark):
     calls = []
     timings = benchmark('timing').interleaved(
