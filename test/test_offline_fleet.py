@@ -10,15 +10,20 @@
 
 """Many recordings: processes and workers that die, full disks, clusters that do not answer."""
 
+from contextlib import suppress
 import csv
+import errno
 import os
 from pathlib import Path
 import signal
+import socket
 import sys
+import threading
 import time
 
+import numpy as np
 import pytest
-from sa_jitter_ros.commands import close_loop
+from sa_jitter_ros.commands import average, close_loop
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
@@ -45,6 +50,15 @@ def work(job):
         raise OSError(28, 'No space left on device')
     time.sleep(0.01)
     return name
+
+
+def greet(server, answer):
+    """Answer every connection of a server in the same way, until it is closed."""
+    with suppress(OSError):
+        while True:
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(answer)
 
 
 @pytest.fixture
@@ -75,6 +89,35 @@ def test_full_disk_ends_the_run(processes):
         list(run_jobs(work, ['a', 'is full', 'b', 'c'], processes=processes))
 
 
+def test_full_disk_is_one_line_and_what_was_finished_stays(tmp_path, monkeypatch, capfd):
+    machine = Gearbox(mesh('shaft', 8), 5000.0, speed=((0.0, 25.0),), seed=3)
+    for name in 'ab':
+        write_npz(tmp_path / f'{name}.npz', Recording(
+            ArraySource(machine.vibration(0, 20_000)), 5000.0,
+            pulse_times=machine.pulses(0.0, 4.0).times))
+    save = np.savez
+
+    def full(path, **arrays):
+        if path.parts[-4] == 'b':
+            Path(path).write_bytes(b'half')
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save(path, **arrays)
+
+    command = [str(tmp_path), '--output', str(tmp_path / 'out'), '--no-figures', '--quiet']
+    before = signal.getsignal(signal.SIGTERM)
+    with monkeypatch.context() as patch:
+        patch.setattr(np, 'savez', full)
+        assert average.main(command) == 2
+    assert capfd.readouterr().err == (
+        f'average: {tmp_path}/out: No space left on device: make room, or give another folder; '
+        'what was finished stays\n')
+    assert sorted(path.parent.name for path in (tmp_path / 'out').rglob('averages.npz')) == ['a']
+    assert average.main(command) == 0
+    signal.signal(signal.SIGTERM, before)
+    assert sorted(path.parent.name for path in (tmp_path / 'out').rglob('averages.npz')) == [
+        'a', 'b']
+
+
 def test_names_of_recordings_are_their_paths_below_the_folder(tmp_path):
     for name in ('b/rig.npz', 'a/rig.npz', 'a/rig.mat', 'bag/metadata.yaml', 'bag/0.mcap',
                  'out/rig/averages.csv', '.hidden/rig.npz', 'a/notes.txt'):
@@ -99,10 +142,14 @@ def test_cluster_without_dask_says_what_to_install(monkeypatch):
 def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
     pytest.importorskip('distributed', reason="Dask is not installed: pip install '.[fleet]'")
     monkeypatch.setattr('sa_jitter_ros.offline.cluster.ANSWER', 1.0)
-    for address in ('tcp://127.0.0.1:9', 'nonsense', 'tcp://'):
-        with pytest.raises(ParameterError, match='no answer within 1 s') as error:
-            list(run_jobs(work, ['a'], scheduler=address))
-        assert '\n' not in str(error.value)
+    with socket.create_server(('127.0.0.1', 0)) as server:  # of something else
+        threading.Thread(target=greet, args=(server, b'HTTP/1.1 400 Bad Request\r\n\r\n'),
+                         daemon=True).start()
+        for address in ('tcp://127.0.0.1:9', 'nonsense', 'tcp://',
+                        f'tcp://127.0.0.1:{server.getsockname()[1]}'):
+            with pytest.raises(ParameterError, match='no answer of a Dask scheduler') as error:
+                list(run_jobs(work, ['a'], scheduler=address))
+            assert '\n' not in str(error.value)
 
 
 def test_loops_of_a_folder_have_a_report_and_a_row_each(tmp_path, capfd):

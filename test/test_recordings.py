@@ -573,6 +573,25 @@ def test_broken_csv(tmp_path, text, options, message):
         read(tmp_path / 'bad.csv', **options).read()
 
 
+def test_csv_that_ends_in_the_middle_of_a_row_is_read_up_to_there(tmp_path):
+    text = ''.join(f'{k / 10:.1f},{k},{-k}\n' for k in range(9))
+    for end in (' ', '0.9', '0.9,1'):
+        (tmp_path / 'cut.csv').write_text(f'time,a,b\n{text}{end}')
+        opened = read(tmp_path / 'cut.csv')
+        np.testing.assert_array_equal(opened.read()[0], np.arange(9.0))
+        assert opened.sample_rate == pytest.approx(10.0)
+        assert len(opened.remarks) == (end != ' ')
+    assert opened.remarks == (
+        'the file ends in the middle of row 9: it was read up to there',)
+
+
+def test_npz_that_is_cut_off_says_so(recording, tmp_path):
+    write_npz(tmp_path / 'rig.npz', recording)
+    (tmp_path / 'cut.npz').write_bytes((tmp_path / 'rig.npz').read_bytes()[:-500])
+    with pytest.raises(RecordingError, match=r'cut\.npz: ends before .* copy it again'):
+        read(tmp_path / 'cut.npz')
+
+
 def test_a_table_of_a_million_columns_gets_a_short_line(tmp_path):
     path = tmp_path / 'wide.csv'
     path.write_text('1,' * 1_000_000 + '1\n')

@@ -24,7 +24,8 @@ import signal
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, Parser, read_options, require_writable, show)
+    add_fleet_options, add_recording_options, failure, Parser, read_options, require_writable,
+    show)
 from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
@@ -101,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> int:
         require_writable(options.output)
         rows = run(options, progress)
     except (SaJitterError, OSError) as error:
-        progress.say(' '.join(str(error).split()))
+        progress.say(failure(error, options.output))
         return 2
     except KeyboardInterrupt:
         progress.say('stopped; what was finished stays, the same command goes on from there')

@@ -29,7 +29,7 @@ import signal
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, Parser, plain_warnings, read_options,
+    add_fleet_options, add_recording_options, failure, Parser, plain_warnings, read_options,
     require_writable, show)
 from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
 from sa_jitter_ros.commands.progress import Progress
@@ -108,7 +108,7 @@ def _show_fleet(options: argparse.Namespace, progress: Progress) -> int:
         require_writable(options.output)
         rows = run_fleet(options, progress)
     except (SaJitterError, OSError) as error:
-        progress.say(' '.join(str(error).split()))
+        progress.say(failure(error, options.output))
         return 2
     except KeyboardInterrupt:
         progress.say('stopped; what was finished stays, the same command goes on from there')
@@ -135,7 +135,7 @@ def main(args: Sequence[str] | None = None) -> int:
             found = run(options)
         found.write(options.output)
     except (SaJitterError, OSError) as error:
-        print(f'close_loop: {" ".join(str(error).split())}', file=sys.stderr)
+        print(f'close_loop: {failure(error, options.output)}', file=sys.stderr)
         return 2
     return show('close_loop', found, f'report: {options.output / "report.html"}')
 

@@ -54,6 +54,14 @@ def show(program: str, *lines: object) -> int:
     return 0
 
 
+def failure(error: Exception, output: Path) -> str:
+    """Return one line for an error that ended a command which writes into the folder `output`."""
+    if isinstance(error, OSError) and error.strerror:
+        return (f'{error.filename or output}: {error.strerror}: make room, or give another '
+                'folder; what was finished stays')
+    return ' '.join(str(error).split())
+
+
 def discard_output() -> None:
     """Discard what could not be printed, which Python would try to print once more at its end."""
     with suppress(UnsupportedOperation):  # a test has replaced it by a buffer

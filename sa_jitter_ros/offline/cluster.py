@@ -68,10 +68,11 @@ def _connected(connect: Callable[..., Any], address: str) -> Any:
     """Return a client of the cluster; raises ParameterError unless it answers and has a worker."""
     try:
         client = connect(address, timeout=ANSWER)
-    except (OSError, ValueError, TypeError) as error:  # a timeout is an OSError, too
+    except Exception as error:  # of a wrong address, or of what answers there, of any type
         reason = ' '.join(str(error).split())
-        raise ParameterError(f'--scheduler {address}: no answer within {ANSWER:g} s: check host '
-                             f'and port, and that dask scheduler runs ({reason:.200})') from None
+        raise ParameterError(f'--scheduler {address}: no answer of a Dask scheduler within '
+                             f'{ANSWER:g} s: check host and port, and that dask scheduler runs '
+                             f'({reason:.200})') from None
     try:
         client.wait_for_workers(1, timeout=ANSWER)
     except TimeoutError:

@@ -61,7 +61,8 @@ class CsvSource:
         with recording_errors(self.path), _open(self.path) as file:
             lines = _rows(file, self.delimiter, self.has_header)
             while start < self.samples:
-                block = _parse(islice(lines, samples_per_block), self.delimiter, wanted, start)
+                count = min(samples_per_block, self.samples - start)
+                block = _parse(islice(lines, count), self.delimiter, wanted, start)
                 if not len(block):
                     raise RecordingError(f'ends at row {start} of {self.samples}: the file was '
                                          'cut while it was read; open it again')
@@ -84,8 +85,9 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     """
     Open a `.csv` file; only the columns of the channel map must be numeric.
 
-    The sampling rate is `sample_rate`, with which the times must agree within half a sample, else
-    the mean rate of the times. Raises RecordingError if there is neither, or a row is not numeric.
+    A last row that is cut off is left out. The sampling rate is `sample_rate`, with which the
+    times must agree within half a sample, else the mean rate of the times. Raises RecordingError
+    if there is neither, or a row is not numeric.
     """
     with recording_errors(path):
         with _open(path) as file:
@@ -105,7 +107,8 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             raise RecordingError(f'no column of vibration among {", ".join(names)}: name it with '
                                  'vibration_channels')
         times = names.index(time) if time else None
-        samples, start_time, end_time = _extent(path, delimiter, has_header, times)
+        cut, samples, start_time, end_time = _extent(path, delimiter, has_header, len(names),
+                                                     times)
         rate = sample_rate
         if times is not None and samples > 1:
             if not end_time > start_time:
@@ -124,7 +127,9 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
         source = CsvSource(path, delimiter, has_header, columns, samples, times, start_time, rate)
         return channel_map.select(Recording(
             source, rate, start_time=start_time,
-            channel_names=tuple(names[column] for column in columns)))
+            channel_names=tuple(names[column] for column in columns),
+            remarks=(f'the file ends in the middle of row {samples}: it was read up to there',)
+            if cut else ()))
 
 
 def _open(path: Path) -> TextIO:
@@ -158,20 +163,27 @@ def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
                              'only') from error
 
 
-def _extent(path: Path, delimiter: str, has_header: bool,
-            times: int | None) -> tuple[int, float, float]:
-    """Return the number of rows and the first and last time (0 without a time column)."""
-    count, first, last = 0, '', ''
+def _extent(path: Path, delimiter: str, has_header: bool, fields: int,
+            times: int | None) -> tuple[bool, int, float, float]:
+    """
+    Return whether the last row is cut off, the number of whole rows, and the first and last time.
+
+    Rows have so many `fields`. The times are 0 without a time column.
+    """
+    count, first, last, before = 0, '', '', ''
     with _open(path) as file:
-        for last in _rows(file, delimiter, has_header):
-            first = first or last
+        for line in _rows(file, delimiter, has_header):
+            before, last, first = last, line, first or line
             count += 1
+    cut = count > 1 and not last.endswith('\n') and last.count(delimiter) + 1 < fields
+    if cut:
+        last, count = before, count - 1
     if times is None or not count:
-        return count, 0.0, 0.0
+        return cut, count, 0.0, 0.0
     ends = _parse(iter([first, last]), delimiter, (times,), 0)
     if not np.isfinite(ends).all():
         raise RecordingError(f'time runs from {ends[0, 0]} to {ends[1, 0]} s: must be finite')
-    return count, float(ends[0, 0]), float(ends[1, 0])
+    return cut, count, float(ends[0, 0]), float(ends[1, 0])
 
 
 def _is_number(text: str, delimiter: str) -> bool:

@@ -46,11 +46,19 @@ def open_npz(path: Path, *, acquisition: int, given: Mapping[str, Any],
     Raises RecordingError if the archive is broken, contains pickled objects or a field exceeds its
     limit.
     """
-    with recording_errors(path), zipfile.ZipFile(path) as archive:
+    with recording_errors(path), _archive(path) as archive:
         names = [name[:-4] for name in archive.namelist() if name.endswith('.npy')]
         return recording_from_fields(
             names, lambda name, limit: _member(archive, path, name, limit),
             acquisition=acquisition, given=given, pulses_suffice=pulses_suffice)
+
+
+def _archive(path: Path) -> zipfile.ZipFile:
+    try:
+        return zipfile.ZipFile(path)
+    except zipfile.BadZipFile:
+        raise RecordingError('ends before the list of its arrays, or is no .npz: the file is '
+                             'truncated or broken; copy it again') from None
 
 
 def write_npz(path: str | os.PathLike[str], recording: Recording, *,
