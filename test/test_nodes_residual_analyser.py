@@ -360,6 +360,29 @@ def test_averages_without_correction_are_refused(bench):
     assert values['averages'] == '0'
 
 
+def test_averages_with_unresolved_pulses_are_counted(bench):
+    b = bench(predictor='test')  # which is none
+    b.predict()
+    averages = synthetic(8, std=5e-5)
+    for number, pulse in ((1, 3), (1, 4), (6, 0)):
+        averages[number].pulses[pulse, 1:] = np.nan
+    b.average(averages)
+    assert b.spin(b.reports)  # of averages 2 to 5
+    assert sum(b.reports()[0]['acquisitions'].values()) == 4
+    assert b.spin(lambda: b.diagnostics()[2]['averages_not_traced'] == '4')
+    assert b.diagnostics()[2]['averages_with_unresolved_pulses'] == '2'
+    assert not b.reported('tell no cause')
+    shift = averages[-1].end_time
+    for item in averages:
+        item.pulses[5, 1:] = np.nan
+        item.pulses[:, 0] += shift
+    b.average([replace(item, start_time=item.start_time + shift, end_time=item.end_time + shift)
+               for item in averages])
+    assert b.spin(lambda: b.reported('8 of 8 averages have pulses whose error the vibration'))
+    assert b.spin(lambda: b.diagnostics()[2]['averages_not_traced'] == '12')
+    assert b.diagnostics()[2]['averages_with_unresolved_pulses'] == '10'
+
+
 def test_bad_messages_are_counted(bench):
     b = bench()
     (good,) = synthetic(1)

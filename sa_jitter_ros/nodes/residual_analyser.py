@@ -48,6 +48,7 @@ PARAMETERS = (
               'missing effect', minimum=2, maximum=10000),
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
 )
+_FEWEST = 4  # averages that a search for the cause takes
 _PERIOD = 0.1  # s between the steps of the loop
 _FIND_TIMEOUT = 3.0  # s to find the predictor
 _ANSWER_TIMEOUT = 15.0  # s for its answer, which comes after a new prediction
@@ -74,6 +75,7 @@ class ResidualAnalyser(MonitoringNode):
         self._added: set[str] = set()  # names of the effects that were set in the predictor
         self._verdict = self._activity = ''
         self._batches = self._uncorrected = self._interrupted = 0
+        self._unresolved = self._untraced = 0
         self._predictor_name = self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
         shaft = self._values['shaft']
@@ -126,8 +128,7 @@ class ResidualAnalyser(MonitoringNode):
         if count != cycles + 1 or not np.isfinite(values[:, 0]).all():
             raise MessageError(f'{count} pulses for {cycles} trigger cycles: send finite times, '
                                'for one pulse more than cycles')
-        if not np.isfinite(values).all():  # the vibration did not resolve all pulses
-            return
+        self._unresolved += not _resolved(values)
         self._pulses[received.header.start_time] = values
         while len(self._pulses) > 2 * self._batch.size + 10:
             del self._pulses[next(iter(self._pulses))]
@@ -154,9 +155,10 @@ class ResidualAnalyser(MonitoringNode):
         self._activity = ''
         if not self._batch.full or self._prediction is None:
             return
-        averages = [replace(item, pulses=self._pulses.get(item.start_time))
-                    for item in self._batch.averages]
-        if averages[-1].pulses is None and not self._waited:
+        pulses = [self._pulses.get(item.start_time) for item in self._batch.averages]
+        averages = [replace(item, pulses=values if _resolved(values) else None)
+                    for item, values in zip(self._batch.averages, pulses)]
+        if pulses[-1] is None and not self._waited:
             self._waited = True  # the pulse errors of an average are published after it
             return
         self._waited = False
@@ -167,6 +169,11 @@ class ResidualAnalyser(MonitoringNode):
             self.set_missing('residual', str(error))
             return
         self.set_missing('residual', '')
+        ambiguous = sum(values is not None and not _resolved(values) for values in pulses)
+        self.set_missing('cause', '' if len(averages) - ambiguous >= _FEWEST else (
+            f'{ambiguous} of {len(averages)} averages have pulses whose error the vibration '
+            'leaves ambiguous, and tell no cause: declare stronger or lower orders in the '
+            'averager, or use a better keyphasor'))
         self._batch.averages.clear()
         self._batches += 1
         self._significant = found.p_value < SIGNIFICANT
@@ -180,7 +187,8 @@ class ResidualAnalyser(MonitoringNode):
             self.set_missing('declared model', f'{self._predictor_name} does not answer: '
                              'independent jitter without effects is assumed; start the node, or '
                              'set the parameter predictor to its name')
-            self._trace(lambda: trace_averages(averages, declared_by(averages, prediction)))
+            self._trace(averages, lambda: trace_averages(
+                averages, declared_by(averages, prediction)))
 
         def ask(parameters: Sequence[Parameter], *others: Sequence[Parameter]) -> None:
             def answered(response: Any) -> None:
@@ -193,7 +201,8 @@ class ResidualAnalyser(MonitoringNode):
                     return
                 model, effects = self._declared(parameters, response)
                 self.set_missing('declared model', '')
-                self._trace(lambda: trace_averages(averages, model, declared=effects))
+                self._trace(averages, lambda: trace_averages(
+                    averages, model, declared=effects))
             names = [item.name for item in parameters]
             self._request(lambda: self._predictor.get_parameters(names), answered, without)
 
@@ -213,8 +222,8 @@ class ResidualAnalyser(MonitoringNode):
         declaration = declaration_of(values)
         return declaration.model, declaration.effects
 
-    def _trace(self, work: Callable[[], Trace]) -> None:
-        """Trace in a thread, so that the executor is not blocked."""
+    def _trace(self, averages: Sequence[ReceivedAverage], work: Callable[[], Trace]) -> None:
+        """Trace averages in a thread, so that the executor is not blocked."""
         job = _Job(work)
         self._activity = 'tracing'
 
@@ -223,14 +232,16 @@ class ResidualAnalyser(MonitoringNode):
                 return
             self._step = self._compare
             if job.result is not None:
-                self._publish_trace(job.result)
+                self._publish_trace(job.result, len(averages))
             else:
+                self._untraced += len(averages)
                 self.warn(f'the cause of the residual could not be searched: {job.error}')
         self._step = look
 
-    def _publish_trace(self, trace: Trace) -> None:
-        """Publish the trace; with `close_loop`, set its effects in the predictor."""
+    def _publish_trace(self, trace: Trace, averages: int) -> None:
+        """Publish the trace of `averages`; with `close_loop`, set its effects in the predictor."""
         content = report(trace)
+        self._untraced += averages - sum(content['acquisitions'].values())
         self._verdict = content['verdict']
         self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
         found = {item.name: item.effect.values for item in trace.findings
@@ -313,6 +324,8 @@ class ResidualAnalyser(MonitoringNode):
                   'batches': str(self._batches), 'verdict': self._verdict,
                   'uncorrected': str(self._uncorrected),
                   'averages_with_discarded_cycles': str(self._interrupted),
+                  'averages_with_unresolved_pulses': str(self._unresolved),
+                  'averages_not_traced': str(self._untraced),
                   'effects_set': ', '.join(sorted(self._added))}
         if self._prediction is None:
             return 'no prediction received yet', values
@@ -342,6 +355,11 @@ class _Job:
             self.error = str(error)
         except Exception as error:  # a bug in the trace must not stop the node
             self.error = repr(error)
+
+
+def _resolved(pulses: NDArray[np.float64] | None) -> bool:
+    """Return whether the vibration shows the errors of all `pulses`, if they came."""
+    return pulses is not None and bool(np.isfinite(pulses).all())
 
 
 def average_of(message: AverageMessage) -> ReceivedAverage:
