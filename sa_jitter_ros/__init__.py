@@ -29,6 +29,8 @@ the parameter names of the ROS 2 nodes. Nothing here needs ROS 2.
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from sa_jitter_ros.version import __version__  # noqa: F401
+
 if TYPE_CHECKING:
     from sa_jitter_ros.averaging.average import Average, Correction
     from sa_jitter_ros.averaging.averager import average, Averager
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
     from sa_jitter_ros.recordings.reading import read
     from sa_jitter_ros.recordings.recording import Recording
 
-__version__ = '1.0.0'
 __all__ = [
     'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'MessageError',
     'ModelError', 'ParameterError', 'Prediction', 'Recording', 'RecordingError', 'SaJitterError',

@@ -16,7 +16,8 @@ that the declared model lacks if the residual is significant.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, MISSING, replace
+from dataclasses import dataclass, field, fields, MISSING, replace
+from datetime import datetime, timezone
 from functools import cached_property
 import math
 import os
@@ -50,7 +51,8 @@ class Loop:
     """
     Result of `close_loop`; `str` makes a summary of it.
 
-    `traces` are the arrays behind the report, by the name of the shaft.
+    `traces` are the arrays behind the report, by the name of the shaft. `unit` is that of the
+    vibration, '' where it is unknown or not that of all channels; `created` is the time (UTC).
 
     A machine whose pulses have no other error than that of a keyphasor sampled at 5 kHz, as
     declared:
@@ -73,11 +75,15 @@ class Loop:
 
     traces: Mapping[str, Trace]
     recordings: tuple[str, ...]
+    unit: str = ''
+    created: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(
+        timespec='seconds'))
 
     @cached_property
     def shafts(self) -> Mapping[str, Mapping[str, Any]]:
         """Return the report of each shaft by its name; undefined numbers are None."""
-        return {shaft: report(trace, recordings=self.recordings)
+        return {shaft: report(trace, recordings=self.recordings, shaft=shaft, unit=self.unit,
+                              created=self.created)
                 for shaft, trace in self.traces.items()}
 
     @property
@@ -212,7 +218,8 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                               progress=progress)
     for fault in dict.fromkeys(faults):
         warnings.warn(fault, DataWarning, stacklevel=2)
-    return Loop(traces, names)
+    units = {unit for recording in opened for unit in recording.units}
+    return Loop(traces, names, units.pop() if len(units) == 1 else '')
 
 
 def _usable(recordings: Sequence[Recording], names: Sequence[str]

@@ -8,12 +8,13 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The parameters of one node in a ROS parameter file, read without ROS."""
+"""The parameters of one node in a ROS parameter file, read and written without ROS."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 import re
 import stat
+from types import MappingProxyType
 from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
@@ -57,6 +58,28 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
         raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
                              f'"{node}:" or "/**:" and "ros__parameters:"')
     return {name: value for section in sections for name, value in _flattened(section, '')}
+
+
+def section_text(node: str, parameters: Mapping[str, Any],
+                 remarks: Mapping[str, str] = MappingProxyType({})) -> str:
+    """
+    Return the section of a node in any namespace as rcl reads it; mappings are nested.
+
+    `remarks` are by the full names of parameters.
+
+    >>> print(section_text('jitter_predictor', {
+    ...     'keyphasor_rate': 3e3, 'effects': {'excess_jitter': {'enabled': True, 'std': 8e-5}},
+    ... }, {'effects.excess_jitter.std': 'new'}), end='')
+    /**/jitter_predictor:
+      ros__parameters:
+        keyphasor_rate: 3000.0
+        effects:
+          excess_jitter:
+            enabled: true
+            std: 8.0e-05  # new
+    """
+    return '\n'.join((f'/**/{node}:', '  ros__parameters:',
+                      *_lines(parameters, remarks, '', '    '), ''))
 
 
 def value_of(text: str) -> Any:
@@ -133,3 +156,29 @@ def _flattened(section: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, A
             yield from _flattened(value, f'{name}.')
         else:
             yield name, value
+
+
+def _lines(parameters: Mapping[str, Any], remarks: Mapping[str, str], prefix: str, indent: str
+           ) -> Iterator[str]:
+    for key, value in parameters.items():
+        if isinstance(value, Mapping):
+            yield f'{indent}{key}:'
+            yield from _lines(value, remarks, f'{prefix}{key}.', f'{indent}  ')
+        else:
+            remark = remarks.get(f'{prefix}{key}', '')
+            yield f'{indent}{key}: {_written(value)}' + (f'  # {remark}' if remark else '')
+
+
+def _written(value: Any) -> str:
+    """Return a parameter as rcl reads it: a float has a point, also with an exponent."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return f'[{", ".join(map(_written, value))}]'
+    if isinstance(value, float):
+        text = f'{value:.10g}'
+        if '.' not in text:
+            mantissa, e, exponent = text.partition('e')
+            text = f'{mantissa}.0{e}{exponent}'
+        return text
+    return str(value)

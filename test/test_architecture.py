@@ -29,6 +29,7 @@ CORE = {
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
     'samples': {'numpy'},
+    'version': set(),
     'pulses': SCIENCE | {'errors', 'parameters', 'samples'},
     'averaging': SCIENCE | {'errors', 'parameters', 'pulses', 'samples'},
     'prediction': SCIENCE | {'errors', 'parameters', 'pulses'},
@@ -40,13 +41,13 @@ CORE = {
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},
     'keyphasor_check': SCIENCE | {
-        'averaging', 'effects', 'errors', 'pulses', 'recordings'},
+        'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop',
         'matplotlib', 'parameter_file', 'parameters', 'pulses', 'recordings', 'samples'},
     'report': SCIENCE | {
-        'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib', 'prediction',
-        'pulses', 'recordings'},
+        'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
+        'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
         'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
         'pulses', 'recordings', 'report'},

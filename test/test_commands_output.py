@@ -10,13 +10,15 @@
 
 """What commands share: output that cannot be written, and the machine file of recordings."""
 
+import io
 from pathlib import Path
 import subprocess
 import sys
 
+from bench import SteadyClock
 import numpy as np
 import pytest
-from sa_jitter_ros.commands import check_keyphasor, close_loop
+from sa_jitter_ros.commands import check_keyphasor, close_loop, progress
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -59,3 +61,41 @@ def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypat
     assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (2.40789, 18.0, 1)
     found = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
     assert (found.ratio, found.orders[0]) == (3.0, 18.0)
+
+
+class Terminal(io.StringIO):
+    """A text that says whether it is a terminal."""
+
+    def __init__(self, terminal):
+        super().__init__()
+        self.isatty = lambda: terminal
+
+
+@pytest.mark.parametrize('terminal', [True, False])
+def test_progress_of_a_long_step_is_shown(monkeypatch, terminal):
+    clock, output = SteadyClock(), Terminal(terminal)
+    monkeypatch.setattr(progress, 'time', clock)
+    monkeypatch.setattr(sys, 'stderr', output)
+    shown = progress.Progress('prog')
+    shown.tick()
+    assert output.getvalue() == ''
+    shown.step('reading')
+    clock.now += 3.0
+    shown.tick()
+    assert ('working, 3 s' in output.getvalue()) == terminal  # a line costs more than a bar
+    clock.now += 9.0
+    shown.tick()
+    assert 'prog: working, 12 s' in output.getvalue()
+    with shown.ticking():
+        shown.step('fitting')
+    assert output.getvalue().count('prog: reading\n') == 1
+    assert output.getvalue().count('prog: fitting\n') == 1
+
+
+def test_quiet_progress_is_silent(monkeypatch):
+    monkeypatch.setattr(sys, 'stderr', Terminal(True))
+    shown = progress.Progress('prog', quiet=True)
+    with shown.ticking():
+        shown.step('reading')
+        shown.tick()
+    assert sys.stderr.getvalue() == ''

@@ -21,8 +21,9 @@ from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import make_bench, trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
-from sa_jitter_ros.report.html_report import html, verdict_sentence
+from sa_jitter_ros.report.html_report import html
 from sa_jitter_ros.report.report import report, summary
+from sa_jitter_ros.report.words import verdict_sentence
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
@@ -186,5 +187,5 @@ def test_report_says_what_the_residual_changes_with(pickup):
     assert 'what is left changes' in verdict_sentence(content)
     page = html(content, (), {})
     assert 'Dependence of the residual' in page
-    assert '<td>trigger cycles</td>' in page
+    assert '>trigger cycles</td>' in page
     assert report(replace(pickup, dependences_after=(), left=None))['remains'] == ''

@@ -19,13 +19,17 @@ import json
 from matplotlib.image import imread
 import numpy as np
 import pytest
+from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.figures import illustrate
-from sa_jitter_ros.report.html_report import html, report_files, verdict_sentence
+from sa_jitter_ros.report.html_report import html, report_files
+from sa_jitter_ros.report.number_text import measured_text, percent_text
 from sa_jitter_ros.report.report import report
+from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 from sa_jitter_ros.simulation import (AdditiveNoise, band_limited, DeclaredJitter, Gearbox,
                                       make_effects, mesh)
 
@@ -87,14 +91,14 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attributes):
         self.tags.append(tag)
         self.links += [value for name, value in attributes if name in ('src', 'href')]
-        if tag not in ('meta', 'img'):
+        if tag not in ('br', 'meta', 'img'):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        self.text += data
+        self.text += data.replace('\u00a0', ' ')  # numbers that stay with their units
 
 
 @pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
@@ -116,7 +120,87 @@ def test_page_is_complete_and_self_contained(files, verdict):
                   *(item['rejected_because'] for item in content['candidates'])):
         assert shown in page.text
     for effect in content['missing_effects']:
-        assert effect['evidence'] in page.text
+        assert effect['evidence'].replace('+-', '±') in page.text
+
+
+def test_page_begins_with_what_was_analysed_found_and_to_be_done(traces):
+    content = report(traces['traced'], recordings=['rigs/a<b>.npz'], unit='m/s^2',
+                     created='2026-11-22T23:41:38+00:00')
+    text = Page(html(content, (), {})).text
+    parts = [
+        'a<b>.npz', 'Analysed 2026-11-22 23:41:38 UTC with sa_jitter_ros',
+        verdict_sentence(content), 'What was found', *next(findings(content)),
+        'What it does to the amplitudes', 'What to do next', *next_steps(content),
+        content['parameter_file'], 'Evidence']
+    places = [text.index(part) for part in parts]
+    assert places == sorted(places)
+    assert 'rigs/' not in text[:places[-1]]
+
+
+@pytest.mark.parametrize('verdict', ['none', 'traced', 'unexplained'])
+def test_each_order_has_its_share_of_the_amplitude(traces, verdict):
+    content = report(traces[verdict])
+    shares = order_shares(content)
+    assert [item.order for item in shares] == [19.0, 38.0]
+    for share in shares:
+        lines = [item for item in content['lines'] if item['order'] == share.order]
+        assert len(lines) == 2  # channels
+        assert share.observed == np.mean([item['observed'] for item in lines])
+        assert share.before == np.mean([item['predicted_before'] for item in lines])
+    page = html(content, (), {}).replace('\u00a0', ' ')
+    for share in shares:
+        assert f'>{percent_text(share.observed, share.standard_error)}<' in page
+    assert ('<th>as found</th>' in page.partition('What to do next')[0]) == (verdict == 'traced')
+
+
+def test_steps_follow_from_what_was_found(traces):
+    content = report(traces['traced'])
+    steps = ' '.join(next_steps(content))
+    assert steps.startswith('Paste the section below')
+    assert EFFECTS['excess_jitter'].remedy in steps
+    lost = min(order_shares(content), key=lambda item: item.observed)
+    assert ('correct_jitter: true' in steps) == (lost.observed < 0.95)
+    doubtful = {**content['missing_effects'][0], 'indistinguishable_from': ['phase_wander'],
+                'deciding_measurement': 'a run-up'}
+    changed = {**content, 'missing_effects': [doubtful], 'undecided': ['clock_skew']}
+    steps = ' '.join(next_steps(changed))
+    assert 'To tell excess_jitter from phase_wander, take a run-up.' in steps
+    assert 'cannot exclude clock_skew' in steps
+    assert 'Do not rely' in ' '.join(next_steps(report(traces['unexplained'])))
+    steady = {**report(traces['none']), 'undecided': []}
+    assert 'Nothing: predictions' in ' '.join(next_steps(steady)) or any(
+        item.observed < 0.95 for item in order_shares(steady))
+
+
+@pytest.mark.parametrize('shaft', ['', 'shaft', 'input'])
+@pytest.mark.parametrize('verdict', ['traced', 'geometry', 'grid'])
+def test_section_to_paste_declares_what_was_found(traces, verdict, shaft, tmp_path):
+    trace = traces[verdict]
+    content = report(trace, shaft=shaft)
+    path = tmp_path / 'machine.yaml'
+    path.write_text(content['parameter_file'])
+    declaration = read_declaration(path)
+    assert declaration.unknown == ()
+    (name, model), = declaration.models.items()
+    assert name == (shaft or 'shaft')
+    wanted = trace.observation.model
+    assert replace(model, ratio=wanted.ratio, trigger_speed=wanted.trigger_speed) == wanted
+    np.testing.assert_allclose((model.ratio, model.trigger_speed), (
+        wanted.ratio, trace.observation.declared_speed), rtol=1e-9)
+    assert len(declaration.effects) == len(trace.findings)
+    for item in trace.findings:
+        effect, = [one for one in declaration.effects if one.name == item.name]
+        for key, value in item.effect.values.items():
+            np.testing.assert_allclose(effect.values[key], value, rtol=1e-5)
+    # declared with it, it is no longer new
+    again = report(replace(trace, declared=declaration.effects), shaft=shaft)['parameter_file']
+    assert '# new' in content['parameter_file']
+    assert '# new' not in again
+    assert '# was' in again
+
+
+def test_nothing_is_pasted_where_nothing_was_found(traces):
+    assert report(traces['none'])['parameter_file'] == ''
 
 
 @pytest.mark.parametrize('verdict', ['none', 'traced', 'blind'])
@@ -150,12 +234,18 @@ def test_panels_are_labelled(traces, verdict):
 
 def test_sentence_contains_effect_and_errors(traces):
     content = report(traces['traced'])
+    before, after = content['error_before'], content['error_after']
+    assert verdict_sentence(content) == (
+        'The declared model lacks excess_jitter. With it the prediction misses the measured '
+        f'amplitudes by {percent_text(after["rms"], after["rms_standard_error"])} instead of '
+        f'{percent_text(before["rms"], before["rms_standard_error"])}.')
     (effect,) = content['missing_effects']
     std = effect['parameters']['std']
-    assert verdict_sentence(content).startswith(
-        f'The declared model lacks excess_jitter (std = {std["value"]:.4g} ± '
-        f'{std["standard_error"]:.2g} s). With it the held-out error goes from '
-        f'{content["error_before"]["rms"]:.4g} to {content["error_after"]["rms"]:.4g}')
+    (found, meaning), = findings(content)
+    assert found == ('excess_jitter: std = '
+                     + measured_text(std['value'], std['standard_error'], 's'))
+    assert found.endswith(' µs')
+    assert meaning.startswith('Pulses come early or late')
 
 
 @pytest.mark.parametrize(('verdict', 'says'), [
@@ -167,14 +257,14 @@ def test_sentence_of_other_verdicts(traces, verdict, says):
 
 def test_sentence_names_effects_that_do_not_suffice(traces):
     content = report(replace(traces['traced'], verdict='unexplained'))
-    assert 'even with excess_jitter (std = ' in verdict_sentence(content)
+    assert 'even with excess_jitter the prediction' in verdict_sentence(content)
 
 
 def test_undefined_numbers_are_dashes(traces):
     trace = traces['none']
     content = report(replace(trace, before=replace(trace.before, ks=float('nan'))))
     assert content['error_before']['ks'] is None
-    assert '<td class="number">–</td>' in html(content, (), {})
+    assert '<td data-label="before">–</td>' in html(content, (), {})
 
 
 def curve(axes, label):

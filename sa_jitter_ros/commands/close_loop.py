@@ -62,18 +62,14 @@ def make_parser() -> Parser:
     return parser
 
 
-def run(options: argparse.Namespace) -> Loop:
+def run(options: argparse.Namespace, progress: Progress) -> Loop:
     """Close the loop on the recordings; raises SaJitterError."""
-    def progress(text: str) -> None:
-        if not options.quiet:
-            print(f'close_loop: {text}', file=sys.stderr, flush=True)
-
     recordings = [on_target(read(path, **read_options(options)), options.declared)
                   for path in options.recordings]
     declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
     _tell_unknown(options.declared, declaration)
     return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
-                      progress=progress)
+                      progress=progress.step)
 
 
 def _tell_unknown(path: Path, declaration: Declaration) -> None:
@@ -127,13 +123,15 @@ def _show_fleet(options: argparse.Namespace, progress: Progress) -> int:
 def main(args: Sequence[str] | None = None) -> int:
     """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)
+    progress = Progress('close_loop', quiet=options.quiet)
     if options.scheduler or options.jobs or any(map(is_folder, options.recordings)):
-        return _show_fleet(options, Progress('close_loop', quiet=options.quiet))
+        return _show_fleet(options, progress)
     try:
         require_writable(options.output)
-        with plain_warnings('close_loop'):
-            found = run(options)
-        found.write(options.output)
+        with plain_warnings('close_loop'), progress.ticking():
+            found = run(options, progress)
+            progress.step('writing the report')
+            found.write(options.output)
     except (SaJitterError, OSError) as error:
         print(f'close_loop: {failure(error, options.output)}', file=sys.stderr)
         return 2

@@ -10,11 +10,14 @@
 
 """The progress of a command on the standard error: a bar on a terminal, else a line at times."""
 
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 import sys
+from threading import Event, Thread
 import time
 
 _REDRAW, _LINE = 0.2, 10.0  # s between two bars, two lines
+_TICK = 1.0  # s between two looks at a step that takes long
 _WIDTH = 24
 
 
@@ -26,6 +29,44 @@ class Progress:
         self._bar = sys.stderr.isatty()
         self._start = self._last = time.monotonic()
         self._drawn = False
+        self._step = ''
+
+    @contextmanager
+    def ticking(self) -> Iterator[None]:
+        """Show meanwhile, unless `quiet`, that a step goes on: it need not tell its share."""
+        if self._quiet:
+            yield
+            return
+        ended = Event()
+
+        def tick() -> None:
+            while not ended.wait(_TICK):
+                self.tick()
+
+        thread = Thread(target=tick, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            self.clear()
+
+    def step(self, text: str) -> None:
+        """Show a line for a step that begins or a result, unless `quiet`."""
+        if not self._quiet:
+            self.say(text)
+        self._step, self._last = text, time.monotonic()
+
+    def tick(self) -> None:
+        """Show for how long the program has worked, if a step takes long."""
+        now = time.monotonic()
+        if self._quiet or not self._step or (not self._bar and now - self._last < _LINE):
+            return
+        self._last = now
+        self._write(f'{self._program}: working, {now - self._start:.0f} s',
+                    end='' if self._bar else '\n')
+        self._drawn = self._bar
 
     def show(self, share: float, text: str) -> None:
         """Show the share that is done (0 to 1), and a text."""

@@ -34,6 +34,10 @@ class AdditiveNoise(DirectEffect):
 
     name: ClassVar[str] = 'additive_noise'
     summary: ClassVar[str] = 'white noise on the vibration'
+    meaning: ClassVar[str] = (
+        'the vibration holds more noise than was declared: amplitudes scatter more, but '
+        'none is lost')
+    remedy: ClassVar[str] = 'average more cycles (trigger_cycles)'
     scatters: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation per sample, units as noise_std', '1',
                            minimum=0.0)

@@ -76,6 +76,8 @@ class AmplitudeModulation(DirectEffect):
 
     name: ClassVar[str] = 'amplitude_modulation'
     summary: ClassVar[str] = 'slow modulation of the amplitude'
+    meaning: ClassVar[str] = 'all amplitudes grow and shrink together, as they do with the load'
+    remedy: ClassVar[str] = 'compare averages of the same load'
     scatters: ClassVar[bool] = True
     std: float = parameter(0.0, 'standard deviation of the gain', '1', minimum=0.0, maximum=1.0)
     bandwidth: float = parameter(

@@ -39,6 +39,9 @@ class ClockSkew(Effect):
 
     name: ClassVar[str] = 'clock_skew'
     summary: ClassVar[str] = 'speed of the keyphasor clock relative to the vibration clock'
+    meaning: ClassVar[str] = (
+        'the clock of the pulses runs at another speed than that of the vibration')
+    remedy: ClassVar[str] = 'time pulses and vibration by one clock'
     timing: ClassVar[Pattern] = Pattern(_growing, show_in_times=False)
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)

@@ -31,6 +31,12 @@ class CorrelatedJitter(Effect):
 
     name: ClassVar[str] = 'correlated_jitter'
     summary: ClassVar[str] = 'normal pulse errors with memory'
+    meaning: ClassVar[str] = (
+        'pulses come early or late at random, neighbouring ones alike, as with a trigger '
+        'level that wanders')
+    remedy: ClassVar[str] = (
+        'set the trigger level on the steepest part of the edge, and check the supply of '
+        'the sensor')
     timing: ClassVar[Spectrum] = Spectrum(
         PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5)), (-9.0, -2.0), (9.0, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)

@@ -89,10 +89,13 @@ class Effect(Influence):
     Base class of all effects; it has no influence itself.
 
     `name` is the prefix of the effect's parameters, `summary` describes the effect in a few words.
+    For somebody who does not know the package, `meaning` says what happens, `remedy` what to do.
     """
 
     name: ClassVar[str]
     summary: ClassVar[str]
+    meaning: ClassVar[str] = ''
+    remedy: ClassVar[str] = ''
     #: Whether it makes amplitudes scatter but does not change the attenuation, raw over corrected.
     scatters: ClassVar[bool] = False
     #: Whether the pulse times alone show it; it is then reported even if amplitudes do not change.

@@ -28,6 +28,11 @@ class ExcessJitter(Effect):
 
     name: ClassVar[str] = 'excess_jitter'
     summary: ClassVar[str] = 'independent normal pulse errors'
+    meaning: ClassVar[str] = (
+        'pulses come early or late at random, each on its own, by more than was declared')
+    remedy: ClassVar[str] = (
+        'look for noise on the keyphasor: trigger level, cable, earth, distance and edge '
+        'of the target')
     timing: ClassVar[Spectrum] = Spectrum(PULSES, white, ((0.0,),), (-9.0,), (9.0,))
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)

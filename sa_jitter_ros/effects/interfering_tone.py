@@ -29,6 +29,8 @@ class InterferingTone(DirectEffect):
 
     name: ClassVar[str] = 'interfering_tone'
     summary: ClassVar[str] = 'a tone that no shaft makes'
+    meaning: ClassVar[str] = 'a tone that no shaft makes leaks into the averages'
+    remedy: ClassVar[str] = 'average more cycles (trigger_cycles), or remove its source'
     scatters: ClassVar[bool] = True
     frequency: float = parameter(50.0, 'frequency of the tone', 'Hz', above=0.0)
     amplitude: float = parameter(0.0, "peak amplitude in units of the component's", '1',

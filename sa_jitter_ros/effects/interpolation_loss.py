@@ -29,6 +29,9 @@ class InterpolationLoss(DirectEffect):
 
     name: ClassVar[str] = 'interpolation_loss'
     summary: ClassVar[str] = 'interpolation of the samples'
+    meaning: ClassVar[str] = 'the samples were interpolated by a rule that damps high frequencies'
+    remedy: ClassVar[str] = (
+        'interpolate band-limited (interpolation of the averager), or sample faster')
     method: str = parameter('linear', 'interpolator of the samples', '', choices=METHODS)
 
     def gain(self, model: DeclaredModel) -> Array:

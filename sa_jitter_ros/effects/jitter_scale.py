@@ -27,6 +27,8 @@ class JitterScale(Effect):
 
     name: ClassVar[str] = 'jitter_scale'
     summary: ClassVar[str] = 'declared jitter of another size'
+    meaning: ClassVar[str] = 'the jitter is of the declared kind, but of another size'
+    remedy: ClassVar[str] = 'declare this size'
     scale: float = parameter(1.0, 'true over declared size of the jitter', '1', minimum=0.0)
 
     def jitter_factor(self, model: DeclaredModel) -> float:

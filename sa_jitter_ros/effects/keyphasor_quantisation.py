@@ -49,6 +49,10 @@ class KeyphasorQuantisation(Effect):
 
     name: ClassVar[str] = 'keyphasor_quantisation'
     summary: ClassVar[str] = 'pulse times on the grid of a clock'
+    meaning: ClassVar[str] = (
+        'a clock rounds the pulse times to its ticks, so that the errors of neighbouring '
+        'pulses depend on each other')
+    remedy: ClassVar[str] = 'sample the keyphasor faster, or time its edges by a counter'
     timing: ClassVar[Pattern] = Pattern(_of_grid, about=_SLOPE, replaces_jitter=True)
     clock_rate: float = parameter(10000.0, 'rate of the clock that times the pulses', 'Hz',
                                   above=0.0)

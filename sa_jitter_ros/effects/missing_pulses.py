@@ -45,6 +45,11 @@ class MissingPulses(DirectEffect):
 
     name: ClassVar[str] = 'missing_pulses'
     summary: ClassVar[str] = 'pulses that are lost and not repaired'
+    meaning: ClassVar[str] = (
+        'pulses are lost and nobody repairs it: behind each the angle lacks a trigger '
+        'cycle')
+    remedy: ClassVar[str] = (
+        'lower the trigger level or the distance to the target until no pulse is lost')
     visible_in_pulse_times: ClassVar[bool] = True
     probability: float = parameter(0.0, 'probability that a pulse is lost', '1', minimum=0.0,
                                    maximum=0.9)

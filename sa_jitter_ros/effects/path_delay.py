@@ -47,6 +47,10 @@ class PathDelay(Effect):
 
     name: ClassVar[str] = 'path_delay'
     summary: ClassVar[str] = 'pulses late by a constant time'
+    meaning: ClassVar[str] = (
+        'the pulses come late by a constant time, which turns the phases as the speed '
+        'changes')
+    remedy: ClassVar[str] = 'give the delay to the averager (path_delay)'
     timing: ClassVar[Pattern] = Pattern(_of_speed, show_in_times=False)
     delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
                              's', minimum=-1.0, maximum=1.0)

@@ -37,6 +37,10 @@ class PhaseWander(Effect):
 
     name: ClassVar[str] = 'phase_wander'
     summary: ClassVar[str] = 'slow motion of the source relative to the tach shaft'
+    meaning: ClassVar[str] = (
+        'the source of the vibration moves slowly against the shaft with the keyphasor: '
+        'torsion, play, or a path that changes')
+    remedy: ClassVar[str] = 'put the keyphasor on the shaft of interest, or average fewer cycles'
     pulse_times_correct: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,

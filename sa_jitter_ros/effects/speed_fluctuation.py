@@ -38,6 +38,9 @@ class SpeedFluctuation(Effect):
 
     name: ClassVar[str] = 'speed_fluctuation'
     summary: ClassVar[str] = 'acceleration inside a trigger cycle'
+    meaning: ClassVar[str] = (
+        'the speed changes within a trigger cycle, where the pulses do not show it')
+    remedy: ClassVar[str] = 'use more pulses a revolution, or the angle_law quadratic or spline'
     acceleration_std: float = parameter(
         0.0, 'standard deviation of the acceleration of the tach shaft', 'rad/s^2', minimum=0.0)
 

@@ -49,6 +49,10 @@ class TargetGeometry(Effect):
 
     name: ClassVar[str] = 'target_geometry'
     summary: ClassVar[str] = 'marks of the target off their even places'
+    meaning: ClassVar[str] = 'the marks of the target are not at even angles'
+    remedy: ClassVar[str] = (
+        'let the averager learn their angles (target_geometry: learn), or trigger once a '
+        'revolution')
     timing: ClassVar[Pattern] = Pattern(_marks)
     pulse_angles: tuple[float, ...] = parameter(
         (), 'angle by which each mark of the target is late', 'rad')

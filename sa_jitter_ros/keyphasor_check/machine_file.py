@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
+from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 
 _MOST_CYCLES, _AVERAGES = 100, 8
@@ -78,22 +79,5 @@ def machine_file(check: KeyphasorCheck, name: str) -> str:
                                for value, probability in item.alternatives)
             lines.append(f'# {key} may also be {others}: {item.decided_by}')
     lines += ['', '/**:', '  ros__parameters:', f'    hardware_id: {json.dumps(name)}']
-    for node, parameters in machine_parameters(check).items():
-        lines += ['', f'/**/{node}:', '  ros__parameters:']
-        lines += [f'    {key}: {_yaml(value)}' for key, value in parameters.items()]
-    return '\n'.join(lines) + '\n'
-
-
-def _yaml(value: Any) -> str:
-    """Return a parameter as rcl reads it: a float has a point, also with an exponent."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, list):
-        return f'[{", ".join(map(_yaml, value))}]'
-    if isinstance(value, float):
-        text = f'{value:.10g}'
-        if '.' not in text:
-            mantissa, e, exponent = text.partition('e')
-            text = f'{mantissa}.0{e}{exponent}'
-        return text
-    return str(value)
+    return '\n'.join(lines) + '\n\n' + '\n'.join(
+        section_text(node, parameters) for node, parameters in machine_parameters(check).items())

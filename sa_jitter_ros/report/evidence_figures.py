@@ -36,7 +36,7 @@ _FINEST = 1e-6  # half the range of a histogram of relative intervals that are a
 def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the pulse errors over time, their distribution, autocorrelation, clock and origin."""
     evidence, versions = whole(evidence), versions_of(evidence, effects)
-    figure, axes = panels(8, columns=4)
+    figure, axes = panels(8)
     _over_time(axes[0], evidence, versions[-1])
     _distribution(axes[1], evidence, versions)
     _autocorrelation(axes[2], evidence, versions)
@@ -51,7 +51,7 @@ def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
 def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
     evidence, versions = whole(evidence), versions_of(evidence, effects)
-    figure, axes = panels(3, columns=3)
+    figure, axes = panels(3)
     _profile(axes[0], evidence, versions)
     _dependence_on_cycles(axes[1], evidence, versions)
     _folded(axes[2], evidence, versions[-1])
@@ -61,7 +61,7 @@ def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
 def amplitudes(evidence: Evidence, channel_names: Sequence[str]) -> Figure:
     """Draw how the strongest lines vary: over time, with each other, and their spectrum."""
     lines = evidence.lines
-    figure, axes = panels(3, columns=3)
+    figure, axes = panels(3)
     strongest = np.argsort(lines.radial_noise)[:4]
     names = [f'order {lines.order[k]:g}, {channel_names[lines.channel[k]]}' for k in strongest]
     changes = lines.radial[..., strongest]

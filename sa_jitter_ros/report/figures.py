@@ -24,7 +24,8 @@ from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report import evidence_figures
-from sa_jitter_ros.report.plotting import AFTER, BEFORE, MEASURED, panels, with_effects
+from sa_jitter_ros.report.plotting import (
+    AFTER, BEFORE, legend_above, MEASURED, PANEL_HEIGHT, panels, WIDTH, with_effects)
 
 Array = NDArray[Any]
 
@@ -47,7 +48,7 @@ class Illustration:
     def png(self) -> bytes:
         """Return the figure as PNG."""
         buffer = io.BytesIO()
-        self.figure.savefig(buffer, format='png', dpi=110)
+        self.figure.savefig(buffer, format='png', dpi=144)
         return buffer.getvalue()
 
 
@@ -116,7 +117,7 @@ def _residual_figure(trace: Trace) -> Figure:
     position, orders = _positions(trace)
     versions = _versions(trace)
     held_out = list(trace.held_out)
-    figure = Figure(figsize=(10.0, 3.1 * (1 + len(versions))), layout='constrained')
+    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * (1 + len(versions))), layout='constrained')
     axes = figure.subplots(1 + len(versions), 1, sharex=True)
     observed = trace.attenuation[held_out]
     axes[0].errorbar(position, observed.mean(axis=0), yerr=observed.std(axis=0), fmt='o',
@@ -126,7 +127,7 @@ def _residual_figure(trace: Trace) -> Figure:
         axes[0].plot(position, expected.attenuation[held_out].mean(axis=0), '_', color=colour,
                      markersize=12, markeredgewidth=2, label=f'predicted, {label}')
     axes[0].set_ylabel('attenuation\n(1: no loss)')
-    axes[0].legend(fontsize='small', loc='best')
+    legend_above(axes[0])
     for row, (label, colour, _, residual) in zip(axes[1:], versions):
         half = _BAND * residual.standard_error
         row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
@@ -137,7 +138,7 @@ def _residual_figure(trace: Trace) -> Figure:
         row.use_sticky_edges = False
         row.margins(y=0.08)
         row.set_ylabel('observed minus predicted\nattenuation')
-        row.legend(fontsize='small', loc='best')
+        legend_above(row)
     step = max(1, orders.size // 30)
     axes[-1].set_xticks(np.arange(orders.size)[::step], [f'{g:g}' for g in orders[::step]],
                         rotation=0 if orders.size <= 20 else 90)
@@ -149,7 +150,7 @@ def _residual_figure(trace: Trace) -> Figure:
 def _distribution_figure(trace: Trace) -> Figure:
     chosen = _most_telling(trace)
     held_out = np.array(trace.held_out)
-    figure, axes = panels(len(chosen) + 1, columns=min(len(chosen) + 1, 4))
+    figure, axes = panels(len(chosen) + 1)
     amplitude = trace.amplitude[held_out]
     for one, line in zip(axes, chosen):
         order = trace.observation.orders[trace.lines.order[line]]
@@ -164,7 +165,7 @@ def _distribution_figure(trace: Trace) -> Figure:
             one.plot(x, expected.mean_cdf(trace.held_out, line, x), color=colour, label=label)
         one.set(title=f'order {order:g}, {channel}', xlabel='amplitude / mean level',
                 ylabel='cumulative share')
-        one.legend(fontsize='x-small')
+        one.legend(fontsize='small')
     _probability_panel(trace, axes[-1])
     return figure
 
@@ -177,7 +178,7 @@ def _probability_panel(trace: Trace, axes: Axes) -> None:
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
     axes.set(title='all lines', xlabel='predicted probability',
              ylabel='cumulative share')
-    axes.legend(fontsize='x-small')
+    axes.legend(fontsize='small')
 
 
 def _most_telling(trace: Trace) -> list[int]:

@@ -11,34 +11,50 @@
 """The report of a trace as files: `report.json`, self-contained `report.html`, PNG figures."""
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 import json
-import re
+from pathlib import PurePath
 from typing import Any
 
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report.figures import illustrate, Illustration
-from sa_jitter_ros.report.report import number_text, parameters_text, unit_text
+from sa_jitter_ros.report.number_text import measured_text, number_text, p_text, percent_text
+from sa_jitter_ros.report.report import parameter_unit
+from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
 Json = Any
 
 _STYLE = """
-body { font: 15px/1.45 sans-serif; color: #222; max-width: 62rem; margin: 2rem auto;
-       padding: 0 1rem }
-h1 { font-size: 1.5rem }
+body { font: 16px/1.5 sans-serif; color: #222; max-width: 44rem; margin: 1.5rem auto;
+       padding: 0 1rem; overflow-wrap: break-word }
+h1 { font-size: 1.5rem; margin-bottom: .3rem; overflow-wrap: anywhere }
 h2 { font-size: 1.15rem; margin-top: 2rem }
+h3 { font-size: 1rem; margin-bottom: .2rem }
+.quiet, figcaption { color: #555; font-size: .9rem }
 .verdict { font-size: 1.1rem; padding: .8rem 1rem; border-left: .4rem solid; background: #f3f3f3 }
 .traced { border-color: #1f77b4 }
 .none { border-color: #2ca02c }
 .unexplained { border-color: #d62728 }
-table { border-collapse: collapse; margin: .5rem 0 }
-th, td { border: 1px solid #ccc; padding: .2rem .6rem; text-align: left; vertical-align: top }
-td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap }
+pre { background: #f3f3f3; padding: .8rem; white-space: pre-wrap; font-size: .85rem }
+table { border-collapse: collapse; margin: .5rem 0; width: 100%; font-size: .9rem }
+th, td { border-bottom: 1px solid #ccc; padding: .25rem .5rem .25rem 0; text-align: left;
+         vertical-align: top; font-variant-numeric: tabular-nums }
+.pairs td, .cards td { overflow-wrap: anywhere }
+th { color: #555; font-weight: normal }
 figure { margin: 1rem 0 }
-img { max-width: 100% }
-figcaption { color: #555 }
+img { width: 100%; max-width: 38rem }
+summary { cursor: pointer; font-weight: bold; padding: .3rem 0 }
+@media (max-width: 40rem) {
+  .cards tr { display: block; padding: .4rem 0; border-bottom: 1px solid #ccc }
+  .cards tr.head { display: none }
+  .cards td { display: grid; grid-template-columns: 9rem minmax(0, 1fr); border: none; padding: 0 }
+  .cards td::before { content: attr(data-label); color: #555 }
+}
 """
+_TITLE = 'Keyphasor jitter: measured against predicted'
+_UNITS = {'keyphasor_rate': 'Hz', 'trigger_speed': 'Hz', 'sample_rate': 'Hz', 'jitter_std': 's',
+          'jitter_table': 's'}
 _ERRORS = (
     ('rms', 'RMS of observed minus predicted attenuation'),
     ('rms_standard_error', 'standard error that the RMS contains (in quadrature)'),
@@ -46,8 +62,7 @@ _ERRORS = (
     ('chi2_per_dof', 'chi2 per degree of freedom of the amplitudes'),
     ('ks', 'Kolmogorov-Smirnov distance from the predicted distribution'),
     ('cramer_von_mises', 'Cramer-von Mises statistic'),
-    ('coverage_95', 'share of amplitudes in the predicted 95 % band'),
-    ('p_value', 'p value of the residual'))
+    ('coverage_95', 'share of amplitudes in the predicted 95 % band'))
 
 
 def report_files(trace: Trace, content: Mapping[str, Json]) -> Mapping[str, bytes]:
@@ -66,62 +81,25 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
 
     `content` is that of the common `report.json`; `files` are those of each shaft.
     """
-    rows = ''.join(
-        f'<tr><td><a href="{escape(shaft)}/report.html">{escape(shaft)}</a></td>'
-        f'<td>{escape(verdict_sentence(item))}</td></tr>\n'
-        for shaft, item in content['shafts'].items())
-    page = _page(content['verdict'], [
-        '<h1>Measured against predicted attenuation</h1>',
-        f'<table>\n<tr><th>shaft</th><th>result</th></tr>\n{rows}</table>'])
-    return {'report.json': _json(content), 'report.html': page.encode(),
+    shafts = content['shafts']
+    parts = [*_head(next(iter(shafts.values())), list(shafts))]
+    for shaft, item in shafts.items():
+        parts += [f'<h2><a href="{escape(shaft)}/report.html">Shaft {escape(shaft)}</a></h2>',
+                  _verdict(item)]
+    return {'report.json': _json(content),
+            'report.html': _page(content['verdict'], parts).encode(),
             **{f'{shaft}/{name}': data for shaft, each in files.items()
                for name, data in each.items()}}
-
-
-def verdict_sentence(content: Mapping[str, Json]) -> str:
-    """Return the verdict of a report in one sentence."""
-    before, after = content['error_before'], content['error_after']
-    rms_before, rms_after = number_text(before['rms']), number_text(after['rms'])
-    error = (f'the held-out error goes from {rms_before} to {rms_after} '
-             f'(RMS of observed minus predicted attenuation), chi2 per degree of freedom from '
-             f'{number_text(before["chi2_per_dof"])} to {number_text(after["chi2_per_dof"])}')
-    added = ' and '.join(f'{item["name"]} ({parameters_text(item)})'
-                         for item in content['missing_effects'])
-    if not content['lines']:
-        return ('Nothing was found, and nothing could have been seen: no line of the vibration '
-                'can be compared with its prediction.')
-    if content['verdict'] == 'none':
-        return (f'The declared model suffices: no significant residual (p = '
-                f'{number_text(before["p_value"])}), held-out error {rms_before} (RMS of observed '
-                'minus predicted attenuation).')
-    if content['verdict'] == 'traced':
-        return f'The declared model lacks {added}. With it {error}.'
-    remains = ', '.join(filter(None, (f'p = {number_text(after["p_value"])}', content['remains'])))
-    if added:
-        return (f'The residual is not explained: even with {added} a significant residual remains '
-                f'({remains}); {error}.')
-    return (f'The residual is significant ({remains}, held-out error {rms_after}) and '
-            'none of the known effects explains it.')
 
 
 def html(content: Mapping[str, Json], figures: Sequence[Illustration],
          pictures: Mapping[str, bytes]) -> str:
     """Return the page; `pictures` are the PNGs of the figures by file name."""
-    verdict = content['verdict']
-    compared = [
-        *_effects(content['missing_effects']),
-        '<h2>Error of held-out acquisitions</h2>', _error_table(content),
-        '<h2>Dependence of the residual on other quantities</h2>',
-        _dependence_table(content['dependence']),
+    return _page(content['verdict'], [
+        *_head(content, [content['shaft']]), _verdict(content), *_found(content),
+        *_amplitudes(content), *_steps(content),
         *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
-        '<h2>Candidates</h2>', _candidate_table(content['candidates']),
-        '<h2>Lines</h2>', _line_table(content['lines'])]
-    return _page(verdict, [
-        '<h1>Measured against predicted attenuation</h1>',
-        f'<p class="verdict {escape(verdict)}">{escape(verdict_sentence(content))}</p>',
-        *(f'<p>Note: {escape(remark)}.</p>' for remark in content['remarks']),
-        *(compared if content['lines'] else ()),
-        '<h2>Declared model and data</h2>', _declared_table(content)])
+        '<h2>Evidence</h2>', *_evidence(content)])
 
 
 def _json(content: Mapping[str, Json]) -> bytes:
@@ -130,67 +108,69 @@ def _json(content: Mapping[str, Json]) -> bytes:
 
 def _page(verdict: str, parts: Sequence[str]) -> str:
     return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            f'<title>Report: {escape(verdict)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n'
-            + '\n'.join(parts) + '\n</body>\n</html>\n')
+            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+            f'<title>Report: {escape(verdict)}</title>\n<style>{_STYLE}</style>\n</head>\n'
+            '<body>\n' + '\n'.join(parts) + '\n</body>\n</html>\n')
 
 
-def _effects(effects: Sequence[Mapping[str, Json]]) -> Iterable[str]:
-    for number, item in enumerate(effects, 1):
-        yield f'<h2>{number}. Missing effect: {escape(item["name"])}</h2>'
-        yield _table(('parameter', 'value', 'standard error', 'unit'), [
-            (name, number_text(value['value']), number_text(value['standard_error']),
-             unit_text(value)) for name, value in item['parameters'].items()])
-        text = f'Evidence: {item["evidence"]}.'
-        if item['indistinguishable_from']:
-            text += (' These data do not distinguish it from '
-                     f'{", ".join(item["indistinguishable_from"])}.')
-        yield f'<p>{escape(text)}</p>'
+# --- for five minutes ----------------------------------------------------------------------------
+
+def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
+    """Return which recording this is about, and when and by what it was analysed."""
+    recordings = [PurePath(name).name for name in content['recordings']]
+    yield f'<h1>{escape(", ".join(recordings) or _TITLE)}</h1>'
+    if recordings:
+        yield f'<p class="quiet">{_TITLE}</p>'
+    count = sum(content['acquisitions'].values())
+    orders = '; orders ' + number_text(content['orders']) if len(shafts) == 1 else ''
+    names = ', '.join(name for name in shafts if name not in ('', 'shaft'))
+    analysed = ' '.join(filter(None, (
+        content['created'].replace('T', ' ').replace('+00:00', ' UTC'),
+        f'with sa_jitter_ros {content["version"]}')))
+    yield (f'<p>Analysed {escape(analysed)}: {count} averages of '
+           f'{content["declared"]["trigger_cycles"]} trigger cycles at '
+           f'{content["measured_speed"]:.4g} Hz{escape(orders)}'
+           + (f'; shaft{"s" * (len(shafts) > 1)} {escape(names)}' if names else '') + '.</p>')
 
 
-def _error_table(content: Mapping[str, Json]) -> str:
-    before, after = content['error_before'], content['error_after']
-    return _table(('', 'before', 'after'), [
-        *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
-        ('unsteadiness: unexplained scatter of the amplitudes, which chi2 and p value take into '
-         'account',
-         *2 * (number_text(content['unsteadiness']),))])
+def _verdict(content: Mapping[str, Json]) -> str:
+    return (f'<p class="verdict {escape(content["verdict"])}">'
+            f'{_kept(verdict_sentence(content))}</p>')
 
 
-def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
-    return _table(
-        ('quantity', 'lowest', 'highest', 'change of the residual, before', 'p value',
-         'change of the residual, after', 'p value'),
-        [(item['on'].replace('_', ' '), number_text(item['low']),
-          f'{number_text(item["high"])} {item["unit"]}'.strip(),
-          *(text for when in ('before', 'after') for text in (
-              f'{number_text(item[when]["change"])} ± {number_text(item[when]["standard_error"])}',
-              number_text(item[when]['p_value'])))) for item in rows])
+def _found(content: Mapping[str, Json]) -> Iterator[str]:
+    found = list(findings(content))
+    if found or content['remarks']:
+        yield '<h2>What was found</h2>'
+    for effect, meaning in found:
+        yield f'<p><b>{_kept(effect)}</b><br>{escape(meaning)}</p>'
+    for remark in content['remarks']:
+        yield f'<p>Note: {escape(remark)}.</p>'
 
 
-def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
-    return _table(('round', 'effect', 'held-out score', 'p value', 'outcome'), [
-        (item['round'], item['name'], number_text(item['held_out_score']),
-         number_text(item['p_value']), item['rejected_because'] or 'added')
-        for item in candidates])
+def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
+    """Return what happens to the amplitude of each order."""
+    shares = order_shares(content)
+    if not shares:
+        return
+    against = ('those of the better keyphasor'
+               if content['against'] == 'reference keyphasor' else 'the corrected amplitudes')
+    added = bool(content['missing_effects'])
+    yield '<h2>What it does to the amplitudes</h2>'
+    yield _table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
+        (number_text(item.order), percent_text(item.observed, item.standard_error),
+         *(percent_text(value, item.standard_error, shown=False)
+           for value in (item.before, *((item.after,) if added else ())))) for item in shares])
+    yield ('<p class="quiet">Share of the true amplitude that an average keeps, with one standard '
+           f'error; the mean over the channels, of {content["acquisitions"]["held_out"]} averages '
+           f'that served no fit. Measured against {against}.</p>')
 
 
-def _line_table(lines: Sequence[Mapping[str, Json]]) -> str:
-    keys = ('level', 'observed', 'predicted_before', 'predicted_after', 'standard_error')
-    return _table(
-        ('order', 'channel', 'amplitude', 'observed attenuation', 'predicted before',
-         'predicted after', 'standard error'),
-        [(number_text(item['order']), item['channel'], *(number_text(item[key]) for key in keys))
-         for item in lines])
-
-
-def _declared_table(content: Mapping[str, Json]) -> str:
-    rows = [(key, number_text(value)) for key, value in content['declared'].items()]
-    rows += [('measured trigger_speed', number_text(content['measured_speed'])),
-             ('recordings', ', '.join(content['recordings'])),
-             ('attenuation measured against', content['against']),
-             ('acquisitions fitted', content['acquisitions']['fit']),
-             ('acquisitions held out', content['acquisitions']['held_out'])]
-    return _table(('quantity', 'value'), rows)
+def _steps(content: Mapping[str, Json]) -> Iterator[str]:
+    yield '<h2>What to do next</h2>'
+    yield '<ol>' + ''.join(f'<li>{_kept(step)}</li>' for step in next_steps(content)) + '</ol>'
+    if content['parameter_file']:
+        yield f'<pre>{escape(content["parameter_file"])}</pre>'
 
 
 def _figure(item: Illustration, picture: bytes) -> str:
@@ -200,13 +180,125 @@ def _figure(item: Illustration, picture: bytes) -> str:
             f'<figcaption>{escape(item.caption)}</figcaption></figure>')
 
 
-def _table(head: Sequence[str], rows: Iterable[Sequence[Json]]) -> str:
-    lines = ['<tr>' + ''.join(f'<th>{escape(cell)}</th>' for cell in head) + '</tr>']
-    lines += ['<tr>' + ''.join(_cell(cell) for cell in row) + '</tr>' for row in rows]
-    return '<table>\n' + '\n'.join(lines) + '\n</table>'
+# --- for those who want to know ------------------------------------------------------------------
+
+def _evidence(content: Mapping[str, Json]) -> Iterator[str]:
+    """Return everything that the report rests on, each part to be opened."""
+    if content['lines']:
+        if content['missing_effects']:
+            yield _part('Effects that are missing', *_effects(content))
+        yield _part('Error of the averages that served no fit', _error_table(content))
+        yield _part('Dependence of the residual on other quantities',
+                    _dependence_table(content['dependence']))
+        yield _part('All effects that were tried', _candidate_table(content['candidates']))
+        yield _part('What an effect that was not found could be at most', _limit_table(content))
+        yield _part('All lines', _line_table(content))
+    yield _part('Declared model and data', _declared_table(content))
 
 
-def _cell(value: Json) -> str:
-    text = str(value)
-    kind = ' class="number"' if re.fullmatch(r'–|[-\d.e+]+', text) else ''
-    return f'<td{kind}>{escape(text)}</td>'
+def _part(title: str, *parts: str) -> str:
+    content = '\n'.join(parts)
+    return f'<details><summary>{escape(title)}</summary>\n{content}\n</details>'
+
+
+def _effects(content: Mapping[str, Json]) -> Iterator[str]:
+    for number, item in enumerate(content['missing_effects'], 1):
+        yield f'<h3>{number}. {escape(item["name"])}</h3>'
+        yield _table(('parameter', 'value'), [
+            (name, measured_text(value['value'], value['standard_error'], parameter_unit(
+                item['name'], name, value['unit'], content['unit'])))
+            for name, value in item['parameters'].items()])
+        yield f'<p>Evidence: {_kept(item["evidence"])}.</p>'
+
+
+def _error_table(content: Mapping[str, Json]) -> str:
+    before, after = content['error_before'], content['error_after']
+    return _table(('', 'before', 'after'), [
+        *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
+        ('p value of the residual', p_text(before['p_value']), p_text(after['p_value'])),
+        ('unsteadiness: unexplained scatter of the amplitudes, which chi2 and p value take into '
+         'account', *2 * (percent_text(content['unsteadiness']),))])
+
+
+def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
+    return _table(
+        ('over', 'from', 'to', 'change of the residual, before', 'p value', 'after',
+         'p value, after'),
+        [(item['on'].replace('_', ' '), number_text(item['low']),
+          measured_text(item['high'], None, item['unit']),
+          *(text for when in ('before', 'after') for text in (
+              measured_text(item[when]['change'], item[when]['standard_error']),
+              p_text(item[when]['p_value'])))) for item in rows], kind='cards')
+
+
+def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
+    return _table(('effect', 'round', 'held-out score', 'p value', 'outcome'), [
+        (item['name'], item['round'], number_text(item['held_out_score']),
+         p_text(item['p_value']), item['rejected_because'] or 'added')
+        for item in candidates], kind='cards')
+
+
+def _limit_table(content: Mapping[str, Json]) -> str:
+    return _table(('effect', 'parameter', 'at 95 %'), [
+        (item['name'], item['parameter'], ' and '.join(filter(None, (
+            bound and f'{word} {bound}' for word, bound in (
+                ('at least', _bound(item, 'lower_95', content)),
+                ('at most', _bound(item, 'upper_95', content)))))) or '–')
+        for item in content['limits']])
+
+
+def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> str:
+    return '' if item[key] is None else measured_text(item[key], None, parameter_unit(
+        item['name'], item['parameter'], item['unit'], content['unit']))
+
+
+def _line_table(content: Mapping[str, Json]) -> str:
+    return _table(
+        ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
+        [(number_text(item['order']), item['channel'],
+          measured_text(item['level'], None, content['unit']),
+          percent_text(item['observed'], item['standard_error']),
+          *(percent_text(item[key], item['standard_error'], shown=False)
+            for key in ('predicted_before', 'predicted_after')))
+         for item in content['lines']], kind='cards')
+
+
+def _declared_table(content: Mapping[str, Json]) -> str:
+    declared = content['declared']
+    rows = [(key, f'{_given(value)} {_UNITS.get(key, "")}'.rstrip())
+            for key, value in declared.items() if key != 'effects']
+    rows += [(f'effects.{name}.{key}', _given(value))
+             for name, values in declared['effects'].items() for key, value in values.items()]
+    rows += [('measured trigger_speed', f'{content["measured_speed"]:.6g} Hz'),
+             ('recordings', ', '.join(content['recordings'])),
+             ('attenuation measured against', content['against']),
+             ('acquisitions fitted', content['acquisitions']['fit']),
+             ('acquisitions held out', content['acquisitions']['held_out'])]
+    return _table(('quantity', 'value'), rows, kind='pairs')
+
+
+def _given(value: Json) -> str:
+    """Return a declared value as it was given."""
+    if isinstance(value, list):
+        return ', '.join(map(_given, value)) or '–'
+    return f'{value:.6g}' if isinstance(value, float) else str(value)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[Json]], *, kind: str = '') -> str:
+    """
+    Return a table.
+
+    On a narrow screen the rows of the kind `cards` are blocks with a line per cell; in `pairs`
+    long words break.
+    """
+    lines = ['<tr class="head">' + ''.join(f'<th>{escape(cell)}</th>' for cell in head) + '</tr>']
+    lines += ['<tr>' + ''.join(f'<td data-label="{escape(name)}">{_kept(str(cell))}</td>'
+                               for name, cell in zip(head, row)) + '</tr>' for row in rows]
+    style = f' class="{kind}"' if kind else ''
+    return f'<table{style}>\n' + '\n'.join(lines) + '\n</table>'
+
+
+def _kept(text: str) -> str:
+    """Return a text in which numbers stay together with their errors and units."""
+    return escape(text.replace(' +- ', ' ± ').replace(' ± ', '\u00a0±\u00a0').replace(
+        ' %', '\u00a0%'))

@@ -14,8 +14,10 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
+WIDTH, PANEL_HEIGHT = 5.2, 3.1  # inches: what stands in 10 points is 10 pixels on a phone
 
 
 def with_effects(names: Sequence[str]) -> str:
@@ -23,20 +25,22 @@ def with_effects(names: Sequence[str]) -> str:
     return f'with {names[0]}' if len(names) == 1 else f'with {len(names)} effects'
 
 
-def panels(count: int, *, columns: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` panels in rows of `columns`."""
-    rows = -(-count // columns)
-    figure = Figure(figsize=(3.6 * columns, 3.1 * rows), layout='constrained')
-    axes = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for spare in axes[count:]:
-        spare.remove()
-    for one in axes[:count]:
+def panels(count: int) -> tuple[Figure, list[Axes]]:
+    """Return a figure with `count` panels one below the other, to be read on a phone, too."""
+    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * count),
+                    layout=ConstrainedLayoutEngine(h_pad=0.12))
+    axes = list(figure.subplots(count, 1, squeeze=False).ravel())
+    for one in axes:
         one.grid(alpha=0.3)
-        one.tick_params(labelsize='small')
-    return figure, axes[:count]
+    return figure, axes
 
 
 def legend_below(axes: Axes) -> None:
     """Add the legend below a panel, where it does not hide data."""
-    axes.legend(fontsize='x-small', loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2,
+    axes.legend(fontsize='small', loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2,
                 frameon=False)
+
+
+def legend_above(axes: Axes) -> None:
+    """Add the legend above a panel that has no title."""
+    axes.legend(fontsize='small', loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)

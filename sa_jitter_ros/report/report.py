@@ -25,12 +25,21 @@ from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.report.new_section import new_section
+from sa_jitter_ros.report.number_text import measured_text
+from sa_jitter_ros.version import __version__
 
 Json = Any
 
 
-def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json]:
-    """Return the content of `report.json`; undefined numbers are None."""
+def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = '', unit: str = '',
+           created: str = '') -> Mapping[str, Json]:
+    """
+    Return the content of `report.json`; undefined numbers are None.
+
+    `shaft` is the name of the shaft in a parameter file, '' for the only one; `unit` that of the
+    vibration; `created` the time of the analysis.
+    """
     observation = trace.observation
     orders = observation.orders
     lines = [{
@@ -45,6 +54,11 @@ def report(trace: Trace, *, recordings: Sequence[str] = ()) -> Mapping[str, Json
                      'effects': {effect.name: effect.values for effect in trace.declared}},
         'measured_speed': observation.model.trigger_speed,
         'recordings': list(recordings),
+        'shaft': shaft,
+        'unit': unit,
+        'created': created,
+        'version': __version__,
+        'parameter_file': new_section(trace, shaft=shaft),
         'remarks': [*observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
@@ -87,7 +101,8 @@ def summary(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     text = [f'verdict: {content["verdict"]}', *content['remarks']]
     for effect in content['missing_effects']:
-        text.append(f'missing effect: {effect["name"]} ({parameters_text(effect)})')
+        text.append(f'missing effect: {effect["name"]} '
+                    f'({parameters_text(effect, content["unit"])})')
         text.append(f'  {effect["evidence"]}')
         if effect['indistinguishable_from']:
             text.append(f'  these data do not distinguish it from: '
@@ -161,6 +176,7 @@ def _effect(finding: Finding) -> Mapping[str, Json]:
                               'unit': ranges[name].unit}
                        for name, value in finding.effect.values.items()},
         'evidence': evidence, 'p_value': finding.p_value,
+        'deciding_measurement': finding.deciding_measurement,
         'indistinguishable_from': list(finding.indistinguishable_from)}
 
 
@@ -170,29 +186,18 @@ def _candidate(item: Candidate) -> Mapping[str, Json]:
             'added': not item.rejected_because}
 
 
-def parameters_text(effect: Mapping[str, Json]) -> str:
-    """Return the parameters of an effect of the report, with standard errors and units."""
+def parameters_text(effect: Mapping[str, Json], unit: str = '') -> str:
+    """
+    Return the parameters of an effect of the report, with standard errors and units.
+
+    `unit` is that of the vibration, which noise is in.
+    """
     return ', '.join(
-        f'{name} = {_with_error(item["value"], item["standard_error"])} {unit_text(item)}'.rstrip()
+        f'{name} = ' + measured_text(item['value'], item['standard_error'],
+                                     parameter_unit(effect['name'], name, item['unit'], unit))
         for name, item in effect['parameters'].items())
 
 
-def unit_text(parameter: Mapping[str, Json]) -> str:
-    """Return the unit of a parameter of the report; empty for a number without unit."""
-    return '' if parameter['unit'] == '1' else str(parameter['unit'])
-
-
-def number_text(value: Json) -> str:
-    """Return a value of the report with 4 digits, a dash for an undefined one."""
-    if value is None:
-        return '–'
-    if isinstance(value, list):
-        return '[' + ', '.join(number_text(item) for item in value) + ']'
-    return f'{value:.4g}' if isinstance(value, float) else str(value)
-
-
-def _with_error(value: Json, error: Json) -> str:
-    if isinstance(value, list):
-        errors = error if isinstance(error, list) else [error] * len(value)
-        return '[' + ', '.join(_with_error(*pair) for pair in zip(value, errors)) + ']'
-    return number_text(value) + (f' ± {error:.2g}' if isinstance(error, float) else '')
+def parameter_unit(effect: str, name: str, unit: str, vibration: str) -> str:
+    """Return the unit of a parameter: that of the vibration for the size of a noise."""
+    return vibration or unit if (effect, name) == (AdditiveNoise.name, 'std') else unit

@@ -1,0 +1,123 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Numbers of a report as people read them: with the digits that their error leaves, and units."""
+
+from collections.abc import Sequence
+import math
+from typing import Any
+
+Json = Any
+
+_PREFIXES = (('', 1.0), ('m', 1e-3), ('µ', 1e-6), ('n', 1e-9))
+_PREFIXED = ('s', 'rad')
+_EXACT = 1e-9  # relative error of a number that only rounding makes uncertain
+_DIGITS = 3  # of a number without error
+_LEAST_P = 1e-12
+
+
+def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
+    """
+    Return a value with two digits of its standard error, in a unit that suits its size.
+
+    Lists have an error for each value, or one for all. Without error, or where it is but rounding,
+    there are three digits, all of a number that is whole.
+
+    >>> measured_text(8.042e-05, 6.92e-06, 's')
+    '80.4 ± 6.9 µs'
+    >>> measured_text(3300.000000000002, 2.2e-12, 'Hz')
+    '3300 Hz'
+    >>> measured_text([0.0061, -0.0042], 0.00021, 'rad')
+    '6.10 ± 0.21, -4.20 ± 0.21 mrad'
+    >>> measured_text(0.01931, 0.00131, '1'), measured_text(None)
+    ('0.0193 ± 0.0013', '–')
+    """
+    values = value if isinstance(value, list) else [value]
+    errors = error if isinstance(error, list) else [error] * len(values)
+    scale, unit = _unit(values, unit)
+    texts = [_one(item if item is None or isinstance(item, str) else item / scale,
+                  each if each is None else each / scale) for item, each in zip(values, errors)]
+    return ' '.join(filter(None, (', '.join(texts), unit if texts != ['–'] else '')))
+
+
+def percent_text(value: Json, error: Json = None, *, shown: bool = True) -> str:
+    """
+    Return a share in percent, with two digits of its standard error; `shown` writes the error.
+
+    >>> percent_text(0.8111402, 0.008426), percent_text(0.8016, 0.008426, shown=False)
+    ('81.11 ± 0.84 %', '80.16 %')
+    >>> percent_text(0.17067)
+    '17.1 %'
+    """
+    if value is None:
+        return '–'
+    text = measured_text(100.0 * value, None if error is None else 100.0 * error, '%')
+    return text if shown else text.partition(' ')[0] + ' %'
+
+
+def number_text(value: Json) -> str:
+    """
+    Return a number, a text or a list of them, with three digits, whole numbers with all.
+
+    >>> number_text(0.000212760), number_text(51200.0), number_text([19.0, 38.0])
+    ('0.000213', '51200', '19, 38')
+    """
+    return measured_text(value)
+
+
+def p_text(value: Json) -> str:
+    """
+    Return a probability; one that is smaller than anybody should believe is a limit.
+
+    >>> p_text(0.51675), p_text(3.9e-37), p_text(None)
+    ('0.517', '< 1e-12', '–')
+    """
+    if value is not None and value <= _LEAST_P:
+        return f'< {_LEAST_P:.0e}'
+    return number_text(value)
+
+
+def _unit(values: Sequence[Json], unit: str) -> tuple[float, str]:
+    """Return the size of a unit that suits the largest value, and its name."""
+    unit = '' if unit == '1' else unit.replace('^2', '²')
+    largest = max((abs(item) for item in values if isinstance(item, (int, float))), default=0.0)
+    if unit not in _PREFIXED or not 0.0 < largest < 1.0:
+        return 1.0, unit
+    prefix, scale = next((item for item in _PREFIXES if largest >= item[1]), _PREFIXES[-1])
+    return scale, prefix + unit
+
+
+def _one(value: Json, error: Json) -> str:
+    if value is None:
+        return '–'
+    if isinstance(value, str):
+        return value
+    if error is None or not error > _EXACT * abs(value):
+        whole = round(value)
+        if abs(value - whole) <= _EXACT * abs(value) and abs(whole) < 10**9:
+            return str(whole)
+        return _fixed(value, _DIGITS - 1 - _exponent(value))
+    places = 1 - _exponent(error)
+    return f'{_fixed(value, places)} ± {_fixed(error, places)}'
+
+
+def _exponent(value: float) -> int:
+    """Return the exponent of ten of the first digit of a number that is not 0."""
+    return int(f'{value:.1e}'.partition('e')[2])
+
+
+def _fixed(value: float, places: int) -> str:
+    """Return a number rounded at a decimal place, with an exponent where it has many zeros."""
+    if not value:
+        return '0'
+    if places > 6:
+        return f'{value:.{max(places + _exponent(value), 0)}e}'
+    rounded = round(value, places)
+    return f'{rounded:.{max(places, 0)}f}' if math.isfinite(rounded) else '–'

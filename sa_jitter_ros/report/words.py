@@ -1,0 +1,136 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What a report says in plain words: what was found, what it does to amplitudes, what to do."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.effects import EFFECTS
+from sa_jitter_ros.report.number_text import number_text, p_text, percent_text
+from sa_jitter_ros.report.report import parameters_text
+
+Json = Any
+
+_LOSS = 0.05  # of an amplitude, from which on correction is worth its work
+_LARGEST = 0.01  # change of an amplitude that the effects of `undecided` may make, at least
+
+
+@dataclass(frozen=True)
+class OrderShare:
+    """Shares of the true amplitude of an order that the averages keep, over all its lines."""
+
+    order: float
+    observed: float
+    standard_error: float
+    before: float
+    after: float
+
+
+def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
+    """
+    Return measured and predicted shares by order, the mean over the channels.
+
+    All channels share the pulse errors, so that their mean is no more certain than one of them.
+    """
+    shares = []
+    for order in sorted({item['order'] for item in content['lines']}):
+        lines = [item for item in content['lines'] if item['order'] == order]
+        shares.append(OrderShare(order, *(
+            float(np.mean([item[key] for item in lines])) for key in (
+                'observed', 'standard_error', 'predicted_before', 'predicted_after'))))
+    return tuple(shares)
+
+
+def verdict_sentence(content: Mapping[str, Json]) -> str:
+    """Return the verdict of a report in one sentence."""
+    if not content['lines']:
+        return ('Nothing was found, and nothing could have been seen: no line of the vibration '
+                'can be compared with its prediction.')
+    names = _listed([item['name'] for item in content['missing_effects']], 'and')
+    if content['verdict'] == 'none':
+        return ('The declared model suffices: the averages lose what it predicts, within '
+                f'{_rms(content, "before")} of an amplitude.')
+    if content['verdict'] == 'traced':
+        return (f'The declared model lacks {names}. With it the prediction misses the measured '
+                f'amplitudes by {_rms(content, "after")} instead of {_rms(content, "before")}.')
+    remains = ', '.join(filter(None, (f'p {_equals(content["error_after"]["p_value"])}',
+                                      content['remains'])))
+    if names:
+        return (f'The averages are not explained: even with {names} the prediction misses the '
+                f'measured amplitudes by {_rms(content, "after")} ({remains}).')
+    return (f'The averages are not explained: the prediction misses the measured amplitudes by '
+            f'{_rms(content, "after")} ({remains}), and none of the known effects explains it.')
+
+
+def _rms(content: Mapping[str, Json], when: str) -> str:
+    error = content[f'error_{when}']
+    return percent_text(error['rms'], error['rms_standard_error'])
+
+
+def _equals(probability: Json) -> str:
+    text = p_text(probability)
+    return text if text.startswith('<') else f'= {text}'
+
+
+def findings(content: Mapping[str, Json]) -> Iterator[tuple[str, str]]:
+    """Iterate over what was found: the effect with its numbers, and what that means."""
+    for item in content['missing_effects']:
+        meaning = _sentence(EFFECTS[item['name']].meaning) if item['name'] in EFFECTS else ''
+        if item['indistinguishable_from']:
+            others = _listed(item['indistinguishable_from'], 'or')
+            meaning += f' It may also be {others}: these data do not tell them apart.'
+        yield f'{item["name"]}: {parameters_text(item, content["unit"])}', meaning.strip()
+
+
+def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
+    """Return what to do next, the most useful first."""
+    steps = []
+    shares = order_shares(content)
+    if content['parameter_file']:
+        steps.append('Paste the section below into your machine file: predictions then hold for '
+                     'this machine.')
+    if content['verdict'] == 'unexplained':
+        steps.append('Do not rely on predictions for this machine. Take corrected amplitudes, '
+                     'which need none, and look in the evidence below at when and where the rest '
+                     'appears.')
+    if shares and min(item.observed for item in shares) < 1.0 - _LOSS:
+        worst = min(shares, key=lambda item: item.observed)
+        steps.append(
+            f'The averages lose {percent_text(1.0 - worst.observed, worst.standard_error)} of '
+            f'order {number_text(worst.order)}. Take corrected amplitudes (correct_jitter: true '
+            'in synchronous_averager), and compare no raw amplitudes across keyphasors.')
+    for item in content['missing_effects']:
+        if item['name'] in EFFECTS and EFFECTS[item['name']].remedy:
+            steps.append(f'Against {item["name"]}: {EFFECTS[item["name"]].remedy}.')
+        if item['indistinguishable_from']:
+            steps.append(f'To tell {item["name"]} from '
+                         f'{_listed(item["indistinguishable_from"], "or")}, take '
+                         f'{item["deciding_measurement"]}.')
+    if content['undecided']:
+        steps.append('This recording cannot exclude '
+                     f'{_listed(content["undecided"], "or")}, which may change '
+                     f'an amplitude by {percent_text(_LARGEST)} or more. A longer recording '
+                     'can.')
+    if not content['lines']:
+        steps.append('Declare orders that stand above the noise, use a quieter channel, or record '
+                     'a better keyphasor beside this one (reference_pulse_times).')
+    return steps or ['Nothing: predictions of the declared model hold for this machine.']
+
+
+def _sentence(text: str) -> str:
+    return f'{text[:1].upper()}{text[1:]}.' if text else ''
+
+
+def _listed(names: Sequence[str], word: str) -> str:
+    """Return names as a list in a sentence, the last behind a word."""
+    return f' {word} '.join(filter(None, (', '.join(names[:-1]), *names[-1:])))
