@@ -23,11 +23,12 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import lru_cache
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
-from sa_jitter_ros.pulses.resampling import interpolate_between, margin
+from sa_jitter_ros.pulses.resampling import interpolate, interpolate_between, margin
 from scipy.fft import next_fast_len
 
 FloatArray = NDArray[np.float64]
@@ -92,13 +93,12 @@ class CycleSamples:
         """Return some of the cycles."""
         return replace(self, first=self.first + first, count=end - first)
 
-    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
-           end: bool = False) -> FloatArray:
+    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
         """
         Return values (point, channel) at fractions `u` of every cycle, cycle after cycle.
 
         `u` (u,) are the same in all cycles, or (cycle, u) those of each, of which NaN are left
-        out. With `end` the value at the last pulse follows.
+        out.
         """
         pulses = (self.pulses - self.start_time) * self.rate
         # Positions in a cycle count from the sample in front of it, so that they do not depend on
@@ -116,13 +116,15 @@ class CycleSamples:
         index = np.add(whole, before[:, None], out=whole)
         if u.ndim == 2:
             index, fraction = index[~np.isnan(u)], fraction[~np.isnan(u)]
-        index, fraction = index.ravel(), fraction.ravel()
-        if end:
-            last = min(pulses[self.first + self.count] - self.first_index, len(self.samples) - 1.0)
-            index = np.append(index, np.floor(last))
-            fraction = np.append(fraction, last - np.floor(last))
-        return interpolate_between(self.samples, index.astype(np.int32), fraction, method=method,
-                                   cutoff=cutoff)
+        return interpolate_between(self.samples, index.ravel().astype(np.int32), fraction.ravel(),
+                                   method=method, cutoff=cutoff)
+
+    def end(self, *, method: str) -> FloatArray:
+        """Return the values (channel,) at the last pulse."""
+        pulse = (self.pulses[self.first + self.count] - self.start_time) * self.rate
+        last = min(pulse - self.first_index, len(self.samples) - 1.0)
+        return np.asarray(
+            interpolate(self.samples, np.array([max(last, 0.0)]), method=method)[0])
 
     @property
     def first_index(self) -> int:
@@ -252,50 +254,87 @@ def _order_basis(points: int, cycles: float, orders: tuple[float, ...]
     return np.exp(step * np.arange(width)), np.concatenate((coarse.real, coarse.imag))
 
 
+class CycleProjection:
+    """
+    Order amplitudes of some consecutive trigger cycles, from pieces of their grid.
+
+    The grid has `points` equal steps of angle in each of `count` cycles, which are `cycles`
+    fundamental cycles long; the first is number `first_cycle` of those since angle 0, to which
+    phases refer. An amplitude is twice the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
+    """
+
+    def __init__(self, points: int, cycles: float, orders: tuple[float, ...], *, first_cycle: int,
+                 count: int) -> None:
+        self._points, self._cycles, self._orders = points, cycles, orders
+        self._fine, self._coarse = _order_basis(points, cycles, orders)
+        whole, rest = multiples(exact_cycles(cycles), first_cycle, count)
+        # In whole fundamental cycles integer orders make whole turns.
+        self._turns = np.multiply.outer(whole[:-1], np.mod(orders, 1.0)) + np.multiply.outer(
+            rest[:-1], orders)
+        self._parts: FloatArray | None = None  # sums over the rows of the coarse table
+        self._rest: ComplexArray | float = 0.0
+        self._begins: FloatArray = np.empty(0)
+
+    @property
+    def step(self) -> int:
+        """Return the points of which every piece but the last must be a multiple."""
+        return int(self._fine.shape[1])
+
+    def add(self, first: int, values: FloatArray) -> None:
+        """Take the values (cycle, point, channel) of all cycles from point `first` on."""
+        count, points, channels = values.shape
+        lines, width = self._fine.shape
+        if not first:
+            self._begins = values[:, 0].copy()
+        if width == self._points:
+            flat = np.moveaxis(values, 1, 2).reshape(count * channels, points)
+            parts = flat @ np.concatenate((self._fine.real, self._fine.imag)).T
+            self._rest = (parts[:, :lines] + 1j * parts[:, lines:]).reshape(
+                count, channels, lines)
+            return
+        row, rows = first // width, points // width
+        if rows:
+            parts = self._coarse[:, row:row + rows] @ values[:, :rows * width].reshape(
+                count, rows, width * channels)
+            self._parts = parts if self._parts is None else np.add(
+                self._parts, parts, out=self._parts)
+        if rows * width < points:
+            last = self._coarse[:, row + rows]
+            total = self._fine[:, :points - rows * width] @ values[:, rows * width:]
+            self._rest = np.moveaxis((last[:lines] + 1j * last[lines:])[:, None] * total, 1, 2)
+
+    def amplitudes(self, end: FloatArray) -> ComplexArray:
+        """Return them (cycle, channel, order), given the very last value `end` (channel,)."""
+        total: Any = self._rest
+        if self._parts is not None:
+            lines, width = self._fine.shape
+            sums = self._parts[:, :lines] + 1j * self._parts[:, lines:]
+            sums = sums.reshape(len(sums), lines, width, -1)
+            total = total + np.moveaxis(np.matmul(self._fine[:, None], sums)[:, :, 0], 1, 2)
+        ends = np.concatenate((self._begins, end[None]))
+        turn = np.exp(-2j * np.pi * self._cycles * np.array(self._orders))
+        total = total + (ends[1:, :, None] * turn - ends[:-1, :, None]) / 2.0
+        return np.asarray(
+            total * (2.0 / self._points * np.exp(-2j * np.pi * self._turns))[:, None])
+
+
 def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first_cycle: int = 0,
             count: int = 1) -> ComplexArray:
     """
     Return the complex peak amplitudes (cycle, channel, order) of consecutive trigger cycles.
 
     `grid` (count x points + 1, channel) are the values of `count` cycles at equal steps of angle,
-    and the last end. The first is number `first_cycle` of those since angle 0, to which phases
-    refer. An amplitude is twice the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
+    and the last end; the other arguments are those of `CycleProjection`.
 
     >>> theta = np.linspace(0.0, 1.0, 65)
     >>> wave = 3.0 * np.cos(2.0 * np.pi * 4.0 * theta)[:, None]
     >>> abs(project(wave, 1.0, (4.0, 5.0))).round(6)
     array([[[3., 0.]]])
     """
-    points, channels = (len(grid) - 1) // count, grid.shape[1]
-    values = grid[:-1].reshape(count, points, channels)
-    total = _sums(values, cycles, orders)
-    ends = grid[::points]
-    turn = np.exp(-2j * np.pi * cycles * np.array(orders))
-    total += (ends[1:, :, None] * turn - ends[:-1, :, None]) / 2.0
-    whole, rest = multiples(exact_cycles(cycles), first_cycle, count)
-    # In whole fundamental cycles integer orders make whole turns.
-    turns = np.multiply.outer(whole[:-1], np.mod(orders, 1.0)) + np.multiply.outer(
-        rest[:-1], orders)
-    return np.asarray(total * (2.0 / points * np.exp(-2j * np.pi * turns))[:, None])
-
-
-def _sums(values: FloatArray, cycles: float, orders: tuple[float, ...]) -> ComplexArray:
-    """Return the sums (cycle, channel, order) of values (cycle, point, channel) x exp(-j ...)."""
-    count, points, channels = values.shape
-    fine, coarse = _order_basis(points, cycles, orders)
-    lines, width = fine.shape
-    if width == points:
-        flat = np.moveaxis(values, 1, 2).reshape(count * channels, points)
-        parts = flat @ np.concatenate((fine.real, fine.imag)).T
-        return np.asarray(parts[:, :lines] + 1j * parts[:, lines:]).reshape(count, channels, lines)
-    rows = coarse.shape[1] - 1
-    parts = coarse[:, :rows] @ values[:, :rows * width].reshape(count, rows, width * channels)
-    sums = (parts[:, :lines] + 1j * parts[:, lines:]).reshape(count, lines, width, channels)
-    total = np.matmul(fine[:, None], sums)[:, :, 0]
-    if rows * width < points:
-        last = coarse[:lines, rows:] + 1j * coarse[lines:, rows:]
-        total += last * (fine[:, :points - rows * width] @ values[:, rows * width:])
-    return np.moveaxis(total, 1, 2)
+    points = (len(grid) - 1) // count
+    projection = CycleProjection(points, cycles, orders, first_cycle=first_cycle, count=count)
+    projection.add(0, grid[:-1].reshape(count, points, -1))
+    return projection.amplitudes(grid[-1])
 
 
 def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatArray]:

@@ -25,7 +25,7 @@ Undefined values are NaN.
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 _CACHED = 1 << 16  # numbers
 
@@ -42,8 +42,11 @@ def _power(values: Array) -> FloatArray:
 
 def _sum_of_powers(values: Array) -> FloatArray:
     """Return the sum of the squared magnitudes over the first axis."""
-    parts = (values.real, values.imag) if np.iscomplexobj(values) else (values,)
-    return np.asarray(sum(np.einsum('k...,k...->...', part, part) for part in parts))
+    if len(values) == 1:
+        return _power(values[0])
+    if np.iscomplexobj(values):
+        return _sum_of_powers(values.real) + _sum_of_powers(values.imag)
+    return np.asarray(np.einsum('k...,k...->...', values, values))
 
 
 class RunningMean(Protocol):
@@ -66,61 +69,71 @@ class RunningMean(Protocol):
 
 
 class BlockMean:
-    """Mean of all arrays since the start (Welford 1962); mergeable (Chan et al. 1983)."""
+    """
+    Mean of all arrays since the start; mergeable.
+
+    It keeps the first array and the sums of the steps from it to all arrays, and of their squares.
+    The variance contains the first array, too, so that it is at least a fraction 1 / count of the
+    mean of these squares, and rounding errors are no more than `count` times those of a number.
+    """
 
     def __init__(self) -> None:
         self.count = 0
-        self._mean: Array = np.array(np.nan)
+        self._first: Array = np.array(np.nan)
+        self._sum: Array = np.array(np.nan)
         self._squares: FloatArray = np.array(np.nan)
+        self._new = False  # the arrays that are expected begin with the first one
 
     def update(self, values: Array) -> None:
         """Take one or more arrays (cycle, ...), at least one."""
-        if not self.count:
-            self._mean = values[0].copy()
-            self._squares = np.zeros(values.shape[1:])
-            self.count, values = 1, values[1:]
-            if not len(values):
-                return
-        self.count += len(values)
+        self.expect(len(values), values.shape[1:], values.dtype)
         # Piece by piece, so that what is computed of a piece stays in the cache.
-        size = max(_CACHED // (len(values) * self._mean[:1].size), 1)
-        for first in range(0, len(self._mean), size):
-            piece = slice(first, first + size)
-            self._take(values[:, piece], self._mean[piece], self._squares[piece])
+        size = max(_CACHED // (values[:, :1].size or 1), 1)
+        for first in range(0, values.shape[1], size):
+            self.put(slice(first, first + size), values[:, first:first + size])
 
-    def _take(self, values: Array, mean: Array, squares: FloatArray) -> None:
-        """Move the mean and the squares around it by arrays that are counted already."""
-        steps = values - mean
-        moved = steps.sum(axis=0) if len(steps) > 1 else steps[0]
-        squares += _sum_of_powers(steps)
-        squares -= _power(moved) / self.count
-        mean += moved / self.count
+    def expect(self, count: int, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
+        """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
+        self._new = not self.count
+        if self._new:
+            self._first, self._sum = np.empty(shape, dtype), np.zeros(shape, dtype)
+            self._squares = np.zeros(shape)
+        self.count += count
+
+    def put(self, where: slice, values: Array) -> None:
+        """Take a piece (cycle, where, ...) of the arrays that are expected."""
+        if self._new:
+            self._first[where] = values[0]
+        steps = values - self._first[where]
+        self._sum[where] += steps.sum(axis=0) if len(steps) > 1 else steps[0]
+        self._squares[where] += _sum_of_powers(steps)
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""
         if not other.count:
             return
         if not self.count:
-            self.count = other.count
-            self._mean, self._squares = other._mean.copy(), other._squares.copy()
+            self.count, self._first = other.count, other._first
+            self._sum, self._squares = other._sum.copy(), other._squares.copy()
             return
-        total = self.count + other.count
-        step = other._mean - self._mean
-        self._mean += step * (other.count / total)
-        self._squares += other._squares + _power(step) * (self.count * other.count / total)
-        self.count = total
+        step = other._first - self._first
+        self._sum += other._sum + other.count * step
+        self._squares += other._squares + other.count * _power(step)
+        self._squares += 2.0 * (step * np.conj(other._sum)).real
+        self.count += other.count
 
     @property
     def mean(self) -> Array:
         """Mean so far."""
-        return self._mean.copy()
+        return np.asarray(self._first + self._sum / self.count if self.count else self._first)
 
     @property
     def standard_error(self) -> FloatArray:
         """Return the standard error of the mean; NaN below two arrays."""
         if self.count < 2:
             return np.full(self._squares.shape, np.nan)
-        return np.asarray(np.sqrt(self._squares / (self.count - 1) / self.count))
+        squares = np.maximum(self._squares - _power(self._sum) / self.count, 0.0)
+        return np.asarray(np.sqrt(squares / (self.count - 1) / self.count))
 
 
 class PartsMean(BlockMean):
@@ -142,18 +155,27 @@ class PartsMean(BlockMean):
         super().__init__()
         self._size, self._least = size, least
         self._parts: list[BlockMean] = []
+        self._expected: list[tuple[BlockMean, slice]] = []  # which cycles belong to which part
 
-    def update(self, values: Array) -> None:
-        """Take one or more arrays (cycle, ...), at least one."""
-        self.count += len(values)
-        while len(values):
+    def expect(self, count: int, shape: tuple[int, ...], dtype: DTypeLike = np.float64) -> None:
+        """Begin to take `count` arrays of this shape, which `put` brings piece by piece."""
+        self.count += count
+        while self.count > 2 * self._least * self._size:
+            self._double()
+        self._expected, begin = [], 0
+        while begin < count:
             if not self._parts or self._parts[-1].count == self._size:
-                if len(self._parts) == 2 * self._least:
-                    self._double()
                 self._parts.append(BlockMean())
-            room = self._size - self._parts[-1].count
-            self._parts[-1].update(values[:room])
-            values = values[room:]
+            part = self._parts[-1]
+            end = min(begin + self._size - part.count, count)
+            part.expect(end - begin, shape, dtype)
+            self._expected.append((part, slice(begin, end)))
+            begin = end
+
+    def put(self, where: slice, values: Array) -> None:
+        """Take a piece (cycle, where, ...) of the arrays that are expected."""
+        for part, cycles in self._expected:
+            part.put(where, values[cycles])
 
     def _double(self) -> None:
         for first, second in zip(self._parts[::2], self._parts[1::2]):

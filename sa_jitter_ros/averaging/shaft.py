@@ -27,14 +27,14 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import Repeatability
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
-    choose_samples_per_revolution, CycleSamples, exact_cycles, first_points, grid_points, joined,
-    needed_margin, on_grid, project, waveform_cutoff)
+    choose_samples_per_revolution, CycleProjection, CycleSamples, exact_cycles, first_points,
+    grid_points, joined, needed_margin, on_grid, waveform_cutoff)
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, PartsMean,
                                                   RunningMean, SlidingMean)
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.pulses.angle_law import angle_law
+from sa_jitter_ros.pulses.angle_law import angle_law, LINEAR_LAW
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -43,6 +43,8 @@ ComplexArray = NDArray[np.complex128]
 _ALL_CYCLES = 1 << 40
 #: Samples times channels that are averaged together.
 TOGETHER = 1 << 18
+# Numbers that are resampled, projected and averaged together, but not fewer positions.
+_CACHED, _FEW = 1 << 16, 1 << 11
 
 
 class ShaftAverager:
@@ -161,16 +163,13 @@ class ShaftAverager:
 
     def _average(self, cycles: CycleSamples) -> None:
         """Average cycles that have grids of the same size."""
-        settings, count = self.settings, cycles.count
-        grid, first, points = self._resample(cycles)
-        amplitudes = project(grid, settings.cycle_length, settings.orders,
-                             first_cycle=self._cycle, count=count)
+        count = cycles.count
+        if not self._counted:
+            self._expect_from(self._angle(self._cycle))
+        amplitudes = self._resample(cycles)
         beyond = self.beyond_nyquist(cycles.periods, cycles.rate)
         if beyond.any():
             amplitudes = np.where(beyond[:, None], np.nan, amplitudes)
-        if not self._counted:
-            self._expect_from(self._angle(self._cycle))
-        self._add_points(first, points, self._angle(self._cycle + count))
         self._amplitude_mean.update(amplitudes)
         self._remember(amplitudes)
         edges = cycles.edges.tolist()
@@ -222,20 +221,6 @@ class ShaftAverager:
         return waveform_cutoff(self._points, self.settings.cycle_length, cycles.periods,
                                cycles.rate)
 
-    def _resample(self, cycles: CycleSamples) -> tuple[FloatArray, int, FloatArray]:
-        """Return the grid with its last end, the first waveform point, and the points."""
-        r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
-        cutoff, count = float(self._cutoff(cycles)[0]), int(self._grid_points(cycles)[0])
-        grid = cycles.at(self._law, np.arange(count) / count, method=method, end=True)
-        first, u = first_points(r, n, self._cycle, cycles.count)
-        if on_grid(n, r) and cutoff == 1.0:
-            return grid, int(first[0]), grid[:-1]
-        number = np.diff(first)
-        steps = np.arange(number.max())
-        u = u[:-1, None] + steps / (n * r)
-        u[steps >= number[:, None]] = np.nan
-        return grid, int(first[0]), cycles.at(self._law, u, method=method, cutoff=cutoff)
-
     # --- the average in progress ---
 
     def _start(self) -> None:
@@ -256,6 +241,54 @@ class ShaftAverager:
         self._next_point = 0
         self._full = False  # the waveform has all points, but its end is not reached
         self._whole: deque[int] = deque()  # numbers of the fundamental cycles in a sliding mean
+
+    def _resample(self, cycles: CycleSamples) -> ComplexArray:
+        """
+        Add the points of the waveform, and return the amplitudes (cycle, channel, order).
+
+        The grid is taken in pieces that stay in the cache until they are projected and averaged.
+        """
+        r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
+        cutoff, size = float(self._cutoff(cycles)[0]), int(self._grid_points(cycles)[0])
+        count, channels, first_cycle = cycles.count, cycles.samples.shape[1], self._cycle
+        projection = CycleProjection(size, r, self.settings.orders, first_cycle=first_cycle,
+                                     count=count)
+        end, u = self._angle(first_cycle + count), np.arange(size) / size
+        if len(self._wave) != n:
+            self._wave = np.full((n, channels), np.nan)
+        shared, first = on_grid(n, r) and cutoff == 1.0, first_points(r, n, first_cycle, count)
+        # Trigger cycles that are the fundamental cycles need not be put together.
+        mean = self._wave_mean
+        whole = None
+        if (isinstance(mean, BlockMean) and shared and size == n
+                and self._next_point == first[0][0]):
+            whole = mean
+            whole.expect(count, (n, channels))
+        points = np.empty((count, size if shared and not whole else 0, channels))
+        piece = size
+        if self._law is LINEAR_LAW:  # others fit a cycle at once
+            piece = max(max(_CACHED // channels, _FEW) // (count * projection.step), 1)
+            piece *= projection.step
+        for begin in range(0, size, piece):
+            values = cycles.at(self._law, u[begin:begin + piece], method=method).reshape(
+                count, -1, channels)
+            projection.add(begin, values)
+            if whole:
+                whole.put(slice(begin, begin + piece), values)
+            elif shared:
+                points[:, begin:begin + piece] = values
+        if whole:
+            self._next_point += count * n
+        elif shared:
+            self._add_points(int(first[0][0]), points.reshape(-1, channels), end)
+        else:
+            number = np.diff(first[0])
+            steps = np.arange(number.max())
+            u = first[1][:-1, None] + steps / (n * r)
+            u[steps >= number[:, None]] = np.nan
+            self._add_points(int(first[0][0]), cycles.at(
+                self._law, u, method=method, cutoff=cutoff), end)
+        return projection.amplitudes(cycles.end(method=method))
 
     def _remember(self, amplitudes: ComplexArray) -> None:
         """Append the amplitudes of cycles to those of the window, in memory never reused."""
@@ -298,8 +331,6 @@ class ShaftAverager:
     def _add_points(self, first: int, points: FloatArray, end: Fraction) -> None:
         """Put points into their fundamental cycles; add those that are whole at `end`."""
         n = self._points
-        if len(self._wave) != n:
-            self._wave = np.full((n, points.shape[1]), np.nan)
         if self._full:
             self._take_wave()
         whole = math.floor(end) * n
