@@ -40,6 +40,7 @@ CORE = {
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},
+    'monitoring': SCIENCE | {'averaging', 'errors', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {

@@ -1,0 +1,221 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The sequential test of new values against the baseline, which they join while nothing changes.
+
+Successive values may depend on each other, because a machine is not steady. Their scores are
+predicted from the one before by the correlation that the baseline shows, and what the prediction
+leaves is tested. What came since a change began is taken out of the baseline again. A change ends
+when the scores are again those of the baseline rather than those of the change.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.monitoring.evidence import Evidence, SIZES, threshold
+from sa_jitter_ros.monitoring.speed_bin import SpeedBin
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+#: Values of a baseline from which on new ones can be tested.
+LEAST_LEARNED = 8
+# Correlation counts from so many standard errors on, and up to the largest. Scores show it so many
+# values later: those of a sudden change, which are alike, are found before they count.
+_SURE_CORRELATION, _LARGEST_CORRELATION, _DELAY = 1.0, 0.95, 16
+# A change ends when its absence is more likely by this factor. Of a change that lasts, the latest
+# values count most: so many of them.
+_ENDS, _MEMORY = 1e4, 64.0
+_LARGEST_SUM = 3.0 * math.log(_ENDS)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """
+    Changes against the baseline, each an array (unit, quantity), NaN where none is known.
+
+    `change` and `variance` are in the units of the values, as the `baseline` mean is; `freedom`
+    are the degrees of freedom of the variance, and `doubt` is how far the change may be due to the
+    doubt that grew.
+    """
+
+    change: FloatArray
+    variance: FloatArray
+    baseline: FloatArray
+    freedom: FloatArray
+    doubt: FloatArray
+
+
+class ChangeTest:
+    """
+    Baseline by bins of speed and test of quantities (unit, quantity); each unit is one machine.
+
+    A bin learns `learning` values before it tests. Without a change a unit is found changed once
+    in `scores_per_alarm` values of all its quantities on average. Raises ParameterError for
+    `learning` below `LEAST_LEARNED`.
+    """
+
+    def __init__(self, shape: tuple[int, int], *, learning: int) -> None:
+        if learning < LEAST_LEARNED:
+            raise ParameterError(f'learning is {learning} values: give at least {LEAST_LEARNED}')
+        self.shape, self.learning = shape, learning
+        self.evidence = Evidence(shape)
+        self.bins: dict[int, SpeedBin] = {}
+        self.active: BoolArray = np.zeros(shape, np.bool_)
+        #: Index in `SIZES` of an active change, and mark of the value with which it began.
+        self.size: NDArray[np.int64] = np.zeros(shape, np.int64)
+        self.begun: FloatArray = np.full((2, len(SIZES), *shape), np.nan)
+        self._last: FloatArray = np.full(shape, np.nan)
+        self._products: FloatArray = np.zeros((3, *shape))  # number, lagged, squared
+        self._delayed: FloatArray = np.zeros((_DELAY, 3, *shape))  # and what joins them
+        self._level: FloatArray = np.zeros(shape)  # mean score of an active change
+        self._farthest: FloatArray = np.zeros(shape)
+        self._gone: FloatArray = np.zeros(shape)
+
+    def correlation(self) -> FloatArray:
+        """Return how successive scores correlate (unit, quantity), zero where it is unsure."""
+        count, lagged, squared = self._products
+        found = lagged / np.where(squared > 0.0, squared, np.inf)
+        unsure = found * np.sqrt(np.maximum(count, 1.0)) < _SURE_CORRELATION
+        return np.where(unsure, 0.0, np.minimum(found, _LARGEST_CORRELATION))
+
+    def spread(self) -> FloatArray:
+        """Return the variance of a mean over that of the mean of independent values."""
+        correlation = self.correlation()
+        return np.asarray((1.0 + correlation) / (1.0 - correlation))
+
+    def update(self, key: int, values: FloatArray, noise: FloatArray, doubt: FloatArray,
+               mark: tuple[float, float], scores_per_alarm: float
+               ) -> tuple[BoolArray, BoolArray]:
+        """
+        Take the next values (unit, quantity) in the bin `key`; return what changed and what ended.
+
+        `noise` and `doubt` are as in `SpeedBin.score`, NaN where not known; `mark` are two numbers
+        that say when the values were.
+        """
+        place = self.bins.setdefault(key, SpeedBin(self.shape))
+        spread = self.spread()
+        scores, weights = place.score(values, noise, doubt, spread)
+        known = np.isfinite(scores) & (place.count >= LEAST_LEARNED)
+        scores = np.where(known, scores, np.nan)
+        innovations = self._innovations(scores)
+        ready = known & (place.count >= self.learning - 0.5) & ~self.active
+        place.learn(values, noise, doubt, weights, self.active)
+        none = self.evidence.update(np.where(ready, innovations, np.nan))
+        chosen = np.arange(len(SIZES))[:, None, None] == self.size
+        none = np.where(self.active, ~chosen, none)
+        began = ~none & np.isnan(self.begun[0])
+        self.begun = np.where(none, np.nan, np.where(
+            began, np.array(mark)[:, None, None, None], self.begun))
+        fading = np.where(self.active & chosen, 1.0 - 1.0 / _MEMORY, 1.0)
+        place.observe(values, none, fading)
+        for other in self.bins.values():
+            if other is not place:
+                other.settle(none)
+        ended = self._end(scores, innovations)
+        return self._begin(threshold(scores_per_alarm)), ended
+
+    def _innovations(self, scores: FloatArray) -> FloatArray:
+        """Return what the score before does not predict, as standard normal scores."""
+        correlation, last = self.correlation(), self._last
+        both = np.isfinite(scores) & np.isfinite(last) & ~self.active
+        pair, squared = scores * last, 0.5 * (scores**2 + last**2)
+        self._products = self._products + self._delayed[0]
+        latest = np.where(both, np.stack((np.ones(self.shape), pair, squared)), 0.0)
+        self._delayed = np.concatenate((self._delayed[1:], latest[None]))
+        self._last = np.where(np.isfinite(scores), scores, last)
+        return np.where(np.isfinite(last), (scores - correlation * last) / np.sqrt(
+            1.0 - correlation**2), scores)
+
+    def _begin(self, level: float) -> BoolArray:
+        """Begin the changes whose evidence reaches a level."""
+        changed = self.evidence.changed(level) & ~self.active
+        if changed.any():
+            self.size = np.where(changed, self.evidence.ratios.argmax(axis=0), self.size)
+            for place in self.bins.values():
+                place.take_out(changed, self.size)
+            self.evidence.forget(changed)
+            self.active = self.active | changed
+            size = np.array(SIZES)[self.size]
+            for state in (self._level, self._farthest):
+                state[changed] = size[changed]
+            self._gone[changed] = 0.0
+            self._delayed[:, :, changed] = 0.0
+        return changed
+
+    def _end(self, scores: FloatArray, innovations: FloatArray) -> BoolArray:
+        """End the active changes that are gone; return which."""
+        known = self.active & np.isfinite(scores)
+        if not known.any():
+            return np.zeros(self.shape, np.bool_)
+        correlation = self.correlation()
+        step = np.where(known, scores - self._level, 0.0) / _MEMORY
+        self._level = self._level + step
+        farther = known & (np.abs(self._level) > np.abs(self._farthest))
+        self._farthest = np.where(farther, self._level, self._farthest)
+        size = self._farthest * np.sqrt((1.0 - correlation) / (1.0 + correlation))
+        gain = 0.5 * size**2 - size * np.where(known, innovations, 0.0)
+        self._gone = np.where(known, np.maximum(self._gone + gain, 0.0), self._gone)
+        ended = known & (self._gone > math.log(_ENDS))
+        self.active = self.active & ~ended
+        self.evidence.forget(ended)
+        for place in self.bins.values():
+            place.settle(np.broadcast_to(ended, place.before.shape[1:]))
+        self.begun[:, :, ended] = np.nan
+        return ended
+
+    def estimate(self) -> Estimate:
+        """Return the active changes, over all bins of speed."""
+        spread = self.spread()
+        total, weight, base, freedom = (np.zeros(self.shape) for _ in range(4))
+        doubt = np.zeros(self.shape)
+        for place in self.bins.values():
+            change, variance, mean = place.change(self.size, spread)
+            share = np.where(self.active & np.isfinite(change) & (variance > 0.0),
+                             1.0 / variance, 0.0)
+            weight += share
+            total += share * np.nan_to_num(change)
+            base += share * np.nan_to_num(mean)
+            doubt += share * place.excess_doubt()
+            freedom = np.where(share > 0.0, np.maximum(freedom, place.count - 1.0), freedom)
+        sure = np.where(weight > 0.0, weight, np.nan)
+        return Estimate(total / sure, 1.0 / sure, base / sure, np.where(
+            weight > 0.0, freedom, np.nan), doubt / sure)
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return what `restore` needs: arrays by names."""
+        found = {'active': self.active, 'size': self.size, 'begun': self.begun,
+                 'last': self._last, 'lagged': self._products, 'delayed': self._delayed,
+                 'level': self._level, 'farthest': self._farthest, 'gone': self._gone,
+                 'bins': np.array(list(self.bins), np.int64)}
+        found.update({f'evidence.{name}': item for name, item in self.evidence.state().items()})
+        for key, place in self.bins.items():
+            found.update({f'bin{key}.{name}': item for name, item in place.state().items()})
+        return found
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from a state."""
+        self.active, self.size = state['active'].copy(), state['size'].copy()
+        self.begun, self._last = state['begun'].copy(), state['last'].copy()
+        self._products, self._level = state['lagged'].copy(), state['level'].copy()
+        self._farthest, self._gone = state['farthest'].copy(), state['gone'].copy()
+        self._delayed = state['delayed'].copy()
+        self.evidence.restore({name.partition('.')[2]: item for name, item in state.items()
+                               if name.startswith('evidence.')})
+        self.bins = {}
+        for key in state['bins'].tolist():
+            place = self.bins[key] = SpeedBin(self.shape)
+            place.restore({name.partition('.')[2]: item for name, item in state.items()
+                           if name.startswith(f'bin{key}.')})

@@ -1,0 +1,359 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The change monitor of one shaft: averages in, changes of its orders and indicators out.
+
+Means of `group` consecutive averages at about the same speed are tested, because they are nearer
+to a normal distribution and depend less on each other than single averages.
+"""
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
+from sa_jitter_ros.monitoring.quantities import Layout, MonitoredAverage
+from sa_jitter_ros.monitoring.speed_bin import SpeedBin
+from sa_jitter_ros.parameters import Parameter, Values
+from scipy import stats
+
+FloatArray = NDArray[np.float64]
+
+YEAR = 365.25 * 86400.0  # s
+# Bins of speed: the machine passes through more of them in a run-up than it stays in.
+_MOST_BINS = 64
+# Intervals between averages of which the median counts.
+_INTERVALS = 256
+# Deviations beyond so many standard deviations say nothing of the covariance.
+_FARTHEST = 4.0
+
+PARAMETERS = (
+    Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all shafts, '
+              'channels, orders and indicators together', above=0.0, maximum=1e4),
+    Parameter('learning_averages', 200, 'averages in a bin of speed that are learnt before new '
+              'ones are tested', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
+    Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
+              maximum=10000, read_only=True),
+    Parameter('speed_bin', 0.05, 'relative width of a bin of speed, in each of which the machine '
+              'has a baseline of its own', minimum=1e-4, maximum=1.0, read_only=True),
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a monitor, named as the parameters of the node; raises ParameterError."""
+
+    false_alarms_per_year: float = 1.0
+    learning_averages: int = 200
+    group_averages: int = 5
+    speed_bin: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Check that the baseline has enough groups."""
+        for item in PARAMETERS:
+            item.convert(getattr(self, item.name))
+        if self.learning_groups < LEAST_LEARNED:
+            raise ParameterError(
+                f'learning_averages is {self.learning_averages} and group_averages '
+                f'{self.group_averages}: learn at least {LEAST_LEARNED} groups, '
+                f'{LEAST_LEARNED * self.group_averages} averages')
+
+    @classmethod
+    def of(cls, values: Values) -> 'Settings':
+        """Return the settings among the values of parameters."""
+        return cls(**{item.name: values[item.name] for item in PARAMETERS})
+
+    @property
+    def learning_groups(self) -> int:
+        """Return the number of groups that are learnt."""
+        return self.learning_averages // self.group_averages
+
+
+@dataclass(frozen=True)
+class Change:
+    """
+    One quantity that has changed.
+
+    `change` is the relative change against the baseline of what came `since`, with its
+    `standard_error`; `keyphasor_share` is how much of it the keyphasor may explain. `p_value` is
+    that of the change at its time, for all independent quantities of the shaft; the search over
+    time is in the rate of false alarms.
+    """
+
+    shaft: str
+    channel: int
+    kind: str
+    name: str
+    change: float
+    standard_error: float
+    since_sequence: int
+    since_time: float
+    keyphasor_share: float
+    p_value: float
+
+    def __str__(self) -> str:
+        """
+        Return the change in words.
+
+        >>> change = Change('input', 2, 'order', '38', 0.041, 0.006, 812, 9.5, 0.003, 1e-9)
+        >>> str(change).partition('; ')[0]
+        'order 38 of input, channel 2: +4.1 +- 0.6 %, since average 812'
+        >>> str(change).partition('; ')[2]
+        'the keyphasor explains 0.3 %'
+        """
+        what = f'order {self.name}' if self.kind == 'order' else self.name
+        error = 100.0 * self.standard_error
+        known = math.isfinite(error) and error > 0.0
+        digits = min(max(-math.floor(math.log10(error)), 0), 6) if known else 1
+        return (f'{what} of {self.shaft}, channel {self.channel}: '
+                f'{100.0 * self.change:+.{digits}f} +- {error:.{digits}f} %, since average '
+                f'{self.since_sequence}; the keyphasor explains '
+                f'{100.0 * self.keyphasor_share:.1f} %')
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """
+    What is known of a shaft at one speed, of means of a group of averages.
+
+    `averages`, `mean` and `scatter` are arrays (channel, quantity), `covariance` (channel,
+    quantity, quantity). Indicators are logarithms.
+    """
+
+    averages: FloatArray
+    mean: FloatArray
+    scatter: FloatArray
+    covariance: FloatArray
+
+
+class _Group:
+    """Sums over consecutive averages in one bin of speed."""
+
+    def __init__(self, average: MonitoredAverage) -> None:
+        self.first = average.header
+        self.count = 0
+        shape = (3, *average.values.shape)
+        self.known: FloatArray = np.zeros(shape)
+        self.sums: FloatArray = np.zeros(shape)
+
+    def add(self, average: MonitoredAverage) -> None:
+        rows = np.stack((average.values, average.noise, average.doubt))
+        self.count += 1
+        self.known += np.isfinite(rows)
+        self.sums += np.nan_to_num(rows)
+
+    def means(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return mean values, their noise variance and doubt; NaN where most are missing."""
+        enough = 2.0 * self.known >= self.count
+        value, noise, doubt = np.where(enough, self.sums / np.maximum(self.known, 1.0), np.nan)
+        return value, noise / np.maximum(self.known[0], 1.0), doubt
+
+
+class ShaftMonitor:
+    """
+    Learns the baseline of a shaft and tests new averages against it.
+
+    `share` is the part of the false alarms that this shaft may cause. Averages with another layout
+    than the first one raise ParameterError.
+    """
+
+    def __init__(self, shaft: str, layout: Layout, settings: Settings, *, share: float = 1.0
+                 ) -> None:
+        self.shaft, self.layout, self.settings, self._share = shaft, layout, settings, share
+        channels, count = layout.shape
+        self._test = ChangeTest((1, channels * count), learning=settings.learning_groups)
+        # Sums of products of scores of a channel, and their numbers.
+        self._products: FloatArray = np.zeros((2, channels, count, count))
+        self._groups: dict[int, _Group] = {}
+        self._speed = math.nan  # the middle of bin 0
+        self._bin = 0
+        self._intervals: list[float] = []
+        self._end = math.nan
+        self.overlapping = self.uncorrected = self.beyond = 0
+
+    # --- averages ---
+
+    def update(self, average: MonitoredAverage) -> list[str]:
+        """Take the next average; return lines that say which changes began and ended."""
+        header = average.header
+        if average.layout != self.layout:
+            raise ParameterError(
+                f'{self.shaft} has {average.layout}, its baseline {self.layout}: is it that of '
+                'another machine? give another baseline_file, or remove this one to learn again')
+        if header.start_time < self._end - 1e-9 and header.end_time > self._end:
+            self.overlapping += 1
+            return []
+        if not average.is_corrected:
+            self.uncorrected += 1
+            return []
+        key = self._bin_of(header.mean_trigger_speed)
+        if key is None:
+            self.beyond += 1
+            return []
+        interval = header.end_time - self._end
+        if interval > 0.0:
+            self._intervals = [*self._intervals, interval][-_INTERVALS:]
+        self._end, self._bin = header.end_time, key
+        group = self._groups.setdefault(key, _Group(average))
+        group.add(average)
+        if group.count < self.settings.group_averages:
+            return []
+        del self._groups[key]
+        return self._test_group(key, group)
+
+    def _bin_of(self, speed: float) -> int | None:
+        if not (math.isfinite(speed) and speed > 0.0):
+            return None
+        if math.isnan(self._speed):
+            self._speed = speed
+        key = round(math.log(speed / self._speed) / math.log1p(self.settings.speed_bin))
+        known = self._test.bins.keys() | self._groups.keys()
+        return key if key in known or len(known) < _MOST_BINS else None
+
+    def scores_per_alarm(self) -> float:
+        """Return the number of tested groups of each quantity for one false alarm."""
+        interval = float(np.median(self._intervals)) if self._intervals else math.nan
+        groups = YEAR / (max(interval, 1e-6) * self.settings.group_averages)
+        return groups / (self.settings.false_alarms_per_year * self._share)
+
+    def _test_group(self, key: int, group: _Group) -> list[str]:
+        values, noise, doubt = (item.reshape(1, -1) for item in group.means())
+        place = self._test.bins.get(key)
+        if place is not None:
+            self._correlate(place, values)
+        mark = (float(group.first.sequence), group.first.start_time)
+        changed, ended = self._test.update(key, values, noise, doubt, mark,
+                                           self.scores_per_alarm())
+        lines = []
+        if changed.any():
+            lines = [str(item) for item in self.changes() if changed.reshape(
+                self.layout.shape)[item.channel, self._place(item)]]
+        return lines + [f'{self._words(place)} is back at its baseline'
+                        for place in np.flatnonzero(ended[0]).tolist()]
+
+    def _place(self, change: Change) -> int:
+        names = [self.layout.name(item) for item in range(self.layout.shape[1])]
+        offset = 0 if change.kind == 'order' else len(self.layout.orders)
+        return names.index(change.name, offset)
+
+    def _words(self, place: int) -> str:
+        channel, quantity = divmod(place, self.layout.shape[1])
+        name = self.layout.name(quantity)
+        what = f'order {name}' if self.layout.kind(quantity) == 'order' else name
+        return f'{what} of {self.shaft}, channel {channel}'
+
+    # --- the baseline ---
+
+    @property
+    def averages(self) -> int:
+        """Return the number of averages in the baseline, and in the groups that are not full."""
+        learned = sum(float(place.count.max()) for place in self._test.bins.values())
+        return round(learned * self.settings.group_averages) + sum(
+            group.count for group in self._groups.values())
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether the baseline at the present speed is learnt: averages are tested."""
+        place = self._test.bins.get(self._bin)
+        return place is not None and bool(
+            place.count.max() > self.settings.learning_groups - 0.5)
+
+    @property
+    def speed(self) -> float:
+        """Return the trigger speed in Hz of the middle of the present bin, NaN at the start."""
+        return self._speed * (1.0 + self.settings.speed_bin) ** self._bin
+
+    def _correlate(self, place: SpeedBin, values: FloatArray) -> None:
+        """Add the products of the deviations of values from the baseline of their bin."""
+        known = place.baseline()
+        scores = (values - known.mean) / np.sqrt(known.variance)
+        scores = np.where(self._test.active, np.nan, np.clip(scores, -_FARTHEST, _FARTHEST))
+        scores = scores.reshape(self.layout.shape)
+        here = np.isfinite(scores).astype(float)
+        scores = np.nan_to_num(scores)
+        self._products += np.stack((np.einsum('ci,cj->cij', scores, scores),
+                                    np.einsum('ci,cj->cij', here, here)))
+
+    def correlation(self) -> FloatArray:
+        """Return how the quantities of a channel correlate: (channel, quantity, quantity)."""
+        product, count = self._products
+        covariance = product / np.maximum(count, 1.0)
+        scatter = np.sqrt(np.einsum('cii->ci', covariance))
+        scale = scatter[:, :, None] * scatter[:, None, :]
+        found = np.where(scale > 0.0, covariance / np.where(scale > 0.0, scale, 1.0), 0.0)
+        np.einsum('cii->ci', found)[:] = 1.0
+        return np.clip(found, -1.0, 1.0)
+
+    def baseline(self, speed: float) -> Baseline | None:
+        """Return what is learnt at a trigger speed in Hz, None where nothing is."""
+        key = round(math.log(speed / self._speed) / math.log1p(self.settings.speed_bin))
+        place = self._test.bins.get(key)
+        if place is None:
+            return None
+        known, shape = place.baseline(), self.layout.shape
+        scatter = np.sqrt(known.variance.reshape(shape))
+        return Baseline(place.count.reshape(shape) * self.settings.group_averages,
+                        known.mean.reshape(shape), scatter,
+                        self.correlation() * scatter[:, :, None] * scatter[:, None, :])
+
+    # --- changes ---
+
+    def changes(self) -> list[Change]:
+        """Return the quantities that have changed, the most certain first."""
+        test, (_, count) = self._test, self.layout.shape
+        if not test.active.any():
+            return []
+        found, estimate, independent = [], test.estimate(), self._independent()
+        for place in np.flatnonzero(test.active[0]).tolist():
+            channel, quantity = divmod(place, count)
+            sequence, time = test.begun[:, test.size[0, place], 0, place].tolist()
+            change, variance, mean, freedom, doubt = (float(item[0, place]) for item in (
+                estimate.change, estimate.variance, estimate.baseline, estimate.freedom,
+                estimate.doubt))
+            error = math.sqrt(variance)
+            chance = float(2.0 * stats.t.sf(abs(change) / error, freedom))
+            if quantity < len(self.layout.orders):
+                change, error, doubt = (item / abs(mean) for item in (change, error, doubt))
+            else:
+                change, error = math.expm1(change), error * math.exp(change)
+            if not (math.isfinite(change) and math.isfinite(sequence)):
+                continue
+            found.append(Change(
+                self.shaft, channel, self.layout.kind(quantity), self.layout.name(quantity),
+                change, error, int(sequence), time, doubt, min(chance * independent, 1.0)))
+        return sorted(found, key=lambda item: item.p_value)
+
+    def _independent(self) -> float:
+        """Return how many independent quantities scatter as much together as the monitored do."""
+        correlation = self.correlation()
+        return float(np.sum(correlation.shape[1] ** 2 / np.sum(correlation**2, axis=(1, 2))))
+
+    # --- state ---
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return what `restore` needs: arrays by names. Groups that are not full are left out."""
+        return {**self._test.state(), 'products': self._products,
+                'intervals': np.array(self._intervals),
+                'place': np.array([self._speed, self._bin, self._end])}
+
+    def restore(self, state: dict[str, NDArray[Any]]) -> None:
+        """Go on from a state; raises KeyError and ValueError for one of something else."""
+        self._test.restore(state)
+        if state['products'].shape != self._products.shape or (
+                self._test.active.shape != self._test.shape):
+            raise ValueError('other shape')
+        self._products = state['products'].copy()
+        self._intervals = state['intervals'].tolist()
+        speed, key, end = state['place'].tolist()
+        self._speed, self._bin, self._end = speed, int(key), end

@@ -1,0 +1,479 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Has the machine changed: the statistics of the test, and the baseline in its file."""
+
+from dataclasses import replace
+import errno
+import os
+
+import numpy as np
+import pytest
+from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader, AverageMessage
+from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
+from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
+from sa_jitter_ros.monitoring.change_test import ChangeTest
+from sa_jitter_ros.monitoring.evidence import Evidence, threshold
+from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor, YEAR
+from sa_jitter_ros.monitoring.quantities import monitored
+
+ORDERS, LEVELS = (1.0, 19.0, 38.0), np.array([0.2, 1.0, 0.5])
+NAMES, INDICATORS = ('rms', 'kurtosis', 'm8a'), np.array([0.8, 1.8, 100.0])
+CHANNELS, SECONDS = 2, 60.0  # between averages
+SETTINGS = Settings(learning_averages=200)
+
+
+class Machine:
+    """
+    Draws averages of a machine from their laws: amplitudes with noise, indicators with scatter.
+
+    `keyphasor` is the noise that the correction adds, times that of the vibration; `bias` what it
+    leaves of the loss, relative, and says so in its standard error; `load` is a relative factor of
+    all amplitudes that scatters, `gain` (channel, order) multiplies the amplitudes.
+    """
+
+    def __init__(self, seed, *, noise=0.01, load=0.002, keyphasor=0.0, bias=0.0):
+        self.rng = np.random.default_rng(seed)
+        self.noise, self.load, self.keyphasor, self.bias = noise, load, keyphasor, bias
+        self.gain = np.ones((CHANNELS, len(ORDERS)))
+        self.damage = np.ones((CHANNELS, len(NAMES)))
+        self.speed, self.sequence, self.corrected = 16.6, 0, True
+
+    def messages(self):
+        """Return order amplitudes, indicators and their errors of the next average."""
+        rng, shape = self.rng, (CHANNELS, len(ORDERS))
+        start = self.sequence * SECONDS
+        header = AverageHeader(start, start + 2.0, self.sequence, 30, 72, self.speed)
+        self.sequence += 1
+        share = (self.speed / 16.6) ** 2 * (1.0 + self.load * rng.standard_normal())
+        true = LEVELS * self.gain * share * (1.0 - self.bias)
+        own = self.noise * np.sqrt(1.0 + self.keyphasor**2)
+        found = np.abs(true + own * (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)))
+        table = np.full((*shape, len(AMPLITUDE_FIELDS)), np.nan)
+        table[..., 0] = ORDERS
+        table[..., 1], table[..., 2] = found * (0.9 - self.bias), 0.1
+        if self.corrected:
+            table[..., 3], table[..., 4], table[..., 5] = found, 0.1, 0.9 - self.bias
+            table[..., 7] = own
+            table[..., 10] = np.hypot(own, self.bias * found)
+        scatter = 0.01 * np.sqrt(1.0 + self.keyphasor**2)
+        indicators = INDICATORS * self.damage * np.exp(
+            scatter * rng.standard_normal((CHANNELS, len(NAMES))))
+        return (AverageMessage(header, table, AMPLITUDE_FIELDS),
+                AverageMessage(header, indicators, NAMES),
+                AverageMessage(header, scatter * indicators, NAMES))
+
+    def average(self):
+        """Return what is monitored of the next average."""
+        return monitored(*self.messages())
+
+    def monitor(self, **changes):
+        """Return a new monitor."""
+        return ShaftMonitor('input', self.average().layout, replace(SETTINGS, **changes))
+
+    def run(self, monitor, count):
+        """Give averages to a monitor; return the lines that it says."""
+        return [line for _ in range(count) for line in monitor.update(self.average())]
+
+
+# --- false alarms --------------------------------------------------------------------------------
+
+
+def alarms_of(draw, *, units, quantities, learning, scores, length):
+    """Return the number of alarms of units and how many are expected, for values from a law."""
+    test, unknown = ChangeTest((units, quantities), learning=learning), np.full(
+        (units, quantities), np.nan)
+    found = 0
+    for number in range(length):
+        changed, _ = test.update(0, draw(), unknown, unknown, (number, number), scores)
+        again = changed.any(axis=1)
+        found += int(again.sum())
+        test.active[again] = False
+        test.evidence.ratios[:, again] = test.evidence.sums[:, again] = 0.0
+    return found, units * (length - learning) / scores
+
+
+def test_evidence_reaches_its_threshold_once_in_the_stated_number_of_scores():
+    rng = np.random.default_rng(1)
+    units, quantities, scores = 400, 4, 400.0
+    evidence, times, started = Evidence((units, quantities)), [], np.zeros(units)
+    mix = np.array([0.0, 0.5, 0.9, 0.99])  # quantities that scatter together with the first
+    for now in range(1, 6001):
+        own = rng.standard_normal((units, quantities))
+        evidence.update(mix * own[:, :1] + np.sqrt(1.0 - mix**2) * own)
+        again = evidence.changed(threshold(scores)).any(axis=1)
+        times += (now - started[again]).tolist()
+        started[again] = now
+        evidence.ratios[:, again] = evidence.sums[:, again] = 0.0
+    # the last, unfinished waiting times leave out long ones: less than one in eight of these
+    error = np.std(times) / np.sqrt(len(times))
+    assert np.mean(times) == pytest.approx(scores, abs=4.0 * error + 0.03 * scores)
+
+
+def smooth(rng, shape):
+    """Return a function that draws from a series whose neighbours correlate by a half."""
+    last = rng.standard_normal(shape)
+
+    def draw():
+        nonlocal last
+        last = 0.5 * last + np.sqrt(0.75) * rng.standard_normal(shape)
+        return 5.0 + last
+    return draw
+
+
+LAWS = {
+    'normal': lambda rng, shape: lambda: 5.0 + rng.standard_normal(shape),
+    'together': lambda rng, shape: lambda: 5.0 + 0.9 * rng.standard_normal(
+        (shape[0], 1)) + 0.44 * rng.standard_normal(shape),
+    'absent order': lambda rng, shape: lambda: rng.rayleigh(size=(5, *shape)).mean(axis=0),
+    'skewed': lambda rng, shape: lambda: rng.exponential(size=(5, *shape)).mean(axis=0),
+    'unsteady': smooth,
+}
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('law', LAWS)
+def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
+    shape = (40, 8)
+    found, expected = alarms_of(
+        LAWS[law](np.random.default_rng(7), shape), units=shape[0], quantities=shape[1],
+        learning=40, scores=2000.0, length=6000)
+    assert found <= expected + 3.0 * np.sqrt(expected)
+    # each machine loses the time that its first alarm takes to build up: a third of its alarms
+    assert found >= 0.5 * expected - 3.0 * np.sqrt(expected)
+
+
+def test_threshold_follows_from_the_rate_of_averages_and_of_false_alarms():
+    machine = Machine(1)
+    monitor = machine.monitor(false_alarms_per_year=2.0)
+    machine.run(monitor, 20)
+    assert monitor.scores_per_alarm() == pytest.approx(YEAR / (5.0 * SECONDS) / 2.0)
+
+
+# --- changes -------------------------------------------------------------------------------------
+
+
+def test_change_is_found_where_it_is_with_its_size_and_its_beginning():
+    machine = Machine(2)
+    monitor = machine.monitor()
+    assert machine.run(monitor, 600) == []
+    assert (monitor.is_complete, monitor.averages) == (True, 600)
+    machine.gain[1, 2] = 1.05
+    line, *others = machine.run(monitor, 200)
+    assert line.startswith('order 38 of input, channel 1: +')
+    assert others == []
+    found, = monitor.changes()
+    assert (found.shaft, found.channel, found.kind, found.name) == ('input', 1, 'order', '38')
+    assert found.change == pytest.approx(0.05, abs=4.0 * found.standard_error)
+    error = 0.01 / 0.5 * np.sqrt(1.0 / 200.0 + 1.0 / 600.0)
+    # a group from before the change, or half of it, may count among those since then
+    assert 0.8 * error < found.standard_error < 1.6 * error
+    assert abs(found.since_sequence - 601) <= 10
+    assert found.since_time == found.since_sequence * SECONDS
+    assert found.keyphasor_share < 0.002
+    assert found.p_value < 1e-6
+
+
+def test_indicators_change_too_and_fall():
+    machine = Machine(3)
+    monitor = machine.monitor()
+    machine.run(monitor, 400)
+    machine.damage[0, 1] = 0.94
+    line, = machine.run(monitor, 100)
+    assert line.startswith('kurtosis of input, channel 0: -')
+    found, = monitor.changes()
+    assert (found.kind, found.name) == ('indicator', 'kurtosis')
+    assert found.change == pytest.approx(-0.06, abs=4.0 * found.standard_error)
+
+
+def test_standard_errors_of_changes_hold():
+    """Without selection: the estimate of what came since a change that is far above threshold."""
+    z = []
+    for seed in range(40):
+        machine = Machine(100 + seed)
+        monitor = machine.monitor(learning_averages=100)
+        machine.run(monitor, 100)
+        machine.gain[:] = 1.2
+        machine.run(monitor, 100)
+        found = {(item.channel, item.name): item for item in monitor.changes()}
+        item = found[0, '38']
+        z.append((item.change - 0.2) / item.standard_error)
+    # the load is common to a unit's orders: each machine counts once
+    assert abs(np.mean(z)) < 4.0 / np.sqrt(len(z))
+    assert np.std(z) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * len(z)))
+
+
+def test_what_came_since_a_change_is_no_part_of_the_baseline():
+    machine = Machine(4)
+    monitor = machine.monitor()
+    machine.run(monitor, 300)
+    before = monitor.baseline(16.6).mean[0, 1]
+    machine.gain[0, 1] = 1.1
+    assert machine.run(monitor, 300)
+    after = monitor.baseline(16.6).mean[0, 1]
+    assert after == pytest.approx(before, abs=4.0 * 0.01 / np.sqrt(300.0))
+
+
+def test_change_that_ends_is_taken_back():
+    machine = Machine(5)
+    monitor = machine.monitor()
+    machine.run(monitor, 400)
+    machine.gain[0, 1] = 1.05
+    assert len(machine.run(monitor, 100)) == 1
+    machine.gain[0, 1] = 1.0
+    assert machine.run(monitor, 150) == ['order 19 of input, channel 0 is back at its baseline']
+    assert monitor.changes() == []
+    assert machine.run(monitor, 300) == []
+
+
+def test_one_wild_average_is_no_change_and_spoils_no_baseline():
+    machine = Machine(6)
+    monitor = machine.monitor()
+    machine.run(monitor, 400)
+    scatter = monitor.baseline(16.6).scatter
+    machine.gain[:] = machine.damage[:] = 30.0
+    assert machine.run(monitor, 1) == []
+    machine.gain[:] = machine.damage[:] = 1.0
+    assert machine.run(monitor, 400) == []
+    np.testing.assert_allclose(monitor.baseline(16.6).scatter, scatter, rtol=0.5)
+
+
+def test_order_that_was_not_there_appears():
+    machine = Machine(7)
+    machine.gain[0, 0] = 0.0
+    monitor = machine.monitor()
+    machine.run(monitor, 400)
+    machine.gain[0, 0] = 0.15  # three times the noise
+    line, = machine.run(monitor, 50)
+    assert line.startswith('order 1 of input, channel 0: +')
+
+
+# --- what is no change ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize('worse', [{'keyphasor': 2.0}, {'bias': 0.01},
+                                   {'keyphasor': 4.0, 'bias': 0.05}])
+def test_worse_keyphasor_is_no_change_of_the_machine(worse):
+    alarms = []
+    for seed in range(8):
+        machine = Machine(20 + seed)
+        monitor = machine.monitor()
+        machine.run(monitor, 400)
+        for name, value in worse.items():
+            setattr(machine, name, value)
+        alarms += machine.run(monitor, 400)
+    assert alarms == []
+    machine.gain[0, 1] = 1.3  # and a real change is still found
+    assert any('order 19 of input, channel 0' in line for line in machine.run(monitor, 200))
+    found = {item.name: item for item in monitor.changes()}['19']
+    assert found.keyphasor_share == pytest.approx(machine.bias, rel=0.3, abs=1e-3)
+
+
+def test_better_keyphasor_is_no_change_either():
+    machine = Machine(30, keyphasor=3.0, bias=0.03)
+    monitor = machine.monitor()
+    machine.run(monitor, 400)
+    machine.keyphasor = 0.0
+    assert machine.run(monitor, 400) == []
+
+
+def test_speeds_have_baselines_of_their_own():
+    machine = Machine(8)
+    monitor = machine.monitor()
+    for speed in (16.6, 12.0, 16.6, 12.0):
+        machine.speed = speed
+        assert machine.run(monitor, 150) == []
+    assert monitor.is_complete
+    slow, fast = monitor.baseline(12.0), monitor.baseline(16.6)
+    np.testing.assert_allclose(slow.mean[:, :3] / fast.mean[:, :3], (12.0 / 16.6) ** 2, rtol=0.02)
+    machine.speed = 14.0
+    machine.run(monitor, 20)
+    assert not monitor.is_complete
+    machine.speed, machine.gain[1, 1] = 12.0, 1.05
+    for speed in (12.0, 16.6, 12.0):
+        machine.speed = speed
+        machine.run(monitor, 30)
+    found, = monitor.changes()
+    assert (found.channel, found.name) == (1, '19')
+    assert found.change == pytest.approx(0.05, abs=4.0 * found.standard_error)
+
+
+def test_covariance_is_that_of_the_machine():
+    machine = Machine(9, load=0.02)
+    monitor = machine.monitor()
+    machine.run(monitor, 2000)
+    found = monitor.baseline(16.6).covariance[0]
+    expected = 0.02**2 * np.outer(LEVELS, LEVELS) / 5.0 + np.eye(3) * 0.01**2 / 5.0
+    scatter = np.sqrt(np.diag(expected))
+    # 400 groups: a correlation is known to 0.05
+    np.testing.assert_allclose(found[:3, :3] / np.outer(scatter, scatter),
+                               expected / np.outer(scatter, scatter), atol=0.25)
+    assert np.abs(found[3:, :3] / np.outer(np.sqrt(np.diag(found[3:, 3:])), scatter)).max() < 0.2
+
+
+def test_missing_numbers_cost_themselves_alone():
+    machine = Machine(10)
+    monitor = machine.monitor()
+    for number in range(700):
+        orders, indicators, errors = machine.messages()
+        orders.values[0, 2, 3:] = np.nan  # an order that never has an amplitude
+        if number % 3 == 0:
+            orders.values[1, 1, 3:] = np.nan
+        indicators.values[1, 2] = np.nan
+        if number == 500:
+            machine.gain[0, 1] = 1.1
+        absent = number % 7 == 0
+        lines = monitor.update(monitored(orders, indicators, None if absent else errors))
+        assert all('order 19 of input, channel 0' in line for line in lines)
+    found, = monitor.changes()
+    assert found.change == pytest.approx(0.1, abs=4.0 * found.standard_error)
+    assert monitor.baseline(16.6).averages[0, 2] == 0.0
+
+
+def test_averages_that_are_not_corrected_or_overlap_are_left_out():
+    machine = Machine(11)
+    monitor = machine.monitor()
+    machine.run(monitor, 10)
+    machine.corrected = False
+    machine.run(monitor, 10)
+    assert (monitor.averages, monitor.uncorrected) == (10, 10)
+    machine.corrected = True
+    average = machine.average()
+    for shift in (0.0, 0.5, 1.0, 1.9, 2.0):  # sliding averages of 2 s
+        header = replace(average.header, start_time=average.header.start_time + shift,
+                         end_time=average.header.end_time + shift)
+        monitor.update(replace(average, header=header))
+    assert (monitor.averages, monitor.overlapping) == (12, 3)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    orders, indicators, errors = Machine(12).messages()
+    with pytest.raises(MessageError, match='1 channels of indicators and 2 of orders'):
+        monitored(orders, replace(indicators, values=indicators.values[:1]), errors)
+    with pytest.raises(ParameterError, match='learn at least 8 groups, 40 averages'):
+        Settings(learning_averages=39)
+    with pytest.raises(ParameterError, match='learning is 3 values: give at least 8'):
+        ChangeTest((1, 1), learning=3)
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """Return machine, monitor and the file of its baseline, with a change that is active."""
+    machine = Machine(13)
+    monitor = machine.monitor()
+    machine.run(monitor, 300)
+    machine.gain[0, 1] = 1.1
+    machine.run(monitor, 50)
+    path = tmp_path / 'state' / 'baseline.npz'
+    write_baseline(path, 'pump 3', {'input': monitor}, SETTINGS)
+    return machine, monitor, path
+
+
+def test_baseline_survives_a_restart(kept):
+    machine, monitor, path = kept
+    again = read_baseline(path, 'pump 3', SETTINGS)['input']
+    assert again.changes() == monitor.changes() != []
+    assert (again.averages, again.is_complete) == (monitor.averages, True)
+    for _ in range(300):
+        average = machine.average()
+        assert again.update(average) == monitor.update(average)
+    assert again.changes() == monitor.changes()
+    assert list(path.parent.iterdir()) == [path]
+
+
+def damage(path, kind):
+    """Damage a file in one of several ways."""
+    content = bytearray(path.read_bytes())
+    if kind == 'cut':
+        content = content[:len(content) // 2]
+    elif kind == 'empty':
+        content = bytearray()
+    elif kind == 'text':
+        content = bytearray(b'no baseline')
+    elif kind == 'bits':
+        content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize('kind', ['cut', 'empty', 'text', 'bits'])
+def test_damaged_file_is_refused_in_one_line_and_kept(kept, kind):
+    path = kept[2]
+    damage(path, kind)
+    before = path.read_bytes()
+    with pytest.raises(RecordingError) as refused:
+        read_baseline(path, 'pump 3', SETTINGS)
+    assert str(refused.value).startswith(f'{path}: is no intact baseline')
+    assert 'move it away to learn again' in str(refused.value)
+    assert '\n' not in str(refused.value)
+    assert path.read_bytes() == before
+
+
+def test_every_cut_and_flipped_byte_is_noticed(kept):
+    path, rng = kept[2], np.random.default_rng(5)
+    whole = path.read_bytes()
+    intact, lines = read_baseline(path, 'pump 3', SETTINGS)['input'].changes(), []
+    for place in rng.integers(0, len(whole), 60).tolist():
+        flipped = bytearray(whole)
+        flipped[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(flipped)
+        try:  # a byte of a date or a comment in the archive says nothing of the arrays
+            assert read_baseline(path, 'pump 3', SETTINGS)['input'].changes() == intact
+        except RecordingError as error:
+            lines.append(str(error))
+    assert lines
+    assert all('\n' not in line for line in lines)
+
+
+def test_file_that_is_no_file_or_another_archive_is_refused(tmp_path):
+    path = tmp_path / 'fifo.npz'
+    os.mkfifo(path)
+    for place in (path, tmp_path):
+        with pytest.raises(RecordingError):
+            read_baseline(place, '', SETTINGS)
+    other = tmp_path / 'other.npz'
+    np.savez(other, vibration=np.zeros(3))
+    with pytest.raises(RecordingError, match='is no intact baseline'):
+        read_baseline(other, '', SETTINGS)
+    assert read_baseline(tmp_path / 'none.npz', '', SETTINGS) == {}
+
+
+def test_baseline_of_another_machine_is_refused(kept):
+    machine, monitor, path = kept
+    with pytest.raises(RecordingError, match="machine 'pump 3', this one is 'pump 4'"):
+        read_baseline(path, 'pump 4', SETTINGS)
+    with pytest.raises(RecordingError, match='was learnt with group_averages 5, now it is 4'):
+        read_baseline(path, 'pump 3', replace(SETTINGS, group_averages=4))
+    orders, indicators, errors = machine.messages()
+    orders.values[..., 0] += 1.0
+    with pytest.raises(ParameterError, match=r'orders 2, 20, 39 .* another machine'):
+        monitor.update(monitored(orders, indicators, errors))
+    assert len(read_baseline(path, 'pump 3', replace(SETTINGS, false_alarms_per_year=5.0))) == 1
+
+
+def test_full_disk_and_unwritable_folder_keep_the_older_file(kept, monkeypatch):
+    machine, monitor, path = kept
+    before = path.read_bytes()
+    machine.run(monitor, 50)
+
+    def full(number):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with monkeypatch.context() as patch:
+        patch.setattr(os, 'fsync', full)
+        with pytest.raises(RecordingError, match='cannot be written: No space left on device'):
+            write_baseline(path, 'pump 3', {'input': monitor}, SETTINGS)
+    assert path.read_bytes() == before
+    assert list(path.parent.iterdir()) == [path]
+    with pytest.raises(RecordingError, match='cannot be written: File exists'):
+        write_baseline(path / 'below.npz', 'pump 3', {'input': monitor}, SETTINGS)
+    write_baseline(path, 'pump 3', {'input': monitor}, SETTINGS)
+    assert path.read_bytes() != before
