@@ -466,7 +466,7 @@ def known_words():
     """Return the names of parameters, their choices, topics, fields, nodes and counts."""
     known = {*NODES, *COMMANDS, *INDICATORS, *FIELDS, *messages.AMPLITUDE_FIELDS,
              *messages.PULSE_ERROR_FIELDS, *messages.PREDICTION_FIELDS,
-             *messages.RESIDUAL_FIELDS,
+             *messages.RESIDUAL_FIELDS, *messages.ENVELOPE_FIELDS,
              *messages.SAMPLE_TYPES, *messages.PULSE_TYPES, *diagnostic_keys(),
              *AngleState.__dataclass_fields__, JOINT_TYPE}
     for name in NODES:

@@ -11,13 +11,14 @@
 """The synchronous average: its parameters, its settings and its result."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import AmplitudeErrors
+from sa_jitter_ros.averaging.envelope import Envelope, EnvelopeSettings
 from sa_jitter_ros.averaging.jackknife import WaveformParts
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
@@ -43,8 +44,9 @@ class AverageSettings:
     are expected to be of the size that a keyphasor sampled at `keyphasor_rate` (Hz) causes; 0 is
     the sampling rate of the vibration. Up to `maximum_discarded` times N_t discarded trigger
     cycles may lie between those of an average, if their number is known. With `keep_parts` a block
-    average has the waveforms of parts of its cycles, too. Raises `ParameterError`
-    for values that cannot be used.
+    average has the waveforms of parts of its cycles, too, with bearing orders in `envelope` the
+    squared envelope of the residual signal. Raises `ParameterError` for values that cannot be
+    used.
     """
 
     cycle_length: float = 1.0
@@ -59,6 +61,7 @@ class AverageSettings:
     keyphasor_rate: float = 0.0
     maximum_discarded: float = 0.0
     keep_parts: bool = False
+    envelope: EnvelopeSettings = field(default_factory=EnvelopeSettings)
 
     def __post_init__(self) -> None:
         """Check every value."""
@@ -80,6 +83,9 @@ class AverageSettings:
         if self.correct_jitter and self.averaging != 'block':
             raise ParameterError(f'correct_jitter with averaging {self.averaging!r}: pulse errors '
                                  'are recovered per block; set averaging to block')
+        if self.envelope.bearing_orders and self.averaging != 'block':
+            raise ParameterError(f'bearing_orders with averaging {self.averaging!r}: the squared '
+                                 'envelope is that of a block; set averaging to block')
         if not (math.isfinite(self.keyphasor_rate) and self.keyphasor_rate >= 0.0):
             raise ParameterError(f'keyphasor_rate is {self.keyphasor_rate} Hz: give a positive '
                                  "rate, or 0 for the vibration's")
@@ -190,7 +196,8 @@ class Correction:
     Both contain the same noise, and `attenuation_standard_error` accounts for this correlation.
     `cycle_amplitudes` (cycle, channel, order) are those of the single trigger cycles between
     corrected pulses. `amplitude_errors` say how far `amplitudes` are from the truth, `parts` are
-    the waveforms of parts of the cycles, None unless `keep_parts` was set.
+    the waveforms of parts of the cycles, None unless `keep_parts` was set, `envelope` that of the
+    residual signal between corrected pulses, None without bearing orders.
 
     A clock of 1 kHz makes each pulse up to 1 ms late, which attenuates order 19 of a shaft at
     20.3 Hz. The correction recovers these errors except for their mean:
@@ -226,6 +233,7 @@ class Correction:
     parts: WaveformParts | None = None
     jitter_std: float = math.nan
     refitted: int = 0
+    envelope: Envelope | None = None
 
     def __repr__(self) -> str:
         """Return one line: whether it was accepted, the size of the errors, what is left."""
@@ -256,7 +264,8 @@ class Average:
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
     angle as those of their mean. `amplitude_errors` say how well another average would repeat
     `amplitudes`. `parts` are the waveforms of parts of the cycles, None unless `keep_parts` was
-    set. `correction` is None unless `correct_jitter` was set.
+    set. `envelope` is that of the residual signal, None without bearing orders, and where the
+    correction has one. `correction` is None unless `correct_jitter` was set.
 
     A shaft at 25 Hz with an order 3 of amplitude 2 and phase 1 rad, in a single channel:
 
@@ -294,6 +303,7 @@ class Average:
     amplitude_errors: AmplitudeErrors
     parts: WaveformParts | None = None
     correction: Correction | None = None
+    envelope: Envelope | None = None
 
     @property
     def periods(self) -> FloatArray:

@@ -24,10 +24,11 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
+from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
-from sa_jitter_ros.parameters import listed, number
+from sa_jitter_ros.parameters import listed, number, numbers
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
@@ -90,6 +91,7 @@ class Averager:
         interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
         time_tolerance: float = 0.01, path_delay: float = 0.0,
         target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
+        bearing_orders: Sequence[float] = (), envelope_band: Sequence[float] = (),
         buffer_seconds: float = math.inf,
     ) -> None:
         sample_rate = number('sample_rate', sample_rate)
@@ -117,7 +119,9 @@ class Averager:
             trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
             samples_per_revolution=samples_per_revolution, interpolation=interpolation,
             correct_jitter=correct_jitter, keyphasor_rate=keyphasor_rate or 0.0,
-            maximum_discarded=maximum_discarded)
+            maximum_discarded=maximum_discarded, envelope=EnvelopeSettings(
+                numbers('bearing_orders', bearing_orders),
+                numbers('envelope_band', envelope_band)))
         self._stream = StreamingAverager(
             {_SHAFT: settings}, validator=keyphasor.validator(),
             timeline=VibrationTimeline(
@@ -206,6 +210,7 @@ def average(
     interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
     time_tolerance: float = 0.01, path_delay: float = 0.0,
     target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
+    bearing_orders: Sequence[float] = (), envelope_band: Sequence[float] = (),
 ) -> tuple[Average, ...]:
     """
     Return the synchronous averages of a recording of vibration (channel, sample) or (sample,).
@@ -246,7 +251,7 @@ def average(
         missing_pulses=missing_pulses, maximum_missing=maximum_missing,
         interval_tolerance=interval_tolerance, minimum_interval=minimum_interval,
         time_tolerance=time_tolerance, path_delay=path_delay, target_geometry=target_geometry,
-        target_angles=target_angles)
+        target_angles=target_angles, bearing_orders=bearing_orders, envelope_band=envelope_band)
     samples, pulses = _array(vibration), np.asarray(pulse_times)
     if pulse_times is None:
         raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '

@@ -14,6 +14,7 @@ from dataclasses import fields, replace
 from math import prod
 
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING, KeyphasorParameters
+from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -87,6 +88,11 @@ def shaft_parameters(name: str) -> tuple[Parameter, ...]:
                   'the condition indicators', above=0.0),
         Parameter(f'{name}.sidebands', 1, 'pairs of sidebands that belong to each mesh order',
                   minimum=0, maximum=100),
+        Parameter(f'{name}.bearing_orders', [], 'orders at which the bearings of this shaft are '
+                  'struck if they are damaged (cage, balls, rings), for the squared envelope of '
+                  'the residual signal', above=0.0),
+        Parameter(f'{name}.envelope_band', [], 'lowest and highest frequency of the residual '
+                  'signal whose envelope is taken; empty: all', unit='Hz', minimum=0.0),
     )
 
 
@@ -105,6 +111,8 @@ def shaft_settings(values: Values, name: str) -> AverageSettings:
         return keyphasor_parameters(values).average(
             ratio=ratio, orders=values[f'{name}.orders'],
             samples_per_revolution=values[f'{name}.samples_per_revolution'], keep_parts=True,
+            envelope=EnvelopeSettings(tuple(values[f'{name}.bearing_orders']),
+                                      tuple(values[f'{name}.envelope_band'])),
             **{key: values[key] for key in (
                 'trigger_cycles', 'averaging', 'angle_law', 'interpolation', 'correct_jitter',
                 'keyphasor_rate', 'maximum_discarded')})

@@ -23,6 +23,7 @@ from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.displaced_pulses import displacements
+from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
 from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
@@ -50,7 +51,11 @@ _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(6
 
 
 class CorrectingAverager:
-    """A `ShaftAverager` that adds the `Correction` to its averages if `correct_jitter` is set."""
+    """
+    A `ShaftAverager` that adds to its averages what needs their cycles once more.
+
+    That is the `Correction` if `correct_jitter` is set, and the `Envelope` with bearing orders.
+    """
 
     def __init__(self, settings: AverageSettings) -> None:
         self._shaft = ShaftAverager(settings)
@@ -92,20 +97,31 @@ class CorrectingAverager:
     def update(self, cycles: CycleSamples) -> Average | None:
         """Take cycles, not more than `room`; return the average and its correction when due."""
         average = self._shaft.update(cycles)
-        if not self.settings.correct_jitter:
+        if not self._keeps_cycles:
             return average
         self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
-        return self._corrected(average)
+        return self._completed(average)
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
         average = self._shaft.finish()
-        return self._corrected(average) if self.settings.correct_jitter else average
+        return self._completed(average) if self._keeps_cycles else average
 
-    def _corrected(self, average: Average | None) -> Average | None:
+    @property
+    def _keeps_cycles(self) -> bool:
+        return self.settings.correct_jitter or bool(self.settings.envelope.bearing_orders)
+
+    def _completed(self, average: Average | None) -> Average | None:
         if average is None:
             return None
         cycles, self._cycles = self._cycles, []
+        if self.settings.correct_jitter:
+            average = self._corrected(average, cycles)
+        if average.correction is None or not average.correction.accepted:
+            average = replace(average, envelope=_envelope(average, cycles, self.settings))
+        return average
+
+    def _corrected(self, average: Average, cycles: list[CycleSamples]) -> Average:
         correction = correct_average(average, cycles, self.settings)
         errors = average.amplitude_errors
         if correction.accepted:
@@ -163,7 +179,20 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
         ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
             cycles_again, _clean(raw, cycles_again, settings), raw.orders, amplitudes=amplitudes,
             unsure=unsure, largest=whole, jitter=_in_cycles(recovery.std, raw, settings)),
-        corrected.parts, recovery.std, refitted)
+        corrected.parts, recovery.std, refitted,
+        _envelope(corrected, _between(raw, cycles, corrected.pulses), settings))
+
+
+def _envelope(average: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
+              ) -> Envelope | None:
+    """Return the envelope of what the cycles of an average have beside it, if it is asked for."""
+    if not settings.envelope.bearing_orders:
+        return None
+    return residual_envelope(
+        cycles, average.waveform, settings.envelope, cycle_length=settings.cycle_length,
+        trigger_cycles=average.trigger_cycles, first_angle=average.first_angle,
+        cycle_numbers=average.cycle_numbers, fundamental_cycles=average.fundamental_cycles,
+        law=settings.angle_law, method=settings.interpolation)
 
 
 def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery

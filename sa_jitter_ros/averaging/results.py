@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.envelope import Envelope
 from sa_jitter_ros.averaging.indicators import GearSettings, RunningIndicators
 from sa_jitter_ros.averaging.jackknife import WaveformParts
 from sa_jitter_ros.errors import ParameterError, SignalError
@@ -30,6 +31,8 @@ AMPLITUDE_FIELDS = (
     'attenuation', 'attenuation_standard_error', 'noise_standard_deviation',
     'raw_standard_error', 'raw_phase_standard_error', 'corrected_standard_error',
     'corrected_phase_standard_error', 'upper_95')
+ENVELOPE_FIELDS = ('order', 'found_order', 'amplitude', 'standard_error', 'mean')
+SPECTRUM_FIELDS = ('order', 'amplitude')
 PULSE_ERROR_FIELDS = ('time', 'error', 'standard_error', 'used')
 
 
@@ -56,7 +59,8 @@ class AverageMessage:
     One array of results of one average.
 
     `values` is channel x angle for a synchronous average, channel x order x field for order
-    amplitudes (`AMPLITUDE_FIELDS`), pulse x field for pulse errors (`PULSE_ERROR_FIELDS`) and
+    amplitudes (`AMPLITUDE_FIELDS`), envelope amplitudes (`ENVELOPE_FIELDS`) and the spectrum of
+    the envelope (`SPECTRUM_FIELDS`), pulse x field for pulse errors (`PULSE_ERROR_FIELDS`) and
     channel x indicator for condition indicators; `names` are the fields or indicators.
     """
 
@@ -84,7 +88,7 @@ class ShaftResults:
 
         `corrected_average` and `pulse_error` are there if the correction was accepted,
         `condition_indicator` and `condition_indicator_error` if the waveform is finite and the
-        mesh orders are in it.
+        mesh orders are in it, `envelope_amplitude` and `envelope_spectrum` with bearing orders.
         """
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
@@ -100,6 +104,10 @@ class ShaftResults:
                 (average.pulses, correction.pulse_errors, correction.standard_errors,
                  average.used), axis=1), PULSE_ERROR_FIELDS)
         source = average if correction is None else correction
+        envelope = average.envelope or (correction.envelope if correction else None)
+        if envelope is not None:
+            found |= {name: AverageMessage(header, *content)
+                      for name, content in envelope_tables(envelope).items()}
         self.problem = ''
         if np.isfinite(source.waveform).all():
             found |= self._indicate(header, source.waveform, source.parts)
@@ -120,6 +128,18 @@ class ShaftResults:
         return {'condition_indicator': AverageMessage(header, found.values, found.names),
                 'condition_indicator_error': AverageMessage(
                     header, found.standard_errors, found.names)}
+
+
+def envelope_tables(envelope: Envelope) -> dict[str, tuple[FloatArray, tuple[str, ...]]]:
+    """Return tables (channel, order, field) and their fields by the names of their topics."""
+    shape = envelope.amplitudes.shape
+    lines = np.stack((np.broadcast_to(envelope.bearing_orders, shape), envelope.found,
+                      envelope.amplitudes, envelope.standard_errors,
+                      np.broadcast_to(envelope.mean[:, None], shape)), axis=-1)
+    spectrum = np.stack((np.broadcast_to(envelope.orders, envelope.spectrum.shape),
+                         envelope.spectrum), axis=-1)
+    return {'envelope_amplitude': (lines, ENVELOPE_FIELDS),
+            'envelope_spectrum': (spectrum, SPECTRUM_FIELDS)}
 
 
 def amplitude_table(average: Average) -> FloatArray:

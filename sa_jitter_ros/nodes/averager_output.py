@@ -31,7 +31,7 @@ class ShaftOutput:
             kind: node.create_output(Float64MultiArray, f'{name}/{kind}')
             for kind in ('synchronous_average', 'standard_error', 'order_amplitude',
                          'condition_indicator', 'condition_indicator_error', 'corrected_average',
-                         'pulse_error')}
+                         'pulse_error', 'envelope_amplitude', 'envelope_spectrum')}
         self._results = ShaftResults()
         self.published = self.refused = 0
         self.refusal = ''

@@ -40,6 +40,7 @@ FloatArray = NDArray[np.float64]
 ArrayMessage = TypeVar('ArrayMessage', Float64MultiArray, Float32MultiArray)
 
 AMPLITUDE_FIELDS = results.AMPLITUDE_FIELDS
+ENVELOPE_FIELDS, SPECTRUM_FIELDS = results.ENVELOPE_FIELDS, results.SPECTRUM_FIELDS
 PULSE_ERROR_FIELDS = results.PULSE_ERROR_FIELDS
 GEOMETRY_FIELDS = ('angle', 'standard_error')
 PREDICTION_FIELDS = (
@@ -159,6 +160,8 @@ _AVERAGE_LABELS = {
     'pulse_error': ('pulse', 'field'),
     'condition_indicator': ('channel', 'indicator'),
     'condition_indicator_error': ('channel', 'indicator'),
+    'envelope_amplitude': ('channel', 'order', 'field'),
+    'envelope_spectrum': ('channel', 'order', 'field'),
 }
 
 
@@ -170,12 +173,14 @@ def encode_average(kind: str, average: AverageMessage) -> Float64MultiArray:
     return encode_array(average.values, labels, astuple(average.header))
 
 
-_AVERAGE_FIELDS = {'order_amplitude': AMPLITUDE_FIELDS, 'pulse_error': PULSE_ERROR_FIELDS}
+_AVERAGE_FIELDS = {
+    'order_amplitude': AMPLITUDE_FIELDS, 'pulse_error': PULSE_ERROR_FIELDS,
+    'envelope_amplitude': ENVELOPE_FIELDS, 'envelope_spectrum': SPECTRUM_FIELDS}
 
 
 # Fields of the first version, by the last one of this version.
 _FIRST_FIELDS = {AMPLITUDE_FIELDS[-1]: 8, PULSE_ERROR_FIELDS[-1]: 3, PREDICTION_FIELDS[-1]: 7,
-                 GEOMETRY_FIELDS[-1]: 2,
+                 GEOMETRY_FIELDS[-1]: 2, ENVELOPE_FIELDS[-1]: 5, SPECTRUM_FIELDS[-1]: 2,
                  RESIDUAL_FIELDS[-1]: 6}
 
 

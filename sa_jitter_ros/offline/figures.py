@@ -16,6 +16,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.offline.average_figures import orders_figure, waveform_figure
+from sa_jitter_ros.offline.envelope_figures import envelope_figure
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.gear_figures import gear_figure
 from sa_jitter_ros.offline.plotting import Array
@@ -44,7 +45,8 @@ def write_figures(folder: Path, signals: Signals, series: Sequence[ShaftSeries],
             'spectrum': spectrum_figure(signals, item, found, gear),
             'order_map': order_map_figure(signals, item, found, gear),
             'tracked_orders': tracked_orders_figure(signals, item),
-            'gear_signals': gear_figure(signals, item, gear)}
+            'gear_signals': gear_figure(signals, item, gear),
+            'envelope': envelope_figure(signals, item)}
         prefix = f'{item.shaft}_' if len(series) > 1 else ''
         for name, figure in drawn.items():
             if figure is not None:

@@ -32,7 +32,8 @@ _NAMES = {'synchronous_average': 'waveform'}
 _HEADER = {'mean_trigger_speed': 'trigger_speed'}
 _OVER_ANGLE = ('waveform', 'corrected_average', 'standard_error')
 _PULSES = 'pulse_error'  # whose number differs from average to average
-_FIELDS = ('order_amplitude', _PULSES)  # of other arrays the names are those of indicators
+# Of other arrays, the names are those of indicators.
+_FIELDS = ('order_amplitude', _PULSES, 'envelope_amplitude', 'envelope_spectrum')
 
 
 @dataclass(frozen=True)
