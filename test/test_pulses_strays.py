@@ -100,6 +100,48 @@ def test_a_displaced_pulse_of_a_steady_shaft_is_in_no_cycle(rng, size):
     assert found.size > 270
 
 
+@pytest.mark.parametrize('clock', [0.0, 4000.0])
+@pytest.mark.parametrize('marks', [1, 4])
+def test_a_displaced_pulse_among_equal_intervals_is_no_tick_of_a_clock(marks, clock):
+    """Whole fractions of an interval, too, which a clock with such a tick would show."""
+    for period in (0.03, 0.04, 1.0 / 33.3):
+        for size in (0.02, 0.03, 0.05, 0.1):
+            pulses = 1.0 + period / marks * np.arange(200.0 * marks)
+            displaced = pulses[90 * marks] + size * period / marks * np.array([0.0, 1.0])
+            given = np.where(pulses == displaced[0], displaced[1], pulses)
+            if clock:
+                given = np.ceil(given * clock - 1e-9) / clock
+                displaced = np.ceil(displaced * clock - 1e-9) / clock
+            if clock and np.ptp(displaced) < 2.5 / clock:
+                continue  # intervals that are rounded differ by two ticks
+            validator = PulseValidator(pulses_per_revolution=marks, pulses_per_trigger=1)
+            found = np.append(validator.update(given).times, validator.flush().times)
+            assert displaced[1] not in found, (period, size)
+            assert found.size > 195 * marks
+
+
+@pytest.mark.parametrize('clock', [0.0, 4000.0])
+@pytest.mark.parametrize('step', [1e-3, -1e-3])
+def test_a_step_of_the_time_among_equal_intervals_is_in_no_cycle(step, clock):
+    for period in (0.02, 0.03, 0.04, 1.0 / 33.3):
+        pulses = 1.0 + period * np.arange(300.0) + step * (np.arange(300) >= 150)
+        if clock:
+            pulses = np.ceil(pulses * clock - 1e-9) / clock
+        validator = PulseValidator()
+        found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
+        assert found.times.size > 295
+        assert found.starts_run[np.flatnonzero(found.times >= pulses[150])[0]]
+
+
+def test_the_nearer_of_two_pulses_of_one_mark_is_the_pulse(rng):
+    """Not a stray shortly before it, which fits worse."""
+    pulses = 0.03 * np.arange(400.0) + rng.normal(0.0, 10e-6, 400)
+    given = np.sort(np.append(pulses, pulses[50::20] - 80e-6))
+    validator = PulseValidator()
+    found = np.append(validator.update(given).times, validator.flush().times)
+    assert np.array_equal(found, pulses)
+
+
 def test_the_second_of_two_near_pulses_is_the_true_one():
     """A stray at 75 to 95 % of an interval is not taken for the pulse, nor the pulse dropped."""
     pulses = 0.03 * np.arange(100.0)

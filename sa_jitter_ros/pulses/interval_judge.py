@@ -262,12 +262,13 @@ class IntervalJudge:
         assert self._lock is not None
         queue, model = self._queue, self._model
         expected = math.exp(model.expected) * float(self._lock.widths[self._slot])
-        same = model.harmless * expected  # no average shows which of two so near is true
+        same = model.same * expected
         if queue[0] - self.confirmed < same:
             self._drop('doubles')
             return True
         if queue.size > 1 and queue[1] - queue[0] < same:
-            self._drop('doubles', at=1)
+            first_is_nearer = expected <= 0.5 * (queue[0] + queue[1]) - self.confirmed
+            self._drop('doubles', at=int(first_is_nearer))
             return True
         if queue.size == 1 and not final:
             return False

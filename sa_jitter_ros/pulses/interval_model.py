@@ -50,9 +50,13 @@ _OF_MARKS = 1.0
 # A shaft scatters more than was learnt if so many of the latest intervals differ by more than the
 # tolerance, but not by more than _NEAR; it is wider then than the largest of these by _WIDER.
 _SEVERAL, _OF_LATEST, _NEAR, _WIDER = 5, 24, 0.15, 1.5
-# Fractions of a trigger cycle: smallest tolerance, and displacement that no average shows. A pulse
-# further off its expected time waits for the next one, which tells if it was a stray.
-_FLOOR, _HARMLESS = 1e-3, 3e-3
+# Fractions of a trigger cycle: smallest tolerance, displacement that no average shows, distance of
+# two pulses of one mark. A pulse further off its expected time waits for the next one, which tells
+# if it was a stray; the nearer one of two is the pulse.
+_FLOOR, _HARMLESS, _SAME = 1e-3, 1e-3, 3e-3
+# Of a trigger cycle: longest tick that a single step of equal intervals shows, and that a longer
+# interval beside a shorter one shows. These two may differ by _OPPOSITE of their deviation.
+_LONE_STEP, _LONE_PAIR, _OPPOSITE = 0.015, 0.006, 0.2
 
 
 class IntervalModel:
@@ -74,7 +78,9 @@ class IntervalModel:
         self.given, self.block = given, block
         self._window, self._of_marks = max(_WINDOW, 3 * marks), _OF_MARKS * (marks > 1)
         self._floor = min(_FLOOR * pulses_per_trigger, 0.03)
-        self._harmless = min(_HARMLESS * pulses_per_trigger, 0.1)
+        self._harmless, self._same = (
+            min(share * pulses_per_trigger, 0.1) for share in (_HARMLESS, _SAME))
+        self._cycle = pulses_per_trigger
         self.start(np.zeros(1), scatter=_PRIOR, count=1)
 
     def start(self, levels: FloatArray, *, scatter: float, count: int,
@@ -180,6 +186,11 @@ class IntervalModel:
         tick = clock_tick(np.concatenate((self._intervals, intervals)), latest) / length
         if tick <= self._tick:
             return False
+        # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
+        lone = not clock_tick(self._intervals, latest)
+        opposite = _is_displacement(intervals / widths / length - 1.0)
+        if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
+            return False
         before, self._tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
         return self.tolerance > before
@@ -221,6 +232,13 @@ class IntervalModel:
         self.tolerance = self.given or widest
         #: a deviation up to this passes without looking at the next pulse
         self.harmless = min(widest, self._harmless, self.tolerance)
+        #: pulses nearer to each other are of one mark
+        self.same = min(widest, self._same, self.tolerance)
+
+
+def _is_displacement(deviations: FloatArray) -> bool:
+    """Tell whether of these intervals (n,) one is longer by as much as another is shorter."""
+    return bool(abs(deviations.sum()) < _OPPOSITE * np.abs(deviations).max())
 
 
 def _robust_square(squares: FloatArray) -> float:
