@@ -14,8 +14,9 @@ Trigger cycles in angle: their order amplitudes and their points of the waveform
 A cycle is `r` fundamental cycles long. Its order amplitudes are integrals over the whole trigger
 cycle for any r (Camerini et al. 2019, Eq. 26 with N_i = r), on a grid that is never coarser than
 the samples. The points of the waveform are at k/n of a fundamental cycle and independent of the
-pulses, so that a fundamental cycle with a pulse inside it is exact, too. Consecutive cycles are
-resampled and projected together.
+pulses, so that a fundamental cycle with a pulse inside it is exact, too. The grid of the
+amplitudes are these points wherever they will do (`CycleProjection`, `WaveformPoints`).
+Consecutive cycles are resampled and projected together.
 """
 
 from collections.abc import Sequence
@@ -28,8 +29,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
-from sa_jitter_ros.pulses.resampling import interpolate, interpolate_between, margin
+from sa_jitter_ros.pulses.resampling import (
+    impulse_response, interpolate, interpolate_between, margin)
 from scipy.fft import next_fast_len
+from scipy.interpolate import CubicSpline
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -38,6 +41,9 @@ ComplexArray = NDArray[np.complex128]
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
 _SMALL_GRID = 64  # points of a cycle up to which its amplitudes are one plain product
+#: Points on either side of a pulse that have a share in the amplitudes of both cycles.
+EDGE = 8
+_EDGE_POWERS = 10  # of the polynomials through the shares: exact to 1e-8
 _LARGE = 1 << 61  # of what integers of 64 bits hold
 
 
@@ -98,7 +104,7 @@ class CycleSamples:
         Return values (point, channel) at fractions `u` of every cycle, cycle after cycle.
 
         `u` (u,) are the same in all cycles, or (cycle, u) those of each, of which NaN are left
-        out.
+        out. They may lie somewhat outside of the cycle.
         """
         pulses = (self.pulses - self.start_time) * self.rate
         # Positions in a cycle count from the sample in front of it, so that they do not depend on
@@ -108,9 +114,6 @@ class CycleSamples:
         if self.ripple:
             positions = positions - self.rate * self.ripple * u * (1.0 - u)
         before = origins - self.first_index
-        # The position of a pulse on the first or last sample may round to just outside.
-        np.maximum(positions[0], -before[0], out=positions[0])
-        np.minimum(positions[-1], len(self.samples) - 1.0 - before[-1], out=positions[-1])
         whole = np.floor(positions)
         fraction = positions - whole
         index = np.add(whole, before[:, None], out=whole)
@@ -258,19 +261,13 @@ class CycleProjection:
     """
     Order amplitudes of some consecutive trigger cycles, from pieces of their grid.
 
-    The grid has `points` equal steps of angle in each of `count` cycles, which are `cycles`
-    fundamental cycles long; the first is number `first_cycle` of those since angle 0, to which
-    phases refer. An amplitude is twice the mean of x exp(-j 2 pi g theta) by the trapezoidal rule.
+    The grid has `points` equal steps of angle in each cycle, which is `cycles` fundamental cycles
+    long. An amplitude is twice the mean of x exp(-j 2 pi g theta).
     """
 
-    def __init__(self, points: int, cycles: float, orders: tuple[float, ...], *, first_cycle: int,
-                 count: int) -> None:
+    def __init__(self, points: int, cycles: float, orders: tuple[float, ...]) -> None:
         self._points, self._cycles, self._orders = points, cycles, orders
         self._fine, self._coarse = _order_basis(points, cycles, orders)
-        whole, rest = multiples(exact_cycles(cycles), first_cycle, count)
-        # In whole fundamental cycles integer orders make whole turns.
-        self._turns = np.multiply.outer(whole[:-1], np.mod(orders, 1.0)) + np.multiply.outer(
-            rest[:-1], orders)
         self._parts: FloatArray | None = None  # sums over the rows of the coarse table
         self._rest: ComplexArray | float = 0.0
         self._begins: FloatArray = np.empty(0)
@@ -303,19 +300,37 @@ class CycleProjection:
             total = self._fine[:, :points - rows * width] @ values[:, rows * width:]
             self._rest = np.moveaxis((last[:lines] + 1j * last[lines:])[:, None] * total, 1, 2)
 
-    def amplitudes(self, end: FloatArray) -> ComplexArray:
-        """Return them (cycle, channel, order), given the very last value `end` (channel,)."""
+    def sums(self) -> ComplexArray:
+        """Sum over the points (cycle, channel, order), with angle 0 at the begin of each cycle."""
         total: Any = self._rest
         if self._parts is not None:
             lines, width = self._fine.shape
-            sums = self._parts[:, :lines] + 1j * self._parts[:, lines:]
-            sums = sums.reshape(len(sums), lines, width, -1)
-            total = total + np.moveaxis(np.matmul(self._fine[:, None], sums)[:, :, 0], 1, 2)
+            parts = self._parts[:, :lines] + 1j * self._parts[:, lines:]
+            parts = parts.reshape(len(parts), lines, width, -1)
+            total = total + np.moveaxis(np.matmul(self._fine[:, None], parts)[:, :, 0], 1, 2)
+        return np.asarray(total)
+
+    def amplitudes(self, end: FloatArray, first_cycle: int = 0) -> ComplexArray:
+        """
+        Return them (cycle, channel, order) by the trapezoidal rule.
+
+        The value at the end of the last cycle is `end` (channel,). The first cycle is number
+        `first_cycle` of those since angle 0, to which phases refer.
+        """
+        count = len(self._begins)
         ends = np.concatenate((self._begins, end[None]))
         turn = np.exp(-2j * np.pi * self._cycles * np.array(self._orders))
-        total = total + (ends[1:, :, None] * turn - ends[:-1, :, None]) / 2.0
-        return np.asarray(
-            total * (2.0 / self._points * np.exp(-2j * np.pi * self._turns))[:, None])
+        total = self.sums() + (ends[1:, :, None] * turn - ends[:-1, :, None]) / 2.0
+        whole, rest = multiples(exact_cycles(self._cycles), first_cycle, count)
+        turned = _turned(whole[:-1], rest[:-1], self._orders)
+        return np.asarray(total * (2.0 / self._points * turned)[:, None])
+
+
+def _turned(whole: IntArray, rest: FloatArray, orders: tuple[float, ...]) -> ComplexArray:
+    """Return exp(-j 2 pi g theta) (cycle, order) at angles of `whole` + `rest` (cycle,)."""
+    # In whole fundamental cycles integer orders make whole turns.
+    return np.exp(-2j * np.pi * (np.multiply.outer(whole, np.mod(orders, 1.0))
+                                 + np.multiply.outer(rest, orders)))
 
 
 def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first_cycle: int = 0,
@@ -323,8 +338,9 @@ def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first
     """
     Return the complex peak amplitudes (cycle, channel, order) of consecutive trigger cycles.
 
-    `grid` (count x points + 1, channel) are the values of `count` cycles at equal steps of angle,
-    and the last end; the other arguments are those of `CycleProjection`.
+    `grid` (count x points + 1, channel) are the values of `count` cycles of `cycles` fundamental
+    cycles at equal steps of angle, and the last end. The first is number `first_cycle` of those
+    since angle 0, to which phases refer.
 
     >>> theta = np.linspace(0.0, 1.0, 65)
     >>> wave = 3.0 * np.cos(2.0 * np.pi * 4.0 * theta)[:, None]
@@ -332,9 +348,106 @@ def project(grid: FloatArray, cycles: float, orders: tuple[float, ...], *, first
     array([[[3., 0.]]])
     """
     points = (len(grid) - 1) // count
-    projection = CycleProjection(points, cycles, orders, first_cycle=first_cycle, count=count)
+    projection = CycleProjection(points, cycles, orders)
     projection.add(0, grid[:-1].reshape(count, points, -1))
-    return projection.amplitudes(grid[-1])
+    return projection.amplitudes(grid[-1], first_cycle)
+
+
+@dataclass(frozen=True)
+class WaveformPoints:
+    """
+    The points of the waveform in consecutive trigger cycles.
+
+    There are `points` in a fundamental cycle and r (`cycles`) of these in a trigger cycle. The
+    points are numbered from angle 0 on: `first` (cycle + 1,) are the first ones at or after the
+    begin of each cycle and of the one behind, and `behind` (cycle + 1,) their distances from it in
+    steps.
+
+    The amplitudes of the cycles follow from these points and `EDGE` more on either side, which
+    continue the angle law of the cycle: an amplitude is the integral of the band-limited function
+    through all of them times exp(-j 2 pi g theta), from pulse to pulse. Inside of a cycle each
+    point has the weight 1, beside a pulse a share of it.
+    """
+
+    points: int
+    cycles: float
+    first: IntArray
+    behind: FloatArray
+
+    @classmethod
+    def of(cls, points: int, cycles: float, first_cycle: int, count: int) -> 'WaveformPoints':
+        """Return those of `count` cycles, of which the first is `first_cycle` since angle 0."""
+        whole, rest = multiples(exact_cycles(cycles) * points, first_cycle, count)
+        inside = rest > 0.0
+        return cls(points, cycles, whole + inside, np.where(inside, 1.0 - rest, 0.0))
+
+    @property
+    def number(self) -> IntArray:
+        """Return the number of points (cycle,) in each cycle."""
+        return np.diff(self.first)
+
+    def part(self, first: int, end: int) -> 'WaveformPoints':
+        """Return those of some of the cycles."""
+        return replace(self, first=self.first[first:end + 1], behind=self.behind[first:end + 1])
+
+    def fractions(self, around: int = 0) -> FloatArray:
+        """
+        Return the positions u (cycle, point) of the points in their cycles.
+
+        In cycles with fewer points than others they go on behind the last one. There are `around`
+        points more in front and behind.
+        """
+        steps = np.arange(-around, self.number.max() + around)
+        return np.asarray((self.behind[:-1, None] + steps) / (self.points * self.cycles))
+
+    def amplitudes(self, values: FloatArray, orders: tuple[float, ...]) -> ComplexArray:
+        """Return them (cycle, channel, order), from values at `fractions(EDGE)`."""
+        number, most = self.number, values.shape[1] - 2 * EDGE
+        projection = CycleProjection(most, most / self.points, orders)
+        projection.add(0, values[:, EDGE:EDGE + most])
+        total = projection.sums()
+        step = -2j * np.pi / self.points * np.array(orders)
+        # The last point of a cycle with fewer points belongs to the next one.
+        beyond = values[:, EDGE + most - 1] * (number < most)[:, None]
+        total -= beyond[:, :, None] * np.exp(step * (most - 1))
+        share = _edge_shares(self.points, orders, self.behind)
+        window = number[:, None] + np.arange(2 * EDGE)
+        last = values[np.arange(len(values))[:, None], window]
+        total += np.moveaxis(share[1:] @ last, 1, 2) * np.exp(np.multiply.outer(number, step))[
+            :, None]
+        total -= np.moveaxis(share[:-1] @ values[:, :2 * EDGE], 1, 2)
+        whole, rest = np.divmod(self.first[:-1], self.points)
+        turned = _turned(whole, rest / self.points, orders)
+        return np.asarray(total * (2.0 / (self.points * self.cycles) * turned)[:, None])
+
+
+def _edge_shares(points: int, orders: tuple[float, ...], behind: FloatArray) -> ComplexArray:
+    """
+    Return the weights (pulse, order, point) that points around pulses add to the cycle before.
+
+    The first point behind a pulse, by `behind` (pulse,) steps, is number `EDGE` of the points.
+    """
+    polynomials = _edge_polynomials(points, orders)
+    powers = np.vander(2.0 * behind - 1.0, len(polynomials), increasing=True)
+    return np.asarray((powers @ polynomials.reshape(len(polynomials), -1)).reshape(
+        len(behind), len(orders), -1))
+
+
+@lru_cache(maxsize=16)
+def _edge_polynomials(points: int, orders: tuple[float, ...]) -> ComplexArray:
+    """Return `_edge_shares` as polynomials (power, order, point) of 2 behind - 1."""
+    nodes = np.cos(np.pi * (np.arange(_EDGE_POWERS) + 0.5) / _EDGE_POWERS)
+    steps = np.arange(-EDGE, EDGE)  # from the first point behind the pulse
+    place, kernel = impulse_response(256)
+    turn = 2.0 * np.pi / points * np.array(orders)
+    integral = CubicSpline(place, kernel[:, None] * np.exp(
+        -1j * np.multiply.outer(place, turn))).antiderivative()
+    before = integral(-steps - (nodes[:, None] + 1.0) / 2.0) / integral(EDGE)
+    before[:, :EDGE] -= 1.0
+    shares = np.moveaxis(before, 1, 2) * np.exp(-1j * np.multiply.outer(turn, steps))
+    flat = shares.reshape(_EDGE_POWERS, -1)
+    return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), flat)).reshape(
+        shares.shape)
 
 
 def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatArray]:
@@ -352,19 +465,6 @@ def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatAr
                 np.array([pair[1] / divisor for pair in pairs]))
     total = rest + number * np.arange(count + 1)
     return whole + total // divisor, (total % divisor) / divisor
-
-
-def first_points(cycles: float, points: int, first_cycle: int, count: int
-                 ) -> tuple[IntArray, FloatArray]:
-    """
-    Return the first waveform point at or after the begin of each of consecutive cycles, and its u.
-
-    The second array are the fractions of the trigger cycle from its begin to the point. Both have
-    a last element more, for the cycle behind.
-    """
-    whole, rest = multiples(exact_cycles(cycles) * points, first_cycle, count)
-    behind = rest > 0.0
-    return whole + behind, np.where(behind, 1.0 - rest, 0.0) / (points * cycles)
 
 
 @lru_cache(maxsize=64)

@@ -17,7 +17,7 @@ a fraction of the same for each of them. The settings limit its memory.
 """
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from fractions import Fraction
 from itertools import pairwise
 import math
@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import Repeatability
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
-    choose_samples_per_revolution, CycleProjection, CycleSamples, exact_cycles, first_points,
-    grid_points, joined, needed_margin, on_grid, waveform_cutoff)
+    choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
+    joined, needed_margin, on_grid, waveform_cutoff, WaveformPoints)
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, PartsMean,
@@ -45,6 +45,8 @@ _ALL_CYCLES = 1 << 40
 TOGETHER = 1 << 18
 # Numbers that are resampled, projected and averaged together, but not fewer positions.
 _CACHED, _FEW = 1 << 16, 1 << 11
+# Points of a trigger cycle beside which those around its ends cost little.
+_LONG = 8 * EDGE
 
 
 class ShaftAverager:
@@ -118,7 +120,8 @@ class ShaftAverager:
         cutoff = 1.0
         if points * self.settings.cycle_length < period * rate:
             cutoff = float(waveform_cutoff(points, self.settings.cycle_length, period, rate))
-        return needed_margin(self.settings.interpolation, cutoff)
+        edge = EDGE if self._needs_edges(points) and cutoff == 1.0 else 0
+        return needed_margin(self.settings.interpolation, cutoff) + edge
 
     def update(self, cycles: CycleSamples) -> Average | None:
         """
@@ -213,9 +216,18 @@ class ShaftAverager:
         """Return the grid's points in each cycle, those of the waveform where these will do."""
         r, n = self.settings.cycle_length, self._points
         points = grid_points(cycles.periods, cycles.rate)
-        if on_grid(n, r):
+        if on_grid(n, r) or self._needs_edges(n):
             points = np.where(self._cutoff(cycles) == 1.0, round(n * r), points)
         return points
+
+    def _needs_edges(self, points: int) -> bool:
+        """
+        Whether amplitudes come from `points` that are at other angles of every cycle.
+
+        Short cycles have a grid of their own, and other angle laws, which end at the pulses.
+        """
+        r = self.settings.cycle_length
+        return points * r >= _LONG and self._law is LINEAR_LAW and not on_grid(points, r)
 
     def _cutoff(self, cycles: CycleSamples) -> FloatArray:
         return waveform_cutoff(self._points, self.settings.cycle_length, cycles.periods,
@@ -250,45 +262,73 @@ class ShaftAverager:
         """
         r, n, method = self.settings.cycle_length, self._points, self.settings.interpolation
         cutoff, size = float(self._cutoff(cycles)[0]), int(self._grid_points(cycles)[0])
-        count, channels, first_cycle = cycles.count, cycles.samples.shape[1], self._cycle
-        projection = CycleProjection(size, r, self.settings.orders, first_cycle=first_cycle,
-                                     count=count)
-        end, u = self._angle(first_cycle + count), np.arange(size) / size
+        channels = cycles.samples.shape[1]
         if len(self._wave) != n:
             self._wave = np.full((n, channels), np.nan)
-        shared, first = on_grid(n, r) and cutoff == 1.0, first_points(r, n, first_cycle, count)
-        # Trigger cycles that are the fundamental cycles need not be put together.
-        mean = self._wave_mean
-        whole = None
-        if (isinstance(mean, BlockMean) and shared and size == n
-                and self._next_point == first[0][0]):
-            whole = mean
-            whole.expect(count, (n, channels))
-        points = np.empty((count, size if shared and not whole else 0, channels))
-        piece = size
+        points = WaveformPoints.of(n, r, self._cycle, cycles.count)
+        if on_grid(n, r) and cutoff == 1.0:
+            return self._resample_even(cycles, points)
+        if self._needs_edges(n) and cutoff == 1.0:
+            return self._resample_uneven(cycles, points)
+        u = points.fractions()
+        u[np.arange(u.shape[1]) >= points.number[:, None]] = np.nan
+        self._add_points(points, cycles.at(self._law, u, method=method, cutoff=cutoff))
+        return self._project(cycles, size)
+
+    def _project(self, cycles: CycleSamples, size: int,
+                 take: Callable[[slice, FloatArray], None] = lambda where, values: None
+                 ) -> ComplexArray:
+        """Return the amplitudes from a grid of so many points, whose pieces `take` gets, too."""
+        count, channels = cycles.count, cycles.samples.shape[1]
+        projection = CycleProjection(size, self.settings.cycle_length, self.settings.orders)
+        piece, u = size, np.arange(size) / size
         if self._law is LINEAR_LAW:  # others fit a cycle at once
             piece = max(max(_CACHED // channels, _FEW) // (count * projection.step), 1)
             piece *= projection.step
         for begin in range(0, size, piece):
-            values = cycles.at(self._law, u[begin:begin + piece], method=method).reshape(
+            where = slice(begin, begin + piece)
+            values = cycles.at(self._law, u[where], method=self.settings.interpolation).reshape(
                 count, -1, channels)
             projection.add(begin, values)
-            if whole:
-                whole.put(slice(begin, begin + piece), values)
-            elif shared:
-                points[:, begin:begin + piece] = values
-        if whole:
-            self._next_point += count * n
-        elif shared:
-            self._add_points(int(first[0][0]), points.reshape(-1, channels), end)
-        else:
-            number = np.diff(first[0])
-            steps = np.arange(number.max())
-            u = first[1][:-1, None] + steps / (n * r)
-            u[steps >= number[:, None]] = np.nan
-            self._add_points(int(first[0][0]), cycles.at(
-                self._law, u, method=method, cutoff=cutoff), end)
-        return projection.amplitudes(cycles.end(method=method))
+            take(where, values)
+        return projection.amplitudes(cycles.end(method=self.settings.interpolation), self._cycle)
+
+    def _resample_even(self, cycles: CycleSamples, points: WaveformPoints) -> ComplexArray:
+        """As `_resample`, with the points of the waveform at the same angles of every cycle."""
+        mean, size = self._wave_mean, int(points.number[0])
+        if (isinstance(mean, BlockMean) and size == self._points
+                and self._next_point == points.first[0]):
+            # Trigger cycles that are the fundamental cycles need not be put together.
+            mean.expect(cycles.count, self._wave.shape)
+            amplitudes = self._project(cycles, size, mean.put)
+            self._next_point += cycles.count * size
+            return amplitudes
+        every = np.empty((cycles.count, size, cycles.samples.shape[1]))
+
+        def take(where: slice, values: FloatArray) -> None:
+            every[:, where] = values
+
+        amplitudes = self._project(cycles, size, take)
+        self._add_points(points, every.reshape(-1, every.shape[2]))
+        return amplitudes
+
+    def _resample_uneven(self, cycles: CycleSamples, points: WaveformPoints) -> ComplexArray:
+        """As `_resample`, with points at other angles of every cycle, some cycles at a time."""
+        channels, begin = cycles.samples.shape[1], points.first - points.first[0]
+        every = np.empty((int(begin[-1]), channels))
+        piece = max(_CACHED // (channels * int(points.number[0])), 1)
+        amplitudes = []
+        for first in range(0, cycles.count, piece):
+            end = min(first + piece, cycles.count)
+            part = points.part(first, end)
+            values = cycles.part(first, end).at(
+                self._law, part.fractions(EDGE), method=self.settings.interpolation).reshape(
+                    end - first, -1, channels)
+            amplitudes.append(part.amplitudes(values, self.settings.orders))
+            for k, wave in enumerate(values[:, EDGE:], first):
+                every[begin[k]:begin[k + 1]] = wave[:begin[k + 1] - begin[k]]
+        self._add_points(points, every)
+        return np.concatenate(amplitudes)
 
     def _remember(self, amplitudes: ComplexArray) -> None:
         """Append the amplitudes of cycles to those of the window, in memory never reused."""
@@ -328,9 +368,10 @@ class ShaftAverager:
         """Begin with the first fundamental cycle that is whole from this angle on."""
         self._next_point = math.ceil(angle) * self._points
 
-    def _add_points(self, first: int, points: FloatArray, end: Fraction) -> None:
-        """Put points into their fundamental cycles; add those that are whole at `end`."""
-        n = self._points
+    def _add_points(self, of: WaveformPoints, points: FloatArray) -> None:
+        """Put points into their fundamental cycles; add those that are whole at the end."""
+        n, first = self._points, int(of.first[0])
+        end = self._angle(self._cycle + len(of.number))
         if self._full:
             self._take_wave()
         whole = math.floor(end) * n

@@ -1,0 +1,51 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Order amplitudes of single trigger cycles against the integrals that define them."""
+
+import numpy as np
+import pytest
+from sa_jitter_ros.averaging.average import AverageSettings
+from sa_jitter_ros.averaging.cycle import CycleSamples, on_grid
+from sa_jitter_ros.averaging.shaft import average_cycles
+
+RATE, SPEED, CYCLES, START = 10e3, 10.0, 36, 0.0123
+
+
+def integrals(order, tone, ratio):
+    """Return those of a cosine of order `tone` and phase 0.7 times exp(-j ...), cycle by cycle."""
+    ends = ratio * np.arange(CYCLES + 1)
+
+    def turned(step):
+        if not step:
+            return np.full(CYCLES, ratio)
+        return np.diff(np.exp(2j * np.pi * step * ends)) / (2j * np.pi * step)
+
+    return (np.exp(0.7j) * turned(tone - order)
+            + np.exp(-0.7j) * turned(-tone - order)) / ratio
+
+
+@pytest.mark.parametrize('tone', [3.0, 19.0, 50.5, 120.0])
+@pytest.mark.parametrize('ratio', [2.40789, 0.410003, np.sqrt(2.0)])
+def test_amplitudes_of_a_cycle_are_integrals_over_it(ratio, tone):
+    frequency = tone * ratio * SPEED
+    assert frequency < 0.32 * RATE
+    time = np.arange(round((CYCLES + 2) / SPEED * RATE)) / RATE
+    samples = np.cos(2.0 * np.pi * frequency * (time - START) + 0.7)[:, None]
+    pulses = START + np.arange(CYCLES + 1) / SPEED
+    orders = (tone, tone + 1.0, tone + 2.3)
+    run = CycleSamples.cut(samples, start_time=0.0, rate=RATE, pulses=pulses, first=0, margin=40,
+                           count=CYCLES)
+    average = average_cycles([run], AverageSettings(
+        cycle_length=ratio, trigger_cycles=CYCLES, orders=orders))
+    assert not on_grid(average.angle.size, ratio)
+    for amplitudes, order in zip(average.cycle_amplitudes[:, 0].T, orders):
+        # The gain of the interpolator is 1 to 0.001 dB.
+        np.testing.assert_allclose(amplitudes, integrals(order, tone, ratio), atol=1.2e-4)
