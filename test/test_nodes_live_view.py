@@ -50,16 +50,23 @@ REPORT = {
     'error_before': {'rms': 0.0123}, 'error_after': {'rms': 0.0018}, 'verdict': 'traced',
     'lines': [{'channel': 'channel 0', 'order': 19.0, 'observed': 0.9,
                'predicted_before': 0.95, 'predicted_after': 0.901}]}
+CHANGE = {
+    'baseline': {'averages': 200, 'complete': True},
+    'changes': [{
+        'shaft': 'shaft', 'channel': 0, 'kind': kind, 'name': name, 'change': change,
+        'standard_error': 0.006, 'since_sequence': 5, 'since_time': 72.0, 'keyphasor_share': 0.003,
+        'p_value': 1e-9} for kind, name, change in (
+            ('order', '19', 0.041), ('indicator', 'rms', -0.02))]}
 
 
 class ViewBench(NodeBench):
     """A bench around the view: publishers of all that it shows, and a client of its page."""
 
     def __init__(self, graph, **parameters):
-        latched = {'prediction': Float64MultiArray, 'missing_effect': String}
+        latched = {'prediction': Float64MultiArray, 'missing_effect': String, 'change': String}
         inputs = {f'shaft/{kind}': Float64MultiArray for kind in (
             'synchronous_average', 'standard_error', 'corrected_average', 'order_amplitude',
-            'pulse_error', 'condition_indicator')}
+            'pulse_error', 'condition_indicator', 'condition_indicator_error')}
         super().__init__(
             graph, LiveView, qos=RESULT_QOS, outputs={},
             inputs={**inputs, 'residual': Float64MultiArray, 'shaft_speed': Float64},
@@ -114,12 +121,14 @@ def average(kind, values, names=(), sequence=7):
 
 def amplitudes(attenuation=0.9, channels=2):
     """Return a table (channel, order, field) of order amplitudes."""
-    table = np.full((channels, len(ORDERS), 8), 0.25)
+    table = np.full((channels, len(ORDERS), len(messages.AMPLITUDE_FIELDS)), 0.25)
     table[..., 0] = ORDERS
     table[..., 1] = 0.4321 * attenuation
     table[..., 3] = 0.4321
     table[..., 5] = attenuation
     table[..., 6] = 0.0123
+    table[..., 8] = 0.021
+    table[..., 10] = 0.032
     return table
 
 
@@ -146,6 +155,8 @@ def publish_all(b):
     b.send('shaft/standard_error', average('standard_error', np.full(raw.shape, 0.05)))
     b.send('shaft/condition_indicator', average(
         'condition_indicator', np.array([[0.7071, NAN], [0.3536, 1.523]]), ('rms', 'fm0')))
+    b.send('shaft/condition_indicator_error', average(
+        'condition_indicator_error', np.array([[0.0123, NAN], [0.01, 0.2]]), ('rms', 'fm0')))
     b.send('shaft/corrected_average', average('corrected_average', 1.1 * raw))
     b.send('shaft/order_amplitude', average(
         'order_amplitude', amplitudes(), messages.AMPLITUDE_FIELDS))
@@ -157,6 +168,7 @@ def publish_all(b):
     b.send('residual', messages.encode_residual(
         messages.ResidualMessage(table, 20, 1.07, 0.38, 0.01)))
     b.send('missing_effect', String(data=json.dumps(REPORT)))
+    b.send('change', String(data=json.dumps(CHANGE)))
     b.send('shaft_speed', Float64(data=16.625))
     b.send('/diagnostics', DiagnosticArray(status=[DiagnosticStatus(
         level=DiagnosticStatus.WARN, name='rig/averager', message='pulses_dropped increased',
@@ -179,9 +191,9 @@ def test_snapshot_holds_what_was_published(bench):
         'shaft/corrected_average', 'shaft/order_amplitude', 'shaft/pulse_error',
         'shaft/synchronous_average_spectrum', 'shaft/corrected_average_spectrum',
         'shaft/synchronous_average_map', 'shaft/corrected_average_map',
-        'shaft/condition_indicator', 'shaft/indicator_trend', 'shaft/raw_trend',
-        'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect', 'shaft_speed',
-        '/diagnostics'}
+        'shaft/condition_indicator', 'shaft/condition_indicator_error', 'shaft/indicator_trend',
+        'shaft/raw_trend', 'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect',
+        'change', 'shaft_speed', '/diagnostics'}
     assert parts['settings'] == {'shafts': ['shaft'], 'vibration_unit': 'g',
                                  'channel_names': ['casing', 'shaft end']}
     assert parts['shaft/synchronous_average']['header'] == vars(header())
@@ -199,6 +211,9 @@ def test_snapshot_holds_what_was_published(bench):
     assert parts['shaft/condition_indicator'] == {
         'header': vars(header()), 'names': ['rms', 'fm0'],
         'values': [[0.7071, None], [0.3536, 1.523]]}
+    assert parts['shaft/indicator_trend']['value'] == [[0.7071, None]]
+    assert parts['shaft/indicator_trend']['error'] == [[0.0123, None]]
+    assert parts['shaft/condition_indicator_error']['values'] == [[0.0123, None], [0.01, 0.2]]
     for name, values in zip(messages.AMPLITUDE_FIELDS, np.moveaxis(amplitudes(), -1, 0)):
         assert parts['shaft/order_amplitude'][name] == values.tolist()
     for name, values in zip(messages.PULSE_ERROR_FIELDS, pulse_errors().T):
@@ -208,6 +223,7 @@ def test_snapshot_holds_what_was_published(bench):
     assert parts['residual']['z'] == [-2.5] * 3
     assert parts['residual']['acquisitions'] == 20
     assert parts['missing_effect'] == REPORT
+    assert parts['change'] == CHANGE
     assert parts['shaft_speed'] == {'value': 16.625, 'history': [16.625]}
     node = parts['/diagnostics']['rig/averager']
     assert (node['level'], node['message']) == (1, 'pulses_dropped increased')
@@ -219,7 +235,7 @@ def test_trends_grow_and_begin_anew_where_time_runs_back(bench):
     b, table = bench(), amplitudes()
     for number in range(3):
         b.send('shaft/order_amplitude', average(
-            'order_amplitude', table * [1.0, *[1.0 + number] * 7], messages.AMPLITUDE_FIELDS,
+            'order_amplitude', table * [1.0, *[1.0 + number] * (table.shape[-1] - 1)], messages.AMPLITUDE_FIELDS,
             sequence=number))
     b.settle()
     trend = b.part('shaft/corrected_trend')
@@ -228,12 +244,23 @@ def test_trends_grow_and_begin_anew_where_time_runs_back(bench):
     first = dict(zip(messages.AMPLITUDE_FIELDS, np.moveaxis(table, -1, 0)))
     np.testing.assert_allclose(trend['value'], np.multiply.outer(
         [1.0, 2.0, 3.0], first['corrected_amplitude'][0]), rtol=1e-4)
-    np.testing.assert_allclose(trend['error'][2], 3.0 * first['noise_standard_deviation'][0],
+    np.testing.assert_allclose(trend['error'][2], 3.0 * first['corrected_standard_error'][0],
                                rtol=1e-2)
     b.send('shaft/order_amplitude', average(
         'order_amplitude', table, messages.AMPLITUDE_FIELDS, sequence=0))
     b.settle()
     assert len(b.part('shaft/raw_trend')['time']) == 1
+
+
+def test_errors_that_come_later_belong_to_their_average():
+    trend, values = board.Trend(), np.ones((1, 2))
+    assert trend.amend(1.0, values) is None  # of an average that never came
+    trend.add(1.0, ('a', 'b'), values, values * NAN)
+    assert trend.amend(0.5, values) is None
+    assert trend.amend(1.0, np.ones((1, 3))) is None
+    assert trend.amend(1.0, 0.25 * values)(0)['error'] == [[0.25, 0.25]]
+    shown = trend.add(2.0, ('a', 'b'), values, values * NAN)(0)
+    assert shown['error'] == [[0.25, 0.25], [None, None]]
 
 
 def test_a_long_trend_is_bounded_in_memory_and_on_the_line():
@@ -252,13 +279,15 @@ def test_order_map_shows_amplitudes_in_decibels_and_is_bounded(monkeypatch):
     monkeypatch.setattr(board, 'time', clock)
     angle, orders = 2.0 * np.pi * np.arange(4096) / 4096, board.OrderMap()
     wave = np.cos(19.0 * angle) + 0.02 * np.cos(1500.0 * angle)
-    for factor in (1.0, 0.1):
-        content = orders.add(factor * np.stack((0.0 * wave, wave)))
-        assert orders.add(np.stack((wave, wave))) is None  # a sliding average, too early
+    for end_time, factor in ((4.0, 1.0), (7.0, 0.1)):
+        content = orders.add(end_time, factor * np.stack((0.0 * wave, wave)))
+        # a sliding average, too early
+        assert orders.add(end_time + 0.1, np.stack((wave, wave))) is None
         clock.now += board.MAP_PERIOD
     found = content(1)
     assert (found['pool'], found['step'], found['span']) == (7, 1, 80.0)  # 2000 orders
     assert found['peak'] == pytest.approx(1.0)
+    assert found['time'] == [4.0, 7.0]
     level = np.array([[ord(item) - ord('0') for item in row] for row in found['rows']])
     assert level.shape == (2, 286)
     # order 19 is in column 2; 63 levels are 80 dB
@@ -269,12 +298,14 @@ def test_order_map_shows_amplitudes_in_decibels_and_is_bounded(monkeypatch):
     assert np.delete(level[0], [2, 1499 // 7]).max() == 0
     assert content(0)['peak'] == 0.0
     assert content(7)['rows'] == []
-    for _ in range(board.MAP_AVERAGES + 5):
-        content = orders.add(np.stack((wave, wave)))
+    for number in range(board.MAP_AVERAGES + 5):
+        content = orders.add(8.0 + number, np.stack((wave, wave)))
         clock.now += board.MAP_PERIOD
     found = content(0)
-    assert len(found['rows']) <= board.MAP_ROWS
+    assert len(found['rows']) == len(found['time']) <= board.MAP_ROWS
+    assert found['time'][-1] == 8.0 + number
     assert found['step'] * len(found['rows']) <= board.MAP_NUMBERS // (2 * 2000) + found['step']
+    assert len(orders.add(3.0, np.stack((wave, wave)))(0)['rows']) == 1  # time ran back
 
 
 def test_each_shaft_has_its_prediction_and_residual(bench):
@@ -353,7 +384,7 @@ def test_snapshot_has_a_limited_size(bench, rng):
     b = bench()
     b.send('shaft/synchronous_average', average(
         'synchronous_average', rng.normal(size=(100, 20000))))
-    table = np.full((100, 400, 8), 0.5)
+    table = np.full((100, 400, len(messages.AMPLITUDE_FIELDS)), 0.5)
     for _ in range(3):
         b.send('shaft/order_amplitude', average(
             'order_amplitude', table, messages.AMPLITUDE_FIELDS))
@@ -396,6 +427,7 @@ BAD = {
     'nested JSON': ('missing_effect', lambda: String(data='[' * 200000)),
     'JSON list': ('missing_effect', lambda: String(data='[1]')),
     'long JSON': ('missing_effect', lambda: String(data=' ' * 1000001)),
+    'change': ('change', lambda: String(data='"none"')),
 }
 
 
@@ -439,6 +471,20 @@ def test_connections_that_drip_are_ended_and_the_page_stays(bench, monkeypatch):
     clock.now += server.REQUEST_SECONDS / 2 + 1.0
     assert [connection.recv(100) for connection in slow[1:]] == [b''] * (len(slow) - 1)
     assert b.ask('/')[0] == 200
+    for connection in slow:
+        connection.close()
+
+
+def test_a_request_takes_the_place_of_the_slowest_connection(bench):
+    b = bench()
+    slow = [socket.create_connection(('127.0.0.1', b.port)) for _ in range(server.CONNECTIONS)]
+    for connection in slow:
+        connection.sendall(b'GET / HT')
+    assert b.spin(lambda: len(b.node._server._server._asking) == len(slow))
+    assert b.ask('/')[0] == 200
+    assert slow[0].recv(100) == b''
+    slow[1].sendall(b'TP/1.1\r\nHost: localhost\r\n\r\n')
+    assert slow[1].recv(100).startswith(b'HTTP')
     for connection in slow:
         connection.close()
 
@@ -612,13 +658,13 @@ def test_the_browser_shows_the_numbers(bench):
     assert text_of(page, 'band') == '100 %'
     assert text_of(page, 'error') == '0.012 → 0.0018'
     rows = text_of(page, 'orders').split()
-    row = ('19', '0.3889', '0.4321', '0.25', '0.9', '±', '0.012', '0.8765', '0.85', 'to', '0.93',
-           'yes')
+    row = ('19', '0.389', '±', '0.021', '0.432', '±', '0.032', '0.25', '0.900', '±', '0.012',
+           '0.8765', '0.85', 'to', '0.93', 'yes')
     assert ' '.join(row) in ' '.join(rows)
     assert 'raw [g]' in text_of(page, 'orders')
     assert text_of(page, 'indicators').split() == [
-        'channel', 'rms', '[g]', 'fm0', 'casing', '0.7071', '–', '&lt;b&gt;end&lt;/b&gt;',
-        '0.3536', '1.523']
+        'channel', 'rms', '[g]', 'fm0', 'casing', '0.707', '±', '0.012', '–',
+        '&lt;b&gt;end&lt;/b&gt;', '0.354', '±', '0.010', '1.52', '±', '0.20']
     assert page.count('class="spread" d="M') == 2
     assert 'excess_jitter (std = 19.3 ± 0.4 µs)' in text_of(page, 'effects')
     assert 'not distinguishable from phase_wander' in text_of(page, 'effects')
@@ -626,12 +672,20 @@ def test_the_browser_shows_the_numbers(bench):
                      text_of(page, 'nodes'))
     # waveforms of two channels, spectrum, average over the circle; the speed has a curve, too
     assert page.count('class="curve raw"') == page.count('class="curve corrected"') - 1 == 4
-    assert text_of(page, 'spectrum-note') == 'point at an order, or click to keep it'
-    assert text_of(page, 'attention').strip() == 'rig/averager: pulses_dropped increased'
-    assert 'order 19, casing' in page  # the trend
+    assert text_of(page, 'spectrum-note').startswith('point at an order; click, or type')
+    attention = re.sub(r'\s+', ' ', text_of(page, 'attention'))
+    assert attention.strip() == (
+        'order 19 of shaft, casing: +4.10 ± 0.60 % since average 5; the keyphasor explains 0.3 % '
+        'rms of shaft, casing: -2.00 ± 0.60 % since average 5; the keyphasor explains 0.3 % '
+        'rig/averager: pulses_dropped increased')
+    assert (text_of(page, 'change'), text_of(page, 'change-note')) == (
+        '2', 'baseline of 200 averages')
+    for title in ('order 19: +4.10 ± 0.60 % since average 5', 'rms: -2.00 ± 0.60 % since average 5'):
+        assert f'>{title}<' in page  # trends
+    assert page.count('class="change"') == 1 + 2  # in the legend, and where they began
     assert page.count('<image href="data:image/png') == 1
     assert page.count('class="mark measured"') == 6  # attenuations and residuals of 3 orders
-    assert page.count('class="mark corrected"') == 3 + 31 + 1 + 1
+    assert page.count('class="mark corrected"') == 3 + 31 + 1 + 1 + 1
     assert page.count('<rect class="band"') == 3 + 1
     assert '&lt;b&gt;end' in page
     assert '<b>end' not in page

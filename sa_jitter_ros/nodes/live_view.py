@@ -32,7 +32,7 @@ from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, dec
 from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
 
-LARGEST_REPORT = 1_000_000  # characters of missing_effect
+LARGEST_REPORT = 1_000_000  # characters of a text in JSON
 NODES, NODE_VALUES = 64, 100  # nodes whose diagnostics are shown, and values of each node
 
 PARAMETERS = (
@@ -77,8 +77,9 @@ class LiveView(MonitoringNode):
             for kind, topic, callback, qos in (
                     (Float64MultiArray, 'prediction', self._on_prediction, LATCHED_QOS),
                     (Float64MultiArray, 'residual', self._on_residual, RESULT_QOS),
-                    (String, 'missing_effect', self._on_missing_effect, LATCHED_QOS)):
+                    (String, 'missing_effect', self._on_object, LATCHED_QOS)):
                 self.create_input(kind, prefix + topic, partial(callback, prefix + topic), qos)
+        self.create_input(String, 'change', partial(self._on_object, 'change'), LATCHED_QOS)
         self.create_input(Float64, 'shaft_speed', self._on_speed, RESULT_QOS)
         self.create_input(DiagnosticArray, '/diagnostics', self._on_diagnostics, RESULT_QOS,
                           most_publishers=0)
@@ -114,7 +115,7 @@ class LiveView(MonitoringNode):
             if kind in maps:
                 self._board.put(f'{shaft}/{kind}_spectrum', partial(spectrum_content, average),
                                 by_channel=True)
-                content = maps[kind].add(average.values[:CHANNELS])
+                content = maps[kind].add(average.header.end_time, average.values[:CHANNELS])
                 if content is not None:
                     self._board.put(f'{shaft}/{kind}_map', content, by_channel=True)
 
@@ -126,6 +127,15 @@ class LiveView(MonitoringNode):
                 self._board.put(f'{shaft}/indicator_trend', indicators.add(
                     average.header.end_time, average.names[:INDICATORS], values,
                     values * math.nan), by_channel=True)
+
+        def on_indicator_errors(message: Float64MultiArray) -> None:
+            average = decode_average('condition_indicator_error', message)
+            self._board.put(f'{shaft}/condition_indicator_error',
+                            partial(indicators_content, average))
+            content = indicators.amend(
+                average.header.end_time, average.values[:CHANNELS, :INDICATORS])
+            if content is not None:
+                self._board.put(f'{shaft}/indicator_trend', content, by_channel=True)
 
         def on_orders(message: Float64MultiArray) -> None:
             average = decode_average('order_amplitude', message)
@@ -153,7 +163,8 @@ class LiveView(MonitoringNode):
             **{kind: partial(on_waveform, kind)
                for kind in ('synchronous_average', 'standard_error', 'corrected_average')},
             'order_amplitude': on_orders, 'pulse_error': on_pulses,
-            'condition_indicator': on_indicators}
+            'condition_indicator': on_indicators,
+            'condition_indicator_error': on_indicator_errors}
         for kind, callback in callbacks.items():
             self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
 
@@ -168,7 +179,8 @@ class LiveView(MonitoringNode):
         residual = decode_residual(message)
         self._board.put(topic, partial(table_content, residual, RESIDUAL_FIELDS))
 
-    def _on_missing_effect(self, topic: str, message: String) -> None:
+    def _on_object(self, topic: str, message: String) -> None:
+        """Show a JSON object of another node."""
         if len(message.data) > LARGEST_REPORT:
             raise MessageError(f'{len(message.data)} characters: send at most {LARGEST_REPORT}')
         try:

@@ -161,7 +161,21 @@ class Trend:
             self._rows = deque(maxlen=int(np.clip(
                 TREND_NUMBERS // max(2 * values.size, 1), 1, TREND_AVERAGES)))
         self._rows.append((time, values, errors))
-        rows = list(self._rows)  # a thread may be sending while the next average comes
+        return self._content()
+
+    def amend(self, time: float, errors: FloatArray) -> Callable[[int], Json] | None:
+        """
+        Give the last values, of an average that ended at `time` (s), errors that came later.
+
+        Returns the content by channel, None where the errors are those of another average.
+        """
+        if not self._rows or self._rows[-1][0] != time or errors.shape != self._shape:
+            return None
+        self._rows[-1] = (time, self._rows[-1][1], errors)
+        return self._content()
+
+    def _content(self) -> Callable[[int], Json]:
+        names, rows = self._names, list(self._rows)  # a thread may be sending as the next comes
         return lambda channel: trend_content(names, rows, channel)
 
 
@@ -169,12 +183,14 @@ class OrderMap:
     """The order spectra of the latest averages of one shaft, for a picture."""
 
     def __init__(self) -> None:
-        self._rows: deque[NDArray[np.float32]] = deque()
+        self._rows: deque[tuple[float, NDArray[np.float32]]] = deque()
         self._next = -math.inf  # s, when the next row may be added
 
-    def add(self, waveforms: FloatArray) -> Callable[[int], Json] | None:
+    def add(self, end_time: float, waveforms: FloatArray) -> Callable[[int], Json] | None:
         """
-        Add an average (channel, angle); others of another shape start a new map.
+        Add an average (channel, angle) that ended at a time (s).
+
+        Others of another shape, and times that run back, start a new map.
 
         Returns the content by channel, None where the last row is too young for another.
         """
@@ -183,24 +199,25 @@ class OrderMap:
             return None
         self._next = now + MAP_PERIOD
         amplitudes = spectrum(waveforms)[0].astype(np.float32)
-        if not self._rows or self._rows[-1].shape != amplitudes.shape:
+        if not self._rows or self._rows[-1][1].shape != amplitudes.shape or (
+                end_time < self._rows[-1][0]):
             self._rows = deque(maxlen=int(np.clip(
                 MAP_NUMBERS // max(amplitudes.size, 1), 1, MAP_AVERAGES)))
-        self._rows.append(amplitudes)
+        self._rows.append((end_time, amplitudes))
         rows = list(self._rows)
         return lambda channel: map_content(rows, channel)
 
 
-def map_content(rows: list[NDArray[np.float32]], channel: int) -> Json:
+def map_content(rows: list[tuple[float, NDArray[np.float32]]], channel: int) -> Json:
     """
     Return the map of one channel: the latest average last, a character for each amplitude.
 
-    A row stands for `step` averages and a column for `pool` orders, of which it shows the largest
-    amplitude.
+    A row stands for `step` averages, the last of which ended at its `time` (s), and a column for
+    `pool` orders, of which it shows the largest amplitude.
     """
     step = -(-len(rows) // MAP_ROWS)
-    shown = np.array([row[channel] for row in rows[::-1][::step][::-1]
-                      if channel < len(row)]).reshape(-1, rows[0].shape[1])
+    chosen = [row for row in rows[::-1][::step][::-1] if channel < len(row[1])]
+    shown = np.array([row[channel] for _, row in chosen]).reshape(-1, rows[0][1].shape[1])
     pool = -(-shown.shape[1] // MAP_COLUMNS)
     if not shown.size:
         return {'channel': channel, 'rows': [], 'step': step, 'pool': 1, 'peak': None}
@@ -210,6 +227,7 @@ def map_content(rows: list[NDArray[np.float32]], channel: int) -> Json:
         level = 1.0 + 20.0 * np.log10(largest / peak) / MAP_SPAN
     code = np.rint(np.clip(np.nan_to_num(level), 0.0, 1.0) * (MAP_LEVELS - 1)).astype(np.uint8)
     return {'channel': channel, 'rows': [bytes(row + ord('0')).decode() for row in code],
+            'time': json_values(np.array([end_time for end_time, _ in chosen])),
             'step': step, 'pool': pool, 'peak': json_values(peak), 'span': MAP_SPAN}
 
 

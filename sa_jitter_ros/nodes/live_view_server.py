@@ -34,9 +34,10 @@ from urllib.parse import parse_qs, urlsplit
 from sa_jitter_ros.errors import ParameterError
 
 PORTS_TRIED = 20  # from `port` on, so that a second view on the same host starts, too
-CONNECTIONS = 32  # at once; more are closed
+CONNECTIONS = 32  # at once; a further one takes the place of the slowest request
 REQUEST_SECONDS = 10.0  # for all of a request to arrive
 ANSWER_SECONDS = 60.0  # for the answer to leave, which a slow line carries
+END_SECONDS = 0.5  # for the thread of an ended connection to stop
 KINDS = {'html': 'text/html', 'css': 'text/css', 'js': 'text/javascript'}
 HEADERS = {
     'Cache-Control': 'no-store',
@@ -139,15 +140,17 @@ class _Server(ThreadingHTTPServer):
         self.requests = self.refused = 0
         self._free = BoundedSemaphore(CONNECTIONS)
         self._deadlines: dict[socket.socket, float] = {}
+        self._asking: dict[socket.socket, None] = {}  # those whose request has not arrived yet
 
     def server_bind(self) -> None:
         """Bind without a query to a name server."""
         TCPServer.server_bind(self)
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve in a thread, unless there are too many connections."""
-        if self._free.acquire(blocking=False):
-            self.allow(request, REQUEST_SECONDS)
+        """Serve in a thread, in place of the slowest request if there are too many."""
+        if self._free.acquire(blocking=False) or self._in_place_of_the_slowest():
+            self._deadlines[request] = time.monotonic() + REQUEST_SECONDS
+            self._asking[request] = None
             super().process_request(request, client_address)
         else:
             self.refused += 1
@@ -159,21 +162,35 @@ class _Server(ThreadingHTTPServer):
             super().process_request_thread(request, client_address)
         finally:
             self._deadlines.pop(request, None)
+            self._asking.pop(request, None)
             self._free.release()
 
-    def allow(self, connection: socket.socket, seconds: float) -> None:
-        """Let a connection last so long from now on."""
-        self._deadlines[connection] = time.monotonic() + seconds
+    def _in_place_of_the_slowest(self) -> bool:
+        """Return whether there is a place since the connection that asks for longest ended."""
+        slowest = next(iter(list(self._asking)), None)
+        if slowest is None:
+            return False
+        self._end(slowest)
+        return self._free.acquire(timeout=END_SECONDS)
+
+    def _end(self, connection: socket.socket) -> None:
+        self.refused += 1
+        self._deadlines.pop(connection, None)
+        self._asking.pop(connection, None)
+        with suppress(OSError):  # it may have ended
+            connection.shutdown(socket.SHUT_RDWR)
+
+    def asked(self, connection: socket.socket) -> None:
+        """Take note that a request has arrived; its answer may last as long again."""
+        self._deadlines[connection] = time.monotonic() + ANSWER_SECONDS
+        self._asking.pop(connection, None)
 
     def service_actions(self) -> None:
         """End connections that last too long, however slowly their bytes drip."""
         now = time.monotonic()
         for connection, deadline in list(self._deadlines.items()):
             if now > deadline:
-                self.refused += 1
-                self._deadlines.pop(connection, None)
-                with suppress(OSError):  # it may have ended
-                    connection.shutdown(socket.SHUT_RDWR)
+                self._end(connection)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore that a browser closed the connection."""
@@ -188,7 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with a file of the page or with the snapshot."""
-        self.server.allow(self.connection, ANSWER_SECONDS)
+        self.server.asked(self.connection)
         path, _, query = self.path.partition('?')
         if not is_name_of_this_machine(self.headers.get('Host', '')):
             self._refuse(HTTPStatus.FORBIDDEN, 'open this page by its address or as localhost')

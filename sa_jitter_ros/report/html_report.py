@@ -36,6 +36,7 @@ h3 { font-size: 1rem; margin-bottom: .2rem }
 .traced { border-color: #1f77b4 }
 .none { border-color: #2ca02c }
 .unexplained { border-color: #d62728 }
+.unseen { border-color: #999 }
 pre { background: #f3f3f3; padding: .8rem; white-space: pre-wrap; font-size: .85rem }
 table { border-collapse: collapse; margin: .5rem 0; width: 100%; font-size: .9rem }
 th, td { border-bottom: 1px solid #ccc; padding: .25rem .5rem .25rem 0; text-align: left;
@@ -134,7 +135,8 @@ def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
 
 
 def _verdict(content: Mapping[str, Json]) -> str:
-    return (f'<p class="verdict {escape(content["verdict"])}">'
+    kind = content['verdict'] if content['lines'] else 'unseen'
+    return (f'<p class="verdict {escape(kind)}">'
             f'{_kept(verdict_sentence(content))}</p>')
 
 

@@ -23,6 +23,14 @@ export function format(value, digits = 4) {
   return String(Number(value.toPrecision(digits)));
 }
 
+// A value with two digits of its standard error.
+export function withError(value, error) {
+  if (!known(value) || !known(error) || !(error > 0)) return format(value);
+  const places = 1 - Number(error.toExponential(1).split('e')[1]);
+  return places > 6 || Math.abs(value) >= 1e6 ? `${format(value)} ± ${format(error, 2)}`
+    : `${value.toFixed(Math.max(places, 0))} ± ${error.toFixed(Math.max(places, 0))}`;
+}
+
 // Range of all known values, a little wider; never empty.
 export function range(values, {margin = 0.06, include = []} = {}) {
   let low = Infinity, high = -Infinity;
@@ -188,6 +196,13 @@ export class Chart {
       + `${points.reverse().map(i => place(highs, i)).join('L')}Z`});
   }
 
+  // Vertical line through the axes.
+  upright(style, value, tip = '') {
+    const place = this.x(value);
+    this.add('line', {class: style, x1: place, x2: place, y1: MARGIN.top,
+                      y2: this.height - MARGIN.bottom}, null, tip);
+  }
+
   level(style, value) {
     const place = this.y(value);
     this.add('line', {class: style, x1: MARGIN.left, x2: MARGIN.left + this.inner, y1: place,
@@ -226,12 +241,12 @@ export class Chart {
 
   // Calls `changed(position from 0 to 1, or null)` as the pointer moves, and shows where it is: at
   // the position that `changed` returns, if it returns one. A click keeps the cursor, also while
-  // new data come; the next click releases it.
-  follow(changed) {
+  // new data come; the next click releases it. `kept` is in parts of an axis of length `span`.
+  follow(changed, span = 1) {
     const cursor = make('line', {class: 'cursor', y1: MARGIN.top,
                                  y2: this.height - MARGIN.bottom});
     const show = () => {
-      const wanted = this.kept ?? this.pointer ?? -1;
+      const wanted = known(this.kept) ? this.kept / span : this.pointer ?? -1;
       const inside = wanted >= 0 && wanted <= 1;
       const place = MARGIN.left + this.inner * (changed(inside ? wanted : null) ?? wanted);
       cursor.setAttribute('visibility', inside ? 'visible' : 'hidden');
@@ -245,7 +260,7 @@ export class Chart {
     this.svg.onpointermove = event => { this.pointer = position(event); show(); };
     this.svg.onpointerleave = () => { this.pointer = null; show(); };
     this.svg.onclick = event => {
-      this.kept = known(this.kept) ? null : position(event);
+      this.kept = known(this.kept) ? null : span * position(event);
       show();
     };
     show();

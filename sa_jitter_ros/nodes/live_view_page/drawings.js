@@ -1,6 +1,6 @@
 // The charts of the page.
 
-import {Chart, format, known, linear, logarithmic, places, range} from './charts.js';
+import {Chart, format, known, linear, logarithmic, places, range, withError} from './charts.js';
 import {analysed, channel, channelName, find, finite, ofShaft, orderRows, part, predicted,
         prediction, refusal, timeUnit, unit, withTimeUnit} from './model.js';
 
@@ -92,8 +92,11 @@ export function drawAmplitudes(chart) {
     const tip = `order ${format(row.order, 6)}: raw ${format(row.raw_amplitude)}, corrected `
       + `${format(row.corrected_amplitude)}, noise ${format(row.noise_standard_deviation)}`;
     chart.dash('noise', i, row.noise_standard_deviation, 0.35, tip);
-    chart.mark('raw', i - 0.1, row.raw_amplitude, {tip});
-    chart.mark('corrected', i + 0.1, row.corrected_amplitude, {square: true, tip});
+    for (const [kind, shift] of [['raw', -0.1], ['corrected', 0.1]]) {
+      const error = row[`${kind}_standard_error`];
+      chart.mark(kind, i + shift, row[`${kind}_amplitude`], {
+        square: kind === 'corrected', tip, error: known(error) ? 2 * error : null});
+    }
   });
 }
 
@@ -125,7 +128,7 @@ export function drawAttenuation(chart) {
     const error = row.attenuation_standard_error;
     chart.mark('measured', i, row.attenuation, {
       error: known(error) ? 2 * error : null,
-      tip: `${name}: measured ${format(row.attenuation)} ± ${format(error, 2)}`});
+      tip: `${name}: measured ${withError(row.attenuation, error)}`});
   });
 }
 
@@ -187,8 +190,8 @@ export function drawResidual(chart) {
   });
   residual?.order.forEach((order, i) => chart.mark('measured', at(order), residual.residual[i], {
     error: known(residual.standard_error[i]) ? 2 * residual.standard_error[i] : null,
-    tip: `order ${order}: ${format(residual.residual[i])} ± `
-      + `${format(residual.standard_error[i], 2)}, z = ${format(residual.z[i], 3)}`}));
+    tip: `order ${order}: ${withError(residual.residual[i], residual.standard_error[i])}, z = `
+      + `${format(residual.z[i], 3)}`}));
 }
 
 export function drawSpeedLine() {
@@ -211,13 +214,16 @@ export function drawSpeedLine() {
 export function ordersTable() {
   const rows = orderRows();
   return rows.length && {
-    columns: ['order', `raw amplitude [${unit()}]`, `corrected amplitude [${unit()}]`,
-              `noise [${unit()}]`, 'attenuation', 'standard error of the attenuation',
-              'predicted attenuation', 'predicted 5 %', 'predicted 95 %'],
-    rows: rows.map(row => [row.order, row.raw_amplitude, row.corrected_amplitude,
-                           row.noise_standard_deviation, row.attenuation,
-                           row.attenuation_standard_error, row.predicted?.mean,
-                           row.predicted?.low, row.predicted?.high])};
+    columns: ['order', ...['raw', 'corrected'].flatMap(kind => [
+      `${kind} amplitude [${unit()}]`, `its standard error [${unit()}]`, `${kind} phase [rad]`,
+      'its standard error [rad]']), `upper limit at 95 % [${unit()}]`, `noise [${unit()}]`,
+              'attenuation', 'standard error of the attenuation', 'predicted attenuation',
+              'predicted 5 %', 'predicted 95 %'],
+    rows: rows.map(row => [
+      row.order, ...['raw', 'corrected'].flatMap(kind => ['amplitude', 'standard_error', 'phase',
+        'phase_standard_error'].map(name => row[`${kind}_${name}`])), row.upper_95,
+      row.noise_standard_deviation, row.attenuation, row.attenuation_standard_error,
+      row.predicted?.mean, row.predicted?.low, row.predicted?.high])};
 }
 
 export function errorsTable() {

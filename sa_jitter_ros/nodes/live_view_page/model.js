@@ -1,6 +1,6 @@
 // The data of the page, and how its parts belong together.
 
-import {format, known} from './charts.js';
+import {format, known, withError} from './charts.js';
 
 const TIMES = [[1, 's'], [1e-3, 'ms'], [1e-6, 'µs'], [1e-9, 'ns']];
 
@@ -30,6 +30,14 @@ export function analysed(kind) {
   }
   return {content: undefined, note: `residual_analyser compares shaft ${others.join(', ')}`};
 }
+
+// The changes that change_monitor has found: all of them, or those of one quantity of what is shown.
+export const changes = () => part('change')?.changes ?? [];
+export const changeOf = (kind, name) => changes().find(item => item.shaft === find('shaft').value
+  && item.channel === channel() && item.kind === kind && (kind === 'order'
+    ? Number(item.name) === Number(name) : item.name === name));
+export const changeText = ({change, standard_error: error}) => (change > 0 ? '+' : '')
+  + `${withError(100 * change, known(error) ? 100 * error : null)} %`;
 
 // Why the correction of the shown shaft was refused last, '' if the last average was corrected.
 export function refusal() {
@@ -76,9 +84,11 @@ export function orderRows() {
   const rows = orders?.order[channel()] ?? [];
   const {rows: predictions} = predicted();
   return rows.map((order, i) => ({
-    order, ...Object.fromEntries(['raw_amplitude', 'corrected_amplitude', 'attenuation',
-      'attenuation_standard_error', 'noise_standard_deviation'].map(
-      name => [name, orders[name][channel()][i]])),
+    order, ...Object.fromEntries(['raw_amplitude', 'raw_phase', 'corrected_amplitude',
+      'corrected_phase', 'attenuation', 'attenuation_standard_error', 'noise_standard_deviation',
+      'raw_standard_error', 'raw_phase_standard_error', 'corrected_standard_error',
+      'corrected_phase_standard_error', 'upper_95'].map(
+      name => [name, orders[name]?.[channel()]?.[i] ?? null])),
     past: orders.history.slice(0, -1).map(average => average[channel()]?.[i]),
     predicted: predictions.get(order)}));
 }

@@ -5,9 +5,9 @@ import {drawAmplitudes, drawAttenuation, drawErrors, drawResidual, drawWaveforms
         ordersTable, residualTable, waveformTable} from './drawings.js';
 import {addButtons} from './export.js';
 import {channel, channelName, find, ofShaft, settings, state} from './model.js';
-import {drawMap, drawPolar, drawSpectrum, drawTrend, mapTable, spectrumTable, trendChoices,
+import {drawMap, drawPolar, drawSpectrum, drawTrends, keepOrder, mapTable, spectrumTable,
         trendTable} from './panels.js';
-import {drawAttention, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles}
+import {drawAttention, drawChange, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles}
   from './words.js';
 
 const PERIOD = 500;  // ms between requests
@@ -41,7 +41,6 @@ const charts = {
   residual: new Chart(find('residual'), 280, drawResidual),
   spectrum: new Chart(find('spectrum'), 280, drawSpectrum),
   map: new Chart(find('map'), 280, drawMap),
-  trend: new Chart(find('trend'), 280, drawTrend),
   polar: new Chart(find('polar'), 280, drawPolar),
 };
 const TABLES = {waveforms: waveformTable, polar: waveformTable, spectrum: spectrumTable, map: mapTable,
@@ -53,15 +52,6 @@ for (const [name, table] of Object.entries(TABLES)) {
                                        average()].join('-').replaceAll(/[^\w.-]+/g, '_'));
 }
 
-function drawTrendAndChoices() {
-  const choices = trendChoices(), select = find('trend-of'), before = select.value;
-  if (choices.map(([, text]) => text).join() !== [...select.options].map(item => item.text).join()) {
-    select.replaceChildren(...choices.map(([value, text]) => new Option(text, value)));
-    if (choices.some(([value]) => value === before)) select.value = before;
-  }
-  charts.trend.render();
-}
-
 // What to draw when a part changes whose name matches.
 const DRAWN = [
   [drawTiles, /speed|order_amplitude|pulse_error|prediction|residual|missing_effect/],
@@ -69,7 +59,8 @@ const DRAWN = [
   [charts.polar.render, /average$/],
   [charts.spectrum.render, /_spectrum$/],
   [charts.map.render, /_map$/],
-  [drawTrendAndChoices, /_trend$/],
+  [drawTrends, /_trend$|^change$/],
+  [drawChange, /^change$/],
   [charts.amplitudes.render, /order_amplitude/],
   [charts.attenuation.render, /order_amplitude|prediction/],
   [drawOrders, /order_amplitude|prediction/],
@@ -78,7 +69,7 @@ const DRAWN = [
   [charts.residual.render, /residual|missing_effect/],
   [drawEffects, /missing_effect/],
   [drawNodes, /diagnostics/],
-  [drawAttention, /diagnostics/],
+  [drawAttention, /diagnostics|^change$/],
 ];
 
 function draw(changed) {
@@ -125,7 +116,7 @@ async function go() {
   setTimeout(go, PERIOD);
 }
 
-find('trend-of').onchange = charts.trend.render;
+find('spectrum-order').oninput = () => keepOrder(charts.spectrum);
 find('shaft').onchange = drawAll;
 find('channel').onchange = () => {
   state.version = 0;  // spectra and trends are sent for one channel

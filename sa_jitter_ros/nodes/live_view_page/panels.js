@@ -1,7 +1,8 @@
 // The order spectrum, the trend, and the average over the circle.
 
-import {Chart, format, known, linear, logarithmic, range} from './charts.js';
-import {channel, channelName, find, finite, ofShaft, state, unit, unitOf} from './model.js';
+import {Chart, format, known, linear, logarithmic, range, withError} from './charts.js';
+import {changeOf, changeText, channel, channelName, find, finite, ofShaft, state, unit, unitOf}
+  from './model.js';
 
 const FLOOR = 1e-6;  // of the largest amplitude: smaller ones are rounding errors
 const SPANS = [[3600, 'h'], [60, 'min'], [1, 's']];
@@ -39,13 +40,23 @@ export function drawSpectrum(chart) {
   chart.follow(position => {
     const order = position === null ? null
       : Math.min(Math.max(Math.round(position * (most + 1)), 1), most);
+    const choice = find('spectrum-order');
+    if (choice !== document.activeElement) choice.value = known(chart.kept) ? order : '';
+    choice.max = most;
     find('spectrum-note').textContent = order === null
-      ? 'point at an order, or click to keep it' : `order ${order}: ` + shown.map(
+      ? 'point at an order; click, or type its number, to keep it' : `order ${order}: ` + shown.map(
         ([kind, amplitudes, phases]) => `${kind} ${format(amplitudes[order - 1])} ${unit()}`
           + (known(phases[order - 1]) ? ` at ${(phases[order - 1] * 180 / Math.PI).toFixed(1)}°`
             : '')).join(', ');
     return order === null ? null : order / (most + 1);
-  });
+  }, most + 1);
+}
+
+// Keeps the cursor at the order that is typed; without one it follows the pointer.
+export function keepOrder(chart) {
+  const order = find('spectrum-order').valueAsNumber;
+  chart.kept = order >= 1 ? order : null;
+  chart.render();
 }
 
 export function spectrumTable() {
@@ -57,61 +68,119 @@ export function spectrumTable() {
       ([, amplitudes, phases]) => [amplitudes[i], phases[i]])])};
 }
 
-// --- trend ---------------------------------------------------------------------------------------
+// --- trends --------------------------------------------------------------------------------------
 
-// What can be chosen: [value of the option, text].
-export function trendChoices() {
-  const orders = ofShaft('raw_trend')?.names ?? [];
-  const indicators = ofShaft('indicator_trend')?.names ?? [];
-  return [...orders.map((name, i) => [`order ${i}`, `order ${name}`]),
-          ...indicators.map((name, i) => [`indicator ${i}`, name.replaceAll('_', ' ')])];
+const trendCharts = new Map();  // by choice: 'order 19', 'indicator rms'
+let chosen = null;  // until somebody chooses: the strongest order and the first indicator
+
+const namesOf = kind => ofShaft(kind === 'order' ? 'raw_trend' : 'indicator_trend')?.names ?? [];
+const choices = () => ['order', 'indicator'].flatMap(
+  kind => namesOf(kind).map(name => `${kind} ${name}`));
+const parted = choice => [choice.slice(0, choice.indexOf(' ')),
+                          choice.slice(choice.indexOf(' ') + 1)];
+const titleOf = choice => {
+  const [kind, name] = parted(choice);
+  return kind === 'order' ? choice : name.replaceAll('_', ' ');
+};
+
+function shownTrends() {
+  const possible = choices();
+  if (chosen) return possible.filter(choice => chosen.has(choice));
+  const last = shownPart('raw_trend')?.value.at(-1) ?? [];
+  const strongest = last.indexOf(Math.max(...finite(last)));
+  return possible.filter((choice, i) => i === Math.max(strongest, 0)
+    || i === namesOf('order').length);
 }
 
-// {name, unit, curves: [kind, times, values, errors]} of what was chosen.
-function trend() {
-  const [what, place] = (find('trend-of').value || 'order 0').split(' ');
+// The choices as boxes, and a chart for each that is chosen.
+export function drawTrends() {
+  const possible = choices(), shown = shownTrends(), box = find('trend-of').lastElementChild;
+  const inputs = [...box.querySelectorAll('input')];
+  if (inputs.map(input => input.value).join() !== possible.join()) {
+    box.replaceChildren(...possible.map(choice => {
+      const label = document.createElement('label'), input = document.createElement('input');
+      Object.assign(input, {type: 'checkbox', value: choice, onchange: () => {
+        chosen = new Set([...box.querySelectorAll(':checked')].map(item => item.value));
+        drawTrends();
+      }});
+      label.append(input, titleOf(choice));
+      return label;
+    }));
+  }
+  for (const input of box.querySelectorAll('input')) input.checked = shown.includes(input.value);
+  for (const [choice, chart] of trendCharts) {
+    if (shown.includes(choice)) continue;
+    chart.container.remove();
+    trendCharts.delete(choice);
+  }
+  for (const choice of shown) {
+    const chart = trendCharts.get(choice) ?? new Chart(
+      document.createElement('div'), 220, item => drawTrend(item, choice));
+    trendCharts.set(choice, chart);
+    if (!chart.container.isConnected) find('trend').append(chart.container);
+    chart.render();
+  }
+}
+
+// {name, measure, curves: [kind, times, values, errors]} of what was chosen.
+function trend(choice) {
+  const [what, name] = parted(choice), place = namesOf(what).indexOf(name);
   const parts = what === 'order' ? KINDS.map(([kind]) => [kind, shownPart(`${kind}_trend`)])
     : [['corrected', shownPart('indicator_trend')]];
   const curves = parts.filter(([, content]) => content).map(([kind, content]) => [
     kind, content.time, ...['value', 'error'].map(
       key => content[key].map(average => average[place] ?? null))]);
-  const name = parts[0][1]?.names[place] ?? '';
-  return {name: what === 'order' ? `order ${name}` : name.replaceAll('_', ' '),
-          measure: what === 'order' ? unit() : unitOf(name),
-          curves: curves.filter(([, , values]) => values.some(known))};
+  return {name: titleOf(choice), measure: what === 'order' ? unit() : unitOf(name),
+          curves: curves.filter(([, , values]) => values.some(known)),
+          change: changeOf(what, name)};
 }
 
-export function drawTrend(chart) {
-  const {name, measure, curves} = trend();
-  if (!curves.length) { chart.empty(missing()); return; }
+function drawTrend(chart, choice) {
+  const {name, measure, curves, change} = trend(choice);
+  if (!curves.length) { chart.empty(`${name}: ${missing()}`); return; }
   const times = curves.flatMap(([, time]) => finite(time));
-  const last = Math.max(...times), span = last - Math.min(...times);
+  const last = Math.max(...times), first = Math.min(...times), span = last - first;
   const [size, letter] = SPANS.find(([seconds]) => span >= 3 * seconds) ?? SPANS.at(-1);
   const limits = curves.flatMap(([, , values, errors]) => values.flatMap((value, i) =>
     known(value) ? [value - 2 * (errors[i] ?? 0), value + 2 * (errors[i] ?? 0)] : []));
   chart.axes({
     x: linear([-(span || 1) / size * 1.03, 0.02 * (span || 1) / size]),
-    xLabel: `end of the average before the last one [${letter}]`, y: linear(range(limits)),
-    yLabel: measure ? `amplitude [${measure}]` : name, title: `${name}, ${channelName(channel())}`});
+    xLabel: `end of the average before the last one [${letter}]`, y: linear(range(limits), 4),
+    yLabel: measure ? `amplitude [${measure}]` : name,
+    title: name + (change ? `: ${changeText(change)} since average ${change.since_sequence}` : '')});
+  if (change && change.since_time >= first) {
+    chart.upright('change', (change.since_time - last) / size,
+                  `changed since average ${change.since_sequence}`);
+  }
   for (const [kind, time, values, errors] of curves) {
     const xs = time.map(item => (item - last) / size);
     chart.curve(`thin ${kind}`, i => xs[i], values);
     values.forEach((value, i) => chart.mark(kind, xs[i], value, {
       size: 2, square: kind === 'corrected', error: known(errors[i]) ? 2 * errors[i] : null,
-      tip: `average that ended at ${format(time[i], 9)} s: ${kind} ${format(value)} `
-        + `${known(errors[i]) ? `± ${format(errors[i], 2)} ` : ''}${measure}`}));
+      tip: `average that ended at ${format(time[i], 9)} s: ${kind} `
+        + `${withError(value, errors[i])} ${measure}`}));
   }
 }
 
+// The chosen trends side by side, a row for each average of any of them.
 export function trendTable() {
-  const {name, measure, curves} = trend();
-  const label = kind => `${name}${curves.length > 1 ? ` ${kind}` : ''}`;
-  const unitText = measure ? ` [${measure}]` : '';
-  return curves.length && {
-    columns: ['end of the average [s]', ...curves.flatMap(
-      ([kind]) => [label(kind) + unitText, `standard error of ${label(kind)}${unitText}`])],
-    rows: curves[0][1].map((time, i) => [time, ...curves.flatMap(
-      ([, , values, errors]) => [values[i] ?? null, errors[i] ?? null])])};
+  const columns = [], rows = new Map();
+  for (const choice of shownTrends()) {
+    const {name, measure, curves} = trend(choice);
+    for (const [kind, times, values, errors] of curves) {
+      const label = `${name}${curves.length > 1 ? ` ${kind}` : ''}`;
+      const unitText = measure ? ` [${measure}]` : '', place = columns.length;
+      columns.push(label + unitText, `standard error of ${label}${unitText}`);
+      times.forEach((time, i) => {
+        const row = rows.get(time) ?? rows.set(time, []).get(time);
+        [row[place], row[place + 1]] = [values[i], errors[i]];
+      });
+    }
+  }
+  return columns.length && {
+    columns: ['end of the average [s]', ...columns],
+    rows: [...rows].sort(([a], [b]) => a - b).map(([time, row]) => [
+      time, ...columns.map((_, i) => row[i] ?? null)])};
 }
 
 // --- order map -----------------------------------------------------------------------------------
@@ -127,8 +196,25 @@ function colour(level) {
 const orderMap = () => [...KINDS].reverse().map(([kind, topic]) => [
   kind, shownPart(`${topic}_map`)]).find(([, content]) => content?.rows.length);
 
+const timeOf = time => SPANS.find(([seconds]) => time.at(-1) - time[0] >= 3 * seconds)
+  ?? SPANS.at(-1);
+
+// Rows of a picture, the latest at the top: at round times before the last one, whatever their gaps.
+function rowAxis(time) {
+  const [size] = timeOf(time), last = time.at(-1), count = time.length;
+  const ages = time.map(item => (last - item) / size);
+  const ticks = linear([0, Math.max(ages[0], 1e-9)], 5).ticks.map(([age, label]) => {
+    const row = ages.findIndex(item => item <= age * (1 + 1e-9));
+    const next = row > 0 ? (ages[row - 1] - age) / (ages[row - 1] - ages[row] || 1) : 1;
+    return [row < 0 ? count - 1 : row > 0 ? row - 1 + next : 0, label];
+  });
+  return {at: row => (row + 0.5) / count, ticks};
+}
+
 export function drawMap(chart) {
   const [kind, map] = orderMap() ?? [];
+  find('map-note').textContent = map ? `${kind}, ${channelName(channel())}: yellow `
+    + `${format(map.peak, 3)} ${unit()}, violet ${map.span} dB less` : '';
   if (!map) { chart.empty(missing()); return; }
   const width = map.rows[0].length, height = map.rows.length;
   const canvas = document.createElement('canvas');
@@ -143,19 +229,17 @@ export function drawMap(chart) {
   context.putImageData(image, 0, 0);
   chart.axes({
     x: linear([0.5, map.pool * width + 0.5], Math.max(4, Math.min(12, chart.inner / 70))),
-    y: linear([map.step * (height - 0.5), -0.5 * map.step]), xLabel:
-      `order of ${find('shaft').value}`, yLabel: 'averages before the last one',
-    title: `${kind}, ${channelName(channel())}: yellow ${format(map.peak, 3)} ${unit()}, `
-      + `violet ${map.span} dB less`});
+    y: rowAxis(map.time), xLabel: `order of ${find('shaft').value}`,
+    yLabel: `time before the last [${timeOf(map.time)[1]}]`});
   chart.picture(canvas.toDataURL());
 }
 
 export function mapTable() {
   const [, map] = orderMap() ?? [];
   return map && {
-    columns: ['averages before the last one', ...Array.from(map.rows[0], (_, i) =>
+    columns: ['end of the average [s]', ...Array.from(map.rows[0], (_, i) =>
       `amplitude of order ${map.pool * i + 1} [dB re ${format(map.peak)} ${unit()}]`)],
-    rows: map.rows.map((row, y) => [map.step * (map.rows.length - 1 - y), ...Array.from(
+    rows: map.rows.map((row, y) => [map.time[y], ...Array.from(
       row, item => ((item.charCodeAt(0) - 48) / 63 - 1) * map.span)])};
 }
 

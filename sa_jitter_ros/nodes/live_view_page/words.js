@@ -1,8 +1,8 @@
 // The numbers and tables of the page.
 
-import {format, known} from './charts.js';
+import {format, known, withError} from './charts.js';
 import {drawSpeedLine} from './drawings.js';
-import {analysed, channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, prediction,
+import {analysed, changes, changeText, channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, prediction,
         state, timeUnit, unit, unitOf, withTimeUnit} from './model.js';
 
 const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
@@ -49,6 +49,14 @@ export function drawTiles() {
       + format(residual.chi2_per_dof, 3) : '');
 }
 
+export function drawChange() {
+  const found = part('change'), baseline = found?.baseline;
+  find('change-tile').hidden = !found;
+  if (!found) return;
+  show('change', baseline && !baseline.complete ? 'learning' : changes().length || 'none');
+  show('change-note', baseline ? `baseline of ${baseline.averages} averages` : '');
+}
+
 // Rows of [text, class] cells under a row of headings.
 function fill(table, headings, rows) {
   const line = (tag, cells) => {
@@ -69,10 +77,10 @@ export function drawOrders() {
     'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation [1]',
     'predicted [1]', '5 % to 95 % [1]', 'in band'].map(right), orderRows().map(row => {
     const inside = inBand(row), band = row.predicted;
-    return [...[format(row.order, 6), format(row.raw_amplitude), format(row.corrected_amplitude),
+    return [...[format(row.order, 6), withError(row.raw_amplitude, row.raw_standard_error),
+                withError(row.corrected_amplitude, row.corrected_standard_error),
                 format(row.noise_standard_deviation, 2),
-                known(row.attenuation) ? `${format(row.attenuation)} ± `
-                  + format(row.attenuation_standard_error, 2) : '–', format(band?.mean),
+                withError(row.attenuation, row.attenuation_standard_error), format(band?.mean),
                 band ? `${format(band.low)} to ${format(band.high)}` : '–'].map(right),
             [inside === null ? '–' : inside ? 'yes' : 'no',
              `number ${inside === false ? 'warn' : ''}`]];
@@ -85,10 +93,13 @@ export function drawIndicators() {
     fill(find('indicators'), [['none received yet']], []);
     return;
   }
+  const published = ofShaft('condition_indicator_error');
+  const errors = published?.header.sequence === indicators.header.sequence
+    ? published.values : null;
   fill(find('indicators'), [['channel'], ...indicators.names.map(
     name => [name.replaceAll('_', ' ') + (unitOf(name) && ` [${unitOf(name)}]`), 'number'])],
        indicators.values.map((row, i) => [[channelName(i)], ...row.map(
-         value => [format(value), 'number'])]));
+         (value, k) => [withError(value, errors?.[i]?.[k]), 'number'])]));
 }
 
 export function drawEffects() {
@@ -113,17 +124,24 @@ export function drawEffects() {
   find('effects').replaceChildren(list);
 }
 
-// Above everything: which nodes lack something, with their own words.
+// Above everything: what has changed, and which nodes lack something, with their own words.
 export function drawAttention() {
   const bad = Object.entries(part('/diagnostics') ?? {}).map(([name, node]) => {
     const age = state.now - node.received;
     return [age > 5 ? 3 : node.level, name, age > 5 ? `no status for ${age.toFixed(0)} s`
       : node.message];
   }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
-  find('attention').replaceChildren(...bad.map(([level, name, text]) => {
+  const changed = changes().map(item => [1, item.kind === 'order' ? `order ${item.name}`
+    : item.name.replaceAll('_', ' '), `of ${item.shaft}, ${channelName(item.channel)}: `
+      + `${changeText(item)} since average ${item.since_sequence}`
+      + (known(item.keyphasor_share) ? '; the keyphasor explains '
+        + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
+  const lines = [...changed.map(([level, name, text]) => [level, `${name} ${text}`]),
+                 ...bad.map(([level, name, text]) => [level, `${name}: ${text}`])];
+  find('attention').replaceChildren(...lines.map(([level, text]) => {
     const line = document.createElement('p');
     line.className = (LEVELS[level] ?? LEVELS[3])[0];
-    line.textContent = `${name}: ${text}`;
+    line.textContent = text;
     return line;
   }));
 }
