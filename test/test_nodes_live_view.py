@@ -682,6 +682,7 @@ def test_the_browser_shows_the_numbers(bench):
         '2', 'baseline of 200 averages')
     for title in ('order 19: +4.10 ± 0.60 %', 'rms: -2.00 ± 0.60 %'):
         assert f'>{title} since average 5<' in page  # trends
+    assert page.count('>CSV</button>') == page.count('>PNG</button>') + 2 == 11  # 2 tables
     assert page.count('class="change"') == 1 + 2  # in the legend, and where they began
     assert page.count('<image href="data:image/png') == 1
     assert page.count('class="mark measured"') == 6  # attenuations and residuals of 3 orders

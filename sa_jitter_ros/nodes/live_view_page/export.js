@@ -55,8 +55,9 @@ export async function png(svgs, name, background) {
   canvas.toBlob(blob => save(blob, name), 'image/png');
 }
 
-// Buttons that save what a panel shows: `table()` and the pictures in `box`; `name()` of the file.
-export function addButtons(box, table, name) {
+// Buttons that save what a panel shows: `table()` and the pictures in `box`, where it has some;
+// `name()` of the file.
+export function addButtons(box, table, name, {pictures = true} = {}) {
   const bar = document.createElement('p');
   bar.className = 'save';
   const button = (text, action) => {
@@ -70,7 +71,7 @@ export function addButtons(box, table, name) {
     const content = table();
     if (content) save(new Blob([csv(content)], {type: 'text/csv'}), `${name()}.csv`);
   });
-  button('PNG', () => {
+  if (pictures) button('PNG', () => {
     const svgs = [...box.querySelectorAll('svg')];
     const card = getComputedStyle(box.closest('section')).backgroundColor;
     if (svgs.length) png(svgs, `${name()}.png`, card);

@@ -7,8 +7,8 @@ import {addButtons} from './export.js';
 import {channel, channelName, find, ofShaft, settings, state} from './model.js';
 import {drawMap, drawPolar, drawSpectrum, drawTrends, keepOrder, mapTable, spectrumTable,
         trendTable} from './panels.js';
-import {drawAttention, drawChange, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles}
-  from './words.js';
+import {drawAttention, drawChange, drawEffects, drawIndicators, drawNodes, drawOrders, drawTiles,
+        indicatorsTable} from './words.js';
 
 const PERIOD = 500;  // ms between requests
 
@@ -45,11 +45,14 @@ const charts = {
 };
 const TABLES = {waveforms: waveformTable, polar: waveformTable, spectrum: spectrumTable, map: mapTable,
                 amplitudes: ordersTable, attenuation: ordersTable, trend: trendTable,
-                errors: errorsTable, residual: residualTable};
+                errors: errorsTable, residual: residualTable, orders: ordersTable,
+                indicators: indicatorsTable};
 for (const [name, table] of Object.entries(TABLES)) {
   const average = () => ofShaft('synchronous_average')?.header.sequence ?? 0;
-  addButtons(find(name), table, () => [find('shaft').value, name, channelName(channel()),
-                                       average()].join('-').replaceAll(/[^\w.-]+/g, '_'));
+  const box = find(name), pictures = box.tagName !== 'TABLE';
+  addButtons(pictures ? box : box.parentElement, table, () => [
+    find('shaft').value, name, channelName(channel()), average()].join('-').replaceAll(
+    /[^\w.-]+/g, '_'), {pictures});
 }
 
 // What to draw when a part changes whose name matches.

@@ -87,19 +87,34 @@ export function drawOrders() {
   }));
 }
 
+// {names, values, errors} of the last average; errors are null until they come.
+function indicators() {
+  const found = ofShaft('condition_indicator'), error = ofShaft('condition_indicator_error');
+  return found && {...found, errors: error?.header.sequence === found.header.sequence
+    ? error.values : null};
+}
+
+const indicatorName = name => name.replaceAll('_', ' ') + (unitOf(name) && ` [${unitOf(name)}]`);
+
 export function drawIndicators() {
-  const indicators = ofShaft('condition_indicator');
-  if (!indicators) {
+  const found = indicators();
+  if (!found) {
     fill(find('indicators'), [['none received yet']], []);
     return;
   }
-  const published = ofShaft('condition_indicator_error');
-  const errors = published?.header.sequence === indicators.header.sequence
-    ? published.values : null;
-  fill(find('indicators'), [['channel'], ...indicators.names.map(
-    name => [name.replaceAll('_', ' ') + (unitOf(name) && ` [${unitOf(name)}]`), 'number'])],
-       indicators.values.map((row, i) => [[channelName(i)], ...row.map(
-         (value, k) => [withError(value, errors?.[i]?.[k]), 'number'])]));
+  fill(find('indicators'), [['channel'], ...found.names.map(
+    name => [indicatorName(name), 'number'])],
+       found.values.map((row, i) => [[channelName(i)], ...row.map(
+         (value, k) => [withError(value, found.errors?.[i]?.[k]), 'number'])]));
+}
+
+export function indicatorsTable() {
+  const found = indicators();
+  return found && {
+    columns: ['channel', ...found.names.flatMap(
+      name => [indicatorName(name), `standard error of ${indicatorName(name)}`])],
+    rows: found.values.map((row, i) => [channelName(i), ...row.flatMap(
+      (value, k) => [value, found.errors?.[i]?.[k] ?? null])])};
 }
 
 export function drawEffects() {
