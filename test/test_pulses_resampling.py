@@ -14,7 +14,8 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.resampling import gain, interpolate, margin, METHODS
+from sa_jitter_ros.pulses.resampling import gain, interpolate, margin, METHODS, periodic
+from scipy import signal
 
 
 def tone(frequency, count=400):
@@ -125,3 +126,11 @@ def test_wrong_arguments_are_refused():
             interpolate(np.zeros((30, 1)), np.zeros(1), cutoff=cutoff)
     with pytest.raises(SignalError, match='samples have 3 dimensions, positions 1'):
         interpolate(np.zeros((30, 1, 1)), np.zeros(1))
+
+
+@pytest.mark.parametrize('points', [5, 6, 7, 8, 12, 15, 63])
+@pytest.mark.parametrize('count', [7, 8, 12])
+def test_a_period_keeps_its_lines_at_any_number_of_points(count, points):
+    values = np.random.default_rng(1).standard_normal((2, count))
+    np.testing.assert_allclose(periodic(values, points), signal.resample(values, points, axis=1),
+                               atol=1e-12)

@@ -31,8 +31,8 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import fft, stats
-from scipy.special import erf
+from scipy import fft
+from scipy.special import chndtrix, erf
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -133,7 +133,7 @@ def upper_limit(amplitude: FloatArray, error: FloatArray) -> FloatArray:
 def _rice_limits() -> tuple[FloatArray, FloatArray]:
     """Return amplitudes that true ones, in the second array, exceed in 95 % of all cases."""
     true = np.linspace(_LOWEST_LIMIT, 20.0, 400)
-    return np.sqrt(stats.ncx2.ppf(0.05, 2, true**2)), true
+    return np.sqrt(chndtrix(0.05, 2.0, true**2)), true
 
 
 def _phase_error(amplitude: FloatArray, across: FloatArray) -> FloatArray:

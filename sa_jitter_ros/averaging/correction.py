@@ -28,7 +28,7 @@ from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
-from scipy.signal import resample
+from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -343,7 +343,7 @@ def _expected_cycles(raw: Average, numbers: NDArray[np.int64], samples: int, cyc
 
     `errors` (pulse,) are those of all pulses in fundamental cycles.
     """
-    fine = resample(raw.waveform, _FINE * raw.waveform.shape[1], axis=1)
+    fine = periodic(raw.waveform, _FINE * raw.waveform.shape[1])
     u = np.arange(samples) / samples
     turns = (raw.first_angle + cycle_length * (numbers[:, None] + u)
              + errors[numbers, None] * (1.0 - u) + errors[numbers + 1, None] * u)

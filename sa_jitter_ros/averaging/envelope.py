@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import CycleSamples, grid_points
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.pulses.angle_law import angle_law
+from sa_jitter_ros.pulses.resampling import periodic
 from scipy.fft import fft, ifft, next_fast_len
-from scipy.signal import resample
 
 FloatArray = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ def residual_envelope(
     points = math.ceil(points / together) * together
     u = np.arange(points) / points
     kind, begins = angle_law(law), first_angle + cycle_length * cycle_numbers
-    fine = resample(waveform, _UPSAMPLED * waveform.shape[1], axis=1)
+    fine = periodic(waveform, _UPSAMPLED * waveform.shape[1])
     residual = np.stack([
         cycle.at(kind, u, method=method).T - _periodic(fine, begin + cycle_length * u)
         for cycle, begin in zip(cycles, begins)])  # cycle x channel x point

@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, real_parts)
-from scipy import stats
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
 
@@ -46,6 +45,7 @@ _COHERENCE = 0.15
 _SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
+_POLE = 1e-8  # lines that are no nearer to a bin: there the lobe is a quotient of two zeros
 _CLEAR = 100.0  # times the power of the orders around
 # Candidates, over those wanted, whose lines are separated, and how far apart they must be.
 _TOGETHER, _APART = 2, 0.02
@@ -175,12 +175,16 @@ class LineSearch:
         angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
         position = np.outer(g, self.cycle_length + np.diff(errors))
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
-        phase = np.exp(-2j * pi * np.outer(g, angle)) / (1.0 if tapered else _taper(count))
+        beside = position - nearest[:, None]
+        beside[np.abs(beside - np.rint(beside)) < _POLE] += 2.0 * _POLE
+        phase = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + beside)) * (
+            0.5 / pi * np.sin(pi * beside) / (1.0 if tapered else _taper(count)))
         for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
             bins = nearest + offset
-            x = position - bins[:, None]
-            lobe = 0.5 * np.sinc(x) + 0.25 * (np.sinc(x - 1.0) + np.sinc(x + 1.0))
-            weight = phase * lobe * np.exp(-1j * pi * x)
+            # Hann's lobe 0.5 sin(pi x) / (pi x (1 - x^2)) times exp(-j pi x): the signs that an
+            # offset gives to both cancel.
+            x = beside - offset
+            weight = phase / (x * (1.0 - x * x))
             weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
             yield weight, self.spectra.take(bins, axis=0, mode='clip')
 
@@ -217,7 +221,8 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
 
 def _significance(tests: int, cycles: int) -> float:
     """Return the level of the F test of one of so many orders and channels."""
-    return float(stats.f.isf(_FALSE_ALARM / tests, 2, 2 * (cycles - 1)))
+    # of 2 and 2 k degrees of freedom the probability above f is (1 + f / k)^-k
+    return float((cycles - 1) * np.expm1(np.log(tests / _FALSE_ALARM) / (cycles - 1)))
 
 
 def _long_run_variance(series: FloatArray) -> FloatArray:

@@ -21,10 +21,12 @@ from collections.abc import Sequence
 import json
 from pathlib import Path
 import sys
+from typing import Any
 
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
-    add_recording_options, machine_fields, Parser, read_options, require_writable, show)
+    add_recording_options, Parser, read_options, require_writable, show)
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
@@ -53,6 +55,17 @@ def make_parser() -> Parser:
     return parser
 
 
+def _machine_fields(params: Path | None) -> dict[str, Any]:
+    """Return what a machine file says of recordings, as keywords of `read`; raises ModelError."""
+    if params is None:
+        return {}
+    model = next(iter(read_declaration(params).models.values()))
+    fields = {'ratio': model.ratio, 'orders': model.orders,
+              'pulses_per_revolution': model.pulses_per_revolution}
+    return fields | ({'pulses_per_trigger': model.pulses_per_trigger}
+                     if model.pulses_per_trigger else {})
+
+
 def run(options: argparse.Namespace) -> KeyphasorCheck:
     """Check the recording; raises SaJitterError."""
     def progress(text: str) -> None:
@@ -60,7 +73,7 @@ def run(options: argparse.Namespace) -> KeyphasorCheck:
             print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
 
     recording = read(options.recording, pulses_suffice=True,
-                     **{**machine_fields(options.params), **read_options(options)})
+                     **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
     return check_keyphasor(recording, teeth=options.teeth, progress=progress)

@@ -21,7 +21,6 @@ import tempfile
 from typing import Any, NoReturn
 import warnings
 
-from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
@@ -131,17 +130,6 @@ def _count(text: str) -> int:
     if not (text.isdecimal() and int(text) > 0):
         raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, 1 or more')
     return int(text)
-
-
-def machine_fields(params: Path | None) -> dict[str, Any]:
-    """Return what a machine file says of recordings, as keywords of `read`; raises ModelError."""
-    if params is None:
-        return {}
-    model = next(iter(read_declaration(params).models.values()))
-    fields = {'ratio': model.ratio, 'orders': model.orders,
-              'pulses_per_revolution': model.pulses_per_revolution}
-    return fields | ({'pulses_per_trigger': model.pulses_per_trigger}
-                     if model.pulses_per_trigger else {})
 
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:

@@ -22,7 +22,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 FloatArray = NDArray[np.float64]
 
@@ -90,6 +89,8 @@ def measure_jitter(true: FloatArray, numbers: NDArray[np.int64]) -> Jitter | Non
     def deviance(parameters: FloatArray) -> float:
         model = spectrum(parameters)
         return float(np.sum(count * (np.log(model) + power / scale / model)))
+
+    from scipy import optimize  # which loads long, for programs that fit nothing
 
     def fitted(bound: float) -> tuple[FloatArray, FloatArray]:
         best = min((optimize.minimize(

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.results import AverageMessage
-from scipy.signal import resample
+from sa_jitter_ros.pulses.resampling import periodic
 
 Array = NDArray[Any]
 
@@ -159,6 +159,6 @@ def _on_grid(name: str, values: Array, angles: int) -> Array:
     if name not in _OVER_ANGLE or values.shape[-1] == angles:
         return values
     if name != 'standard_error':
-        return np.asarray(resample(values, angles, axis=-1))
+        return periodic(values, angles)
     place, grid = np.arange(values.shape[-1] + 1) / values.shape[-1], np.arange(angles) / angles
     return np.stack([np.interp(grid, place, np.append(row, row[0])) for row in values])

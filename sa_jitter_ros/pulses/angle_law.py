@@ -30,12 +30,12 @@ to terms of the order eps^2 per trigger cycle. For the linear law it is Eq. 16 o
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
-from scipy.interpolate import CubicSpline
 
 Array = NDArray[Any]
 FloatArray = NDArray[np.float64]
@@ -148,11 +148,22 @@ def _quadratic(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     return np.asarray(pulses[first] + 2.0 * theta / (speed + np.sqrt(root)))
 
 
+def _through(values: Array) -> Callable[[Array], Array]:
+    """Return the cubic spline through values (place, ...) at places 0, 1, ..."""
+    from scipy.interpolate import CubicSpline  # which takes as long to load as all the rest
+    return cast(Callable[[Array], Array], CubicSpline(np.arange(len(values)), values))
+
+
+@lru_cache(maxsize=1)
+def _unit_splines() -> Callable[[Array], Array]:
+    return _through(np.eye(2 * _SIDE + 2))
+
+
 def _spline(pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     """Cubic spline through the given pulses: time as a smooth function of angle."""
     if len(pulses) < 4:
         return _quadratic(pulses, cycle, u)
-    times = CubicSpline(np.arange(len(pulses)), pulses - pulses[cycle])(cycle + u)
+    times = _through(pulses - pulses[cycle])(cycle + u)
     if np.any(np.diff(times) <= 0.0):
         return _linear(pulses, cycle, u)
     return np.asarray(pulses[cycle] + times)
@@ -168,11 +179,10 @@ def _quadratic_weights(u: Array) -> Array:
 
 
 _SIDE = 8  # pulses that the spline uses on either side
-_UNIT_SPLINES = CubicSpline(np.arange(2 * _SIDE + 2), np.eye(2 * _SIDE + 2))
 
 
 def _spline_weights(u: Array) -> Array:
-    return np.moveaxis(_UNIT_SPLINES(_SIDE + u), -1, 0)
+    return np.moveaxis(_unit_splines()(_SIDE + u), -1, 0)
 
 
 LINEAR = PulseWeights(0, 0, _linear_weights)

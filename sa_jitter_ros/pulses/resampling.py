@@ -134,6 +134,24 @@ def impulse_response(steps: int) -> tuple[FloatArray, FloatArray]:
     return x, _kernel('band_limited', x, half)
 
 
+def periodic(period: FloatArray, points: int) -> FloatArray:
+    """
+    Return one period (..., n) of a signal at another number of evenly spaced points.
+
+    It is the interpolation by the signal's own lines; of fewer points the higher ones are left
+    out.
+
+    >>> periodic(np.array([1.0, 0.0, -1.0, 0.0]), 6).round(3).tolist()
+    [1.0, 0.5, -0.5, -1.0, -0.5, 0.5]
+    """
+    count = period.shape[-1]
+    least = min(count, points)
+    lines = np.fft.rfft(period)[..., :least // 2 + 1]
+    if least % 2 == 0 and count != points:  # the line at the Nyquist order of the fewer points
+        lines[..., -1] *= 0.5 if points > count else 2.0
+    return np.asarray(np.fft.irfft(lines, points) * (points / count))
+
+
 def interpolate(samples: FloatArray, positions: FloatArray, *, method: str = 'band_limited',
                 cutoff: float = 1.0) -> FloatArray:
     """
