@@ -33,7 +33,7 @@ from typing import Any
 from independent_effects import draw_case, KNOWN, UNKNOWN
 from independent_machines import declared, record
 import numpy as np
-from sa_jitter_ros.commands import close_loop
+from sa_jitter_ros.commands import close_loop, loop_run
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 
@@ -133,7 +133,7 @@ def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str,
         status = close_loop.main(arguments)
         return status, {} if status else json.loads((options.output / 'report.json').read_text())
     try:
-        return 0, close_loop.run(options, Progress('close_loop', quiet=True)).report
+        return 0, loop_run.run(options, Progress('close_loop', quiet=True)).report
     except SaJitterError as error:
         print(error, file=sys.stderr)
         return 2, {}

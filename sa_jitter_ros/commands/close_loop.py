@@ -21,28 +21,15 @@ recordings that were finished before are skipped.
 """
 
 import argparse
-from collections import Counter
 from collections.abc import Sequence
-import os
 from pathlib import Path
-import signal
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, failure, Parser, plain_warnings, read_options,
-    require_writable, show)
-from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
+    add_fleet_options, add_recording_options, failure, Parser, plain_warnings, require_writable,
+    show)
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.declaration import Declaration, read_declaration
 from sa_jitter_ros.errors import SaJitterError
-from sa_jitter_ros.loop import close_loop, Loop
-from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.offline.files import write_rows
-from sa_jitter_ros.offline.fleet import is_folder
-from sa_jitter_ros.offline.loop_recording import loop_file, LoopJob, LoopRow, on_target
-from sa_jitter_ros.recordings import read
-
-LOOPS = 'loops.csv'
 
 
 def make_parser() -> Parser:
@@ -62,70 +49,14 @@ def make_parser() -> Parser:
     return parser
 
 
-def run(options: argparse.Namespace, progress: Progress) -> Loop:
-    """Close the loop on the recordings; raises SaJitterError."""
-    recordings = [on_target(read(path, **read_options(options)), options.declared)
-                  for path in options.recordings]
-    declaration = read_declaration(options.declared, sample_rate=recordings[0].sample_rate)
-    _tell_unknown(options.declared, declaration)
-    return close_loop(recordings, declaration, names=[str(path) for path in options.recordings],
-                      progress=progress.step)
-
-
-def _tell_unknown(path: Path, declaration: Declaration) -> None:
-    if declaration.unknown:
-        print(f'close_loop: {path}: ignored, because jitter_predictor has no such '
-              f'parameters: {", ".join(declaration.unknown)}', file=sys.stderr)
-
-
-def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
-    """Close the loop on each recording, and write their table; raises SaJitterError, OSError."""
-    _tell_unknown(options.declared, read_declaration(options.declared, sample_rate=1e9))
-    output, keywords = options.output.absolute(), read_options(options)
-    found = recordings_of(options)
-    jobs = [LoopJob(item.name, os.path.abspath(item.path), str(output / item.name),
-                    os.path.abspath(options.declared), keywords)
-            for item in found if not item.error]
-    rows = [LoopRow(item.name, str(item.path), item.error) for item in found if item.error]
-    try:
-        work_through(loop_file, jobs, rows, failed=LoopRow, options=options, progress=progress)
-    finally:
-        if any(row.verdict for row in rows):
-            write_rows(options.output / LOOPS, sorted(
-                rows, key=lambda row: (row.recording, row.path)))
-    return rows
-
-
-def _show_fleet(options: argparse.Namespace, progress: Progress) -> int:
-    """Close the loop on each recording; return the exit status."""
-    use_one_thread()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        require_writable(options.output)
-        rows = run_fleet(options, progress)
-    except (SaJitterError, OSError) as error:
-        progress.say(failure(error, options.output))
-        return 2
-    except KeyboardInterrupt:
-        progress.say('stopped; what was finished stays, the same command goes on from there')
-        return 130
-    closed = [row for row in rows if row.verdict]
-    if not closed:
-        return 2
-    counts = Counter(row.verdict for row in closed)
-    failed = len(rows) - len(closed)
-    return show('close_loop', ', '.join(f'{count} {verdict}' for verdict, count in counts.items())
-                + f' of {len(closed)} recording{"s" * (len(closed) > 1)}'
-                + (f'; {failed} could not be used' if failed else ''),
-                f'table: {options.output / LOOPS}')
-
-
 def main(args: Sequence[str] | None = None) -> int:
     """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)
     progress = Progress('close_loop', quiet=options.quiet)
-    if options.scheduler or options.jobs or any(map(is_folder, options.recordings)):
-        return _show_fleet(options, progress)
+    with progress.ticking():  # what does the work takes a second to load
+        from sa_jitter_ros.commands.loop_run import is_fleet, run, show_fleet
+    if is_fleet(options):
+        return show_fleet(options, progress)
     try:
         require_writable(options.output)
         with plain_warnings('close_loop'), progress.ticking():

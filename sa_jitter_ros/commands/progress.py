@@ -29,14 +29,14 @@ class Progress:
         self._bar = sys.stderr.isatty()
         self._start = self._last = time.monotonic()
         self._drawn = False
-        self._step = ''
 
     @contextmanager
     def ticking(self) -> Iterator[None]:
-        """Show meanwhile, unless `quiet`, that a step goes on: it need not tell its share."""
+        """Show meanwhile, unless `quiet`, that the program works: it need not tell its share."""
         if self._quiet:
             yield
             return
+        self.tick()
         ended = Event()
 
         def tick() -> None:
@@ -56,12 +56,12 @@ class Progress:
         """Show a line for a step that begins or a result, unless `quiet`."""
         if not self._quiet:
             self.say(text)
-        self._step, self._last = text, time.monotonic()
+        self._last = time.monotonic()
 
     def tick(self) -> None:
-        """Show for how long the program has worked, if a step takes long."""
+        """Show for how long the program has worked, on no terminal only if a step takes long."""
         now = time.monotonic()
-        if self._quiet or not self._step or (not self._bar and now - self._last < _LINE):
+        if self._quiet or (not self._bar and now - self._last < _LINE):
             return
         self._last = now
         self._write(f'{self._program}: working, {now - self._start:.0f} s',
