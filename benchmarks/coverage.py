@@ -188,9 +188,13 @@ def indicator_table(channels: int) -> Iterator[str]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--trials', type=int, default=600)
-    trials = parser.parse_args().trials
-    print('\n'.join(amplitude_table(trials)), '', *indicator_table(trials), sep='\n', flush=True)
+    parser.add_argument('--trials', type=int, default=600, help='averages of a row; 0: no table')
+    parser.add_argument('--indicators', type=int, default=1500, help='channels; 0: no table')
+    options = parser.parse_args()
+    if options.trials:
+        print('\n'.join(amplitude_table(options.trials)), '', sep='\n', flush=True)
+    if options.indicators:
+        print('\n'.join(indicator_table(options.indicators)), flush=True)
 
 
 if __name__ == '__main__':

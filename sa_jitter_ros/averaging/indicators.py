@@ -90,6 +90,12 @@ _FIRST_NOMINAL, _NOMINAL = 8, 3.0
 # Averages over which the variance by the jackknife is smoothed: one alone has two degrees of
 # freedom.
 _SMOOTHED = 8
+# Standard deviation of an indicator over that by the jackknife, measured (benchmarks/coverage.py):
+# three parts exaggerate that of a maximum and of a moment of noise.
+_JACKKNIFE = np.array([{
+    'peak': 0.9, 'crest_factor': 0.9, 'kurtosis': 0.95, 'fm0': 0.89, 'fm4': 0.9, 'm6a': 0.91,
+    'm8a': 0.96, 'nb4': 1.13}.get(name, 1.0) for name in INDICATORS])
+_CHANGED = 3.0  # errors from which on an indicator has changed
 # Points of the envelope in a period of its highest order.
 _ENVELOPE_POINTS = 8
 _CACHED = 1 << 14  # numbers
@@ -272,7 +278,8 @@ class RunningIndicators:
         """Start without history."""
         self._settings = settings or GearSettings()
         self._history = _History()
-        self._variance: Array = np.zeros(0)
+        self._variance: Array = np.zeros(0)  # of the logarithms
+        self._level: Array = np.zeros(0)  # mean logarithms
         self._jackknifed = 0
         empty = np.zeros((0, len(INDICATORS)))
         self._latest = ConditionIndicators(empty, 0, empty)
@@ -297,18 +304,33 @@ class RunningIndicators:
         values = self._history.take(moments, self._settings)
         error = np.full(values[0].shape, np.nan)
         if parts is not None and len(replicates):
-            error = self._smoothed(jackknife_variance(values[0], values[1:], parts.counts))
+            with np.errstate(divide='ignore', invalid='ignore'):
+                logarithms = np.log(values)
+            error = self._error(logarithms[0], self._history.variance + jackknife_variance(
+                logarithms[0], logarithms[1:], parts.counts))
         self._latest = ConditionIndicators(values[0], count + 1, error)
 
-    def _smoothed(self, variance: Array) -> Array:
-        """Return the standard error from the variances of this average and of those before."""
+    def _error(self, logarithm: Array, variance: Array) -> Array:
+        """
+        Return the standard error of the latest values from their `logarithm` and its `variance`.
+
+        Both are smoothed over the averages. A value that is low by chance must not have a small
+        error: the relative one counts from halfway to the smoothed value, unless it has changed.
+        """
         if not self._jackknifed:
-            self._variance = variance
+            self._variance, self._level = variance, logarithm
         self._jackknifed += 1
         share = max(1.0 / self._jackknifed, 1.0 / _SMOOTHED)
-        change = variance - self._variance
-        self._variance = np.where(np.isfinite(change), self._variance + share * change, variance)
-        return widened(np.sqrt(self._variance), (PARTS - 1.0) / share)
+
+        def smoothed(before: Array, latest: Array) -> Array:
+            return np.where(np.isfinite(latest - before), before + share * (latest - before),
+                            latest)
+
+        self._variance = smoothed(self._variance, variance)
+        relative = _JACKKNIFE * widened(np.sqrt(self._variance), (PARTS - 1.0) / share)
+        changed = ~(np.abs(logarithm - self._level) < _CHANGED * relative)
+        self._level = np.where(changed, logarithm, smoothed(self._level, logarithm))
+        return np.asarray(relative * np.exp(0.5 * (logarithm + self._level)))
 
     def get(self) -> ConditionIndicators:
         """Return the indicators of the latest average; before the first one, of no channel."""
@@ -485,6 +507,14 @@ class _Reference:
         self._mean: Array = np.zeros(())
         self._squares: Array = np.zeros(())
 
+    @property
+    def uncertainty(self) -> Array:
+        """Return the variance (channel,) that earlier averages give to the reference, relative."""
+        scatter = self._squares / np.maximum(self._count - 1.0, 1.0)
+        earlier = np.maximum(self._count - 1.0, 0.0) / np.maximum(self._count, 1.0) ** 2
+        relative = np.sqrt(scatter) / np.maximum(self._mean, np.finfo(float).tiny)
+        return np.asarray(earlier * relative**2)
+
     def take(self, variance: Array) -> Array:
         """
         Take the variance of the next average; return the reference with it.
@@ -506,11 +536,16 @@ class _Reference:
 
 
 class _History:
-    """What indicators need of earlier averages."""
+    """
+    What indicators need of earlier averages.
+
+    `variance` (channel, indicator) is what these give to the logarithms of the latest indicators.
+    """
 
     def __init__(self) -> None:
         self._residual, self._envelope = _Reference(False), _Reference(False)
         self._nominal_residual, self._nominal_difference = _Reference(True), _Reference(True)
+        self.variance: Array = np.zeros(())
 
     def take(self, moments: _Moments, settings: GearSettings) -> Array:
         """
@@ -528,13 +563,17 @@ class _History:
         residual, difference = moments.residual * scale, moments.difference * scale
         nominal = self._nominal_difference.take(difference)
         envelope = self._envelope.take(moments.envelope * scale)
-        for name, found in (
-                ('na4', over(moments.residual_4, self._residual.take(residual), 2)),
-                ('na4_star', over(moments.residual_4, self._nominal_residual.take(residual), 2)),
-                ('nb4', over(moments.envelope_4, envelope, 2)),
-                ('m6a_star', over(moments.difference_6, nominal, 3)),
-                ('m8a_star', over(moments.difference_8, nominal, 4))):
-            values[..., INDICATORS.index(name)] = found
+        self.variance = np.zeros(values.shape[1:])
+        for name, moment, reference, kind, power in (
+                ('na4', moments.residual_4, self._residual.take(residual), self._residual, 2),
+                ('na4_star', moments.residual_4, self._nominal_residual.take(residual),
+                 self._nominal_residual, 2),
+                ('nb4', moments.envelope_4, envelope, self._envelope, 2),
+                ('m6a_star', moments.difference_6, nominal, self._nominal_difference, 3),
+                ('m8a_star', moments.difference_8, nominal, self._nominal_difference, 4)):
+            place = INDICATORS.index(name)
+            values[..., place] = over(moment, reference, power)
+            self.variance[..., place] = power**2 * kind.uncertainty
         if not settings.mesh_orders:
             values[..., INDICATORS.index('fm0'):] = np.nan
         return values
