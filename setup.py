@@ -18,6 +18,7 @@ from setuptools import find_packages, setup
 NAME = 'sa_jitter_ros'
 HOME = 'https://sa-jitter-ros.example'
 NODES = (
+    'change_monitor',
     'jitter_predictor',
     'live_view',
     'machine_simulator',

@@ -40,7 +40,8 @@ CORE = {
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},
-    'monitoring': SCIENCE | {'averaging', 'errors', 'parameter_file', 'parameters'},
+    'monitoring': SCIENCE | {
+        'averaging', 'errors', 'json_values', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {

@@ -23,6 +23,7 @@ from rclpy.parameter import Parameter
 from sa_jitter_ros.commands import chain, close_loop, design
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
@@ -39,7 +40,7 @@ MACHINE = CONFIG / 'machine.yaml'
 NODES = {'jitter_predictor': JitterPredictor, 'live_view': LiveView,
          'machine_simulator': MachineSimulator, 'recording_player': RecordingPlayer,
          'residual_analyser': ResidualAnalyser, 'synchronous_averager': SynchronousAverager,
-         'tach_detector': TachDetector}
+         'tach_detector': TachDetector, 'change_monitor': ChangeMonitor}
 #: The truth of the simulated machine: amplitudes of its orders on channel 0.
 TRUE = {18.0: 0.1, 19.0: 1.0, 20.0: 0.1, 37.0: 0.05, 38.0: 0.5, 39.0: 0.05, 57.0: 0.25}
 SECONDS, RATE = 24.0, 12.0  # of machine time; times real time

@@ -19,6 +19,7 @@ import pytest
 from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
@@ -139,6 +140,9 @@ NODES = {
     'predictor': (JitterPredictor, {'follow_shaft_speed': True}, {'shaft_speed': SPEED}),
     'analyser': (ResidualAnalyser, {'acquisitions': 2}, {
         'shaft/order_amplitude': ARRAY, 'shaft/pulse_error': ARRAY, 'prediction': ARRAY}),
+    'monitor': (ChangeMonitor, {'learning_averages': 8, 'group_averages': 1}, {
+        'shaft/order_amplitude': ARRAY, 'shaft/condition_indicator': ARRAY,
+        'shaft/condition_indicator_error': ARRAY}),
     'view': (LiveView, {'port': 0}, {
         'shaft/synchronous_average': ARRAY, 'shaft/order_amplitude': ARRAY,
         'shaft/pulse_error': ARRAY, 'prediction': ARRAY, 'residual': ARRAY,

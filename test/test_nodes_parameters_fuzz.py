@@ -18,6 +18,7 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
@@ -82,6 +83,7 @@ NODES = {
     'analyser': (ResidualAnalyser, {}),
     'simulator': (MachineSimulator, {'playing': False}),
     'player': (RecordingPlayer, {'playing': False}),
+    'monitor': (ChangeMonitor, {}),
     'view': (LiveView, {'port': 0}),
 }
 

@@ -24,7 +24,7 @@ from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.nodes.base import run_nodes
 
 NODES = ('synchronous_averager', 'jitter_predictor', 'residual_analyser')
-OTHERS = ('live_view', 'tach_detector')
+OTHERS = ('change_monitor', 'live_view', 'tach_detector')
 
 
 def make_parser() -> Parser:

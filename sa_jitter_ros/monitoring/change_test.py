@@ -143,7 +143,7 @@ class ChangeTest:
         """Begin the changes whose evidence reaches a level."""
         changed = self.evidence.changed(level) & ~self.active
         if changed.any():
-            self.size = np.where(changed, self.evidence.ratios.argmax(axis=0), self.size)
+            self.size = np.where(changed, self.evidence.sums.argmax(axis=0), self.size)
             for place in self.bins.values():
                 place.take_out(changed, self.size)
             self.evidence.forget(changed)

@@ -32,8 +32,10 @@ from scipy.special import ndtr
 FloatArray = NDArray[np.float64]
 
 #: Sizes of the changes that are looked for, in standard deviations of a score. Between two of them
-#: a change is found with a fifth more scores than at the best size.
-SIZES: tuple[float, ...] = (0.1, 0.3, 1.0, -0.1, -0.3, -1.0)
+#: a change is found with a fifth more scores than at the best size. The last two only tell when a
+#: large change began: as evidence they would hang on the tails of the scores.
+SIZES: tuple[float, ...] = (0.1, 0.3, 1.0, -0.1, -0.3, -1.0, 3.0, -3.0)
+_TESTED = 6
 _LARGEST = 1e250
 _TERMS = 1 << 16  # the last one is below 1e-30 for the smallest size
 
@@ -41,14 +43,14 @@ _TERMS = 1 << 16  # the last one is below 1e-30 for the smallest size
 @lru_cache(maxsize=1)
 def overshoot() -> float:
     """
-    Return the mean over `SIZES` of E[exp(-overshoot)] of a sum of log likelihood ratios.
+    Return E[exp(-overshoot)] of a sum of log likelihood ratios, the mean over the tested sizes.
 
     >>> round(overshoot(), 2)
     0.78
     """
     terms = np.arange(1.0, _TERMS)
     return float(np.mean([2.0 / size**2 * math.exp(-2.0 * float(np.sum(
-        ndtr(-0.5 * abs(size) * np.sqrt(terms)) / terms))) for size in SIZES]))
+        ndtr(-0.5 * abs(size) * np.sqrt(terms)) / terms))) for size in SIZES[:_TESTED]]))
 
 
 def threshold(scores: float) -> float:
@@ -65,13 +67,13 @@ class Evidence:
     """
     Evidence of changes of quantities, of one or more units that are judged apart.
 
-    `ratios` (size, unit, quantity) are the Shiryaev-Roberts statistics. `sums` of the same shape
-    are the logarithms of the likelihood ratio since the most likely beginning of the change; where
-    they are zero none has begun.
+    `ratios` (size, unit, quantity) are the Shiryaev-Roberts statistics of the tested sizes. `sums`
+    of all sizes are the logarithms of the likelihood ratio since the most likely beginning of the
+    change; where they are zero none has begun.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self.ratios: FloatArray = np.zeros((len(SIZES), *shape))
+        self.ratios: FloatArray = np.zeros((_TESTED, *shape))
         self.sums: FloatArray = np.zeros((len(SIZES), *shape))
         self.tested: NDArray[np.bool_] = np.zeros(shape, np.bool_)
 
@@ -85,7 +87,7 @@ class Evidence:
         known = np.isfinite(scores)
         self.tested |= known
         gain = sizes * np.where(known, scores, 0.0) - 0.5 * sizes**2
-        ratios = np.minimum((1.0 + self.ratios) * np.exp(gain), _LARGEST)
+        ratios = np.minimum((1.0 + self.ratios) * np.exp(gain[:_TESTED]), _LARGEST)
         self.ratios = np.where(known, ratios, self.ratios)
         self.sums = np.where(known, np.maximum(self.sums + gain, 0.0), self.sums)
         return np.asarray(self.sums == 0.0)
@@ -93,7 +95,7 @@ class Evidence:
     def mean(self) -> FloatArray:
         """Return the mean evidence (unit,) over sizes and tested quantities."""
         count = np.maximum(self.tested.sum(axis=1), 1)
-        return np.asarray(self.ratios.sum(axis=(0, 2)) / (len(SIZES) * count))
+        return np.asarray(self.ratios.sum(axis=(0, 2)) / (_TESTED * count))
 
     def changed(self, level: float) -> NDArray[np.bool_]:
         """

@@ -164,8 +164,8 @@ class ShaftMonitor:
     """
     Learns the baseline of a shaft and tests new averages against it.
 
-    `share` is the part of the false alarms that this shaft may cause. Averages with another layout
-    than the first one raise ParameterError.
+    `share` is the part of the false alarms that this shaft may cause. Averages with other channels
+    or orders raise ParameterError; indicators may be missing.
     """
 
     def __init__(self, shaft: str, layout: Layout, settings: Settings, *, share: float = 1.0
@@ -186,11 +186,12 @@ class ShaftMonitor:
 
     def update(self, average: MonitoredAverage) -> list[str]:
         """Take the next average; return lines that say which changes began and ended."""
-        header = average.header
-        if average.layout != self.layout:
+        header, fitted = average.header, average.fitted(self.layout)
+        if fitted is None:
             raise ParameterError(
                 f'{self.shaft} has {average.layout}, its baseline {self.layout}: is it that of '
                 'another machine? give another baseline_file, or remove this one to learn again')
+        average = fitted
         if header.start_time < self._end - 1e-9 and header.end_time > self._end:
             self.overlapping += 1
             return []
@@ -261,6 +262,13 @@ class ShaftMonitor:
         learned = sum(float(place.count.max()) for place in self._test.bins.values())
         return round(learned * self.settings.group_averages) + sum(
             group.count for group in self._groups.values())
+
+    @property
+    def learned(self) -> int:
+        """Return the number of averages in the baseline at the present speed."""
+        place, group = self._test.bins.get(self._bin), self._groups.get(self._bin)
+        count = 0.0 if place is None else float(place.count.max())
+        return round(count * self.settings.group_averages) + (group.count if group else 0)
 
     @property
     def is_complete(self) -> bool:

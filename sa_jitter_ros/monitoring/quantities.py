@@ -81,6 +81,27 @@ class MonitoredAverage:
         """Return whether the average has corrected amplitudes."""
         return bool(np.isfinite(self.values[:, :len(self.layout.orders)]).any())
 
+    def fitted(self, layout: Layout) -> 'MonitoredAverage | None':
+        """
+        Return the average with the indicators of a layout, NaN where it lacks them.
+
+        None if channels or orders differ.
+        """
+        if self.layout == layout:
+            return self
+        if (self.layout.channels, self.layout.orders) != (layout.channels, layout.orders):
+            return None
+        count, names = len(layout.orders), self.layout.indicators
+        found = []
+        for array in (self.values, self.noise, self.doubt):
+            rows = np.full(layout.shape, np.nan)
+            rows[:, :count] = array[:, :count]
+            for place, name in enumerate(layout.indicators):
+                if name in names:
+                    rows[:, count + place] = array[:, count + names.index(name)]
+            found.append(rows)
+        return MonitoredAverage(self.header, layout, *found)
+
 
 def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
               errors: AverageMessage | None = None) -> MonitoredAverage:

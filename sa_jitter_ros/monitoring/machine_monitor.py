@@ -1,0 +1,143 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The change monitor of a machine: arrays of results in, changes of all its shafts out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sa_jitter_ros.averaging.results import AverageMessage
+from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
+from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
+from sa_jitter_ros.monitoring.quantities import monitored, MonitoredAverage
+
+#: Topics of a shaft whose arrays make one average, by the names of their arrays.
+KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error')
+# Averages that wait for arrays that are on their way; older ones do without.
+_WAITING = 4
+# Averages without indicators after which a shaft is taken to have none.
+_WITHOUT = 3
+
+
+class Pairing:
+    """Puts the arrays of one average together, which come on topics of their own."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[tuple[int, float], dict[str, AverageMessage]] = {}
+
+    def add(self, kind: str, message: AverageMessage) -> list[MonitoredAverage]:
+        """
+        Take an array; return the averages that are complete, or have waited long enough.
+
+        Raises MessageError for arrays that do not fit each other.
+        """
+        key = message.header.sequence, message.header.start_time
+        self._waiting.setdefault(key, {})[kind] = message
+        ready: list[dict[str, AverageMessage]] = []
+        while self._waiting and (len(self._waiting) > _WAITING or len(
+                next(iter(self._waiting.values()))) == len(KINDS)):
+            ready.append(self._waiting.pop(next(iter(self._waiting))))
+        return [monitored(*(parts.get(name) for name in KINDS))  # type: ignore[arg-type]
+                for parts in ready if KINDS[0] in parts]
+
+
+class MachineMonitor:
+    """
+    The monitors of the shafts of a machine, whose baseline is kept in a file.
+
+    `path` is the file, None: it is not kept. Raises RecordingError for a file that cannot be used,
+    and for one without these shafts.
+    """
+
+    def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
+                 path: Path | None = None) -> None:
+        self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
+        self.monitors: dict[str, ShaftMonitor] = {}
+        self._others: dict[str, ShaftMonitor] = {}
+        if path is not None:
+            found = read_baseline(path, machine, settings, 1.0 / len(shafts))
+            self.monitors = {shaft: found[shaft] for shaft in shafts if shaft in found}
+            self._others = {name: item for name, item in found.items() if name not in shafts}
+        self._pairings = {shaft: Pairing() for shaft in shafts}
+        self._without = dict.fromkeys(shafts, 0)
+        #: Whether the latest average of each shaft had corrected amplitudes.
+        self.corrected: dict[str, bool] = {}
+        #: Whether the file lacks what is known now.
+        self.unsaved = False
+
+    def use(self, settings: Settings) -> None:
+        """Use another rate of false alarms."""
+        self._settings = settings
+        for item in self.monitors.values():
+            item.settings = settings
+
+    def take(self, shaft: str, kind: str, message: AverageMessage) -> list[str]:
+        """
+        Take an array, of a kind in `KINDS`; return lines that say which changes began and ended.
+
+        Raises MessageError for arrays that do not fit each other, ParameterError for those that
+        do not fit the baseline.
+        """
+        lines: list[str] = []
+        for average in self._pairings[shaft].add(kind, message):
+            self.corrected[shaft] = average.is_corrected
+            monitor = self.monitors.get(shaft) or self._begin(shaft, average)
+            if monitor is not None:
+                lines += monitor.update(average)
+                self.unsaved = True
+        return lines
+
+    def _begin(self, shaft: str, average: MonitoredAverage) -> ShaftMonitor | None:
+        """Return a new monitor, or None while it is not known what the shaft has."""
+        if not average.layout.channels:
+            raise MessageError('average of no channel: publish at least one')
+        self._without[shaft] += 1
+        if not (average.is_corrected and (average.layout.indicators
+                                          or self._without[shaft] >= _WITHOUT)):
+            return None
+        self.monitors[shaft] = ShaftMonitor(
+            shaft, average.layout, self._settings, share=1.0 / len(self.shafts))
+        return self.monitors[shaft]
+
+    @property
+    def averages(self) -> int:
+        """Return the number of averages in the baseline of all shafts."""
+        return sum(item.averages for item in self.monitors.values())
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether all shafts have learnt their baseline at the present speed."""
+        return len(self.monitors) == len(self.shafts) and all(
+            item.is_complete for item in self.monitors.values())
+
+    def changes(self) -> list[Change]:
+        """Return what has changed, the most certain first."""
+        return sorted((change for item in self.monitors.values() for change in item.changes()),
+                      key=lambda change: change.p_value)
+
+    def report(self) -> dict[str, Any]:
+        """Return the object of the topic `change`, without NaN and infinities."""
+        names = ('shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_sequence',
+                 'since_time', 'keyphasor_share', 'p_value')
+        found: dict[str, Any] = json_values({
+            'baseline': {'averages': self.averages, 'complete': self.is_complete},
+            'changes': [{name: getattr(item, name) for name in names}
+                        for item in self.changes()]})
+        return found
+
+    def save(self) -> None:
+        """Write the file; raises RecordingError where it cannot be written."""
+        if self.path is not None and self.monitors:
+            write_baseline(self.path, self.machine, {**self._others, **self.monitors},
+                           self._settings)
+        self.unsaved = False

@@ -1,0 +1,203 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Node `change_monitor`: tells whether the machine has changed, and keeps its baseline."""
+
+from collections.abc import Sequence
+from functools import partial
+import json
+from pathlib import Path
+import time
+from typing import Any
+
+from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
+from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
+from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.messages import decode_average
+from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, require_shaft_names, Values
+from std_msgs.msg import Float64MultiArray, String
+
+PARAMETERS = (
+    Parameter('shafts', ['shaft'], 'names of the shafts that are monitored', read_only=True),
+    *TEST_PARAMETERS,
+    Parameter('severe_change', 0.25, 'relative change that is an error, if it is at least that '
+              'large by two standard errors; smaller ones are warnings', above=0.0,
+              maximum=1e6),
+    Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: it is lost when '
+              'the node ends', read_only=True),
+)
+_SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens
+_SHOWN = 3  # changes in the message of the status
+
+
+class ChangeMonitor(MonitoringNode):
+    """
+    Publishes `change` after each average: how far the baseline is, and what has changed.
+
+    A baseline file that cannot be used is an error that lasts: nothing is monitored, and the file
+    stays as it is.
+    """
+
+    def __init__(self, **node_kwargs: Any) -> None:
+        super().__init__('change_monitor', PARAMETERS, **node_kwargs)
+        self._values = values = self.parameters.values()
+        shafts = values['shafts']
+        require_shaft_names('shafts', shafts)
+        settings = Settings.of(values)
+        self._monitor: MachineMonitor | None = None
+        self._saved, self._was_complete = time.monotonic(), False
+        file = values['baseline_file']
+        try:
+            self._monitor = MachineMonitor(values[HARDWARE_ID.name], shafts, settings,
+                                           Path(file).expanduser() if file else None)
+        except RecordingError as error:
+            self._fail('baseline', str(error))
+        self._change = self.create_output(String, 'change', LATCHED_QOS)
+        for shaft in shafts:
+            for kind in KINDS:
+                self.create_input(Float64MultiArray, f'{shaft}/{kind}',
+                                  partial(self._on_array, shaft, kind))
+        self._average_flow = self.watch_input(
+            'average', f'{shafts[0]}/order_amplitude',
+            'has it vibration and pulses? (see its status)')
+        self.parameters.watch(check=Settings.of, apply=self._apply)
+        self._publish()
+        if self._monitor is not None:
+            self._was_complete = self._monitor.is_complete
+            self._show()
+            known = f'baseline of {self._monitor.averages} averages in {file}' if file else (
+                'the baseline is lost when the node ends, set baseline_file to keep it')
+            self.get_logger().info(f'started: monitors {", ".join(shafts)}; {known}')
+
+    def destroy_node(self) -> None:
+        """Keep the baseline and destroy the node."""
+        if self._monitor is not None and self._monitor.unsaved:
+            self._save(self._monitor)
+        super().destroy_node()
+
+    def _apply(self, values: Values) -> None:
+        self._values = values
+        if self._monitor is not None:
+            self._monitor.use(Settings.of(values))
+            self._show()
+
+    def _fail(self, what: str, reason: str) -> None:
+        """Show an error that lasts until the reason is ''; log it once."""
+        if reason and self.faults.get(what) != reason:
+            self.get_logger().error(reason)
+        self.faults.pop(what, '')
+        if reason:
+            self.faults[what] = reason
+
+    # --- messages ---
+
+    def _on_array(self, shaft: str, kind: str, message: Float64MultiArray) -> None:
+        decoded = decode_average(kind, message)
+        if kind == KINDS[0]:
+            self._average_flow.came()
+            self._average_flow.allowance = decoded.header.end_time - decoded.header.start_time
+        if self._monitor is None:
+            return
+        try:
+            lines = self._monitor.take(shaft, kind, decoded)
+        except ParameterError as error:
+            self._fail(f'baseline of {shaft}', str(error))
+            return
+        if kind == KINDS[0]:
+            self._fail(f'baseline of {shaft}', '')
+        for line in lines:
+            self.get_logger().warning(line)
+        if self._monitor.unsaved:
+            self._show()
+            self._publish()
+            due = time.monotonic() - self._saved > _SAVE_PERIOD
+            if lines or due or self._monitor.is_complete != self._was_complete:
+                self._save(self._monitor)
+
+    def _save(self, monitor: MachineMonitor) -> None:
+        """Write the baseline to its file, and say if that is not possible."""
+        self._saved, self._was_complete = time.monotonic(), monitor.is_complete
+        try:
+            monitor.save()
+        except RecordingError as error:
+            self.set_missing('baseline file', f'{error}; it is tried again every '
+                             f'{_SAVE_PERIOD:.0f} s')
+        else:
+            self.set_missing('baseline file', '')
+
+    def _show(self) -> None:
+        """Show the changes in the status: severe ones as an error."""
+        assert self._monitor is not None
+        severe: list[str] = []
+        others: list[str] = []
+        for item in self._monitor.changes():
+            (severe if self._is_severe(item) else others).append(str(item))
+        if severe:
+            self.faults['change'] = _some(severe)
+        else:
+            self.faults.pop('change', '')
+        self.set_missing('the machine has changed', _some(others))
+
+    def _is_severe(self, item: Change) -> bool:
+        least = abs(item.change) - 2.0 * item.standard_error
+        return least >= float(self._values['severe_change'])
+
+    def _publish(self) -> None:
+        content = self._monitor.report() if self._monitor is not None else {
+            'baseline': {'averages': 0, 'complete': False}, 'changes': []}
+        self._change.publish(String(data=json.dumps(content, allow_nan=False)))
+
+    # --- diagnostics ---
+
+    def update_counts(self) -> None:
+        """Count averages left out; say which shafts have no corrected amplitudes."""
+        if self._monitor is None:
+            return
+        found = self._monitor.monitors
+        self.counts.update(averages_overlapping=sum(item.overlapping for item in found.values()))
+        for shaft, latest in self._monitor.corrected.items():
+            self.set_missing(f'comparison of {shaft}', '' if latest else (
+                'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
+                'averager; if the averager refuses the correction (see its diagnostics), use a '
+                'better keyphasor'))
+
+    def summary(self) -> tuple[str, dict[str, str]]:
+        """Return what is learnt and how many quantities have changed."""
+        monitor = self._monitor
+        if monitor is None:
+            return 'nothing is monitored', {'baseline_file': self._values['baseline_file']}
+        found = monitor.monitors
+        changes = len(monitor.changes())
+        values = {
+            'baseline_averages': str(monitor.averages),
+            'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
+            'uncorrected': str(sum(item.uncorrected for item in found.values())),
+            'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
+            'baseline_file': self._values['baseline_file'] or 'none, lost when the node ends'}
+        if not found:
+            return 'no average received yet', values
+        if not monitor.is_complete:
+            shaft, item = min(found.items(), key=lambda each: each[1].learned)
+            return (f'learning: {item.learned} of {self._values["learning_averages"]} averages of '
+                    f'{shaft} at {item.speed:.4g} Hz', values)
+        return (f'{changes} changes' if changes else
+                f'no change; {monitor.averages} averages in the baseline'), values
+
+
+def _some(lines: Sequence[str]) -> str:
+    """Return the first lines, and how many there are beside them."""
+    more = f'; and {len(lines) - _SHOWN} more' if len(lines) > _SHOWN else ''
+    return '; '.join(lines[:_SHOWN]) + more
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node."""
+    return run_node(ChangeMonitor, args)

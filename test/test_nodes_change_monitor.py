@@ -1,0 +1,267 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""The change monitor over DDS: learning, changes, health, and the file of its baseline."""
+
+from contextlib import contextmanager
+import json
+
+from bench import NodeBench, SteadyClock
+from diagnostic_msgs.msg import DiagnosticStatus
+from drawn_machine import DrawnMachine
+import numpy as np
+import pytest
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.monitoring.machine_monitor import KINDS
+from sa_jitter_ros.nodes import health, messages
+from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
+from sa_jitter_ros.nodes.testing import Graph
+from std_msgs.msg import Float64MultiArray, String
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+KEYS = {'shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_sequence',
+        'since_time', 'keyphasor_share', 'p_value'}
+
+
+class MonitorBench(NodeBench):
+    """A bench around a monitor of drawn averages."""
+
+    def __init__(self, graph, *, shafts=('input',), **parameters):
+        parameters = {'learning_averages': 40, 'group_averages': 4, 'hardware_id': 'pump 3',
+                      'shafts': list(shafts), **parameters}
+        super().__init__(
+            graph, ChangeMonitor,
+            inputs={f'{shaft}/{kind}': Float64MultiArray for shaft in shafts for kind in KINDS},
+            outputs={}, **parameters)
+        self.received['change'] = graph.capture('change', String, latched=True)
+
+    def play(self, machine, count, *, shaft='input', kinds=KINDS):
+        """Publish averages of a machine, their arrays in any order."""
+        for number in range(count):
+            arrays = dict(zip(KINDS, machine.messages()))
+            for kind in sorted(kinds, key=lambda kind: hash((kind, number))):
+                self.send(f'{shaft}/{kind}', messages.encode_average(kind, arrays[kind]))
+        self.settle()
+
+    def change(self):
+        """Return the latest content of the topic."""
+        self.settle()
+        assert self.spin(lambda: self.received['change'])
+        return json.loads(self.received['change'][-1].data, parse_constant=pytest.fail)
+
+
+def test_learns_then_names_the_change(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(1)
+    assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
+    assert b.diagnostics()[:2] == (OK, 'no average received yet')
+    b.play(machine, 30)
+    assert b.change()['baseline'] == {'averages': 30, 'complete': False}
+    assert b.diagnostics()[:2] == (OK, 'learning: 30 of 40 averages of input at 16.6 Hz')
+    b.play(machine, 50)
+    assert b.change() == {'baseline': {'averages': 80, 'complete': True}, 'changes': []}
+    assert b.diagnostics()[:2] == (OK, 'no change; 80 averages in the baseline')
+    machine.gain[1, 2] = 1.08
+    b.play(machine, 80)
+    found, = b.change()['changes']
+    assert found.keys() == KEYS
+    assert [found[key] for key in ('shaft', 'channel', 'kind', 'name')] == [
+        'input', 1, 'order', '38']
+    assert found['change'] == pytest.approx(0.08, abs=4.0 * found['standard_error'])
+    assert abs(found['since_sequence'] - 80) <= 4
+    assert found['p_value'] < 1e-3
+    level, text, values = b.diagnostics()
+    assert level == WARN
+    assert text.startswith('the machine has changed: order 38 of input, channel 1: +')
+    assert 'since average 80; the keyphasor explains 0.' in text
+    assert (values['changes'], values['baseline_complete']) == ('1', 'true')
+    machine.gain[1, 2] = 2.0
+    b.play(machine, 80)
+    level, text, _ = b.diagnostics()
+    assert (level, text.partition(':')[0]) == (ERROR, 'order 38 of input, channel 1')
+    assert b.set_parameter('severe_change', 10.0) == (True, '')
+    assert b.diagnostics()[0] == WARN
+
+
+def test_late_subscriber_gets_the_last_answer(ros_graph):
+    b = MonitorBench(ros_graph)
+    b.play(DrawnMachine(2), 12)
+    late = ros_graph.capture('change', String, latched=True)
+    assert ros_graph.spin(lambda: late)
+    assert json.loads(late[-1].data)['baseline'] == {'averages': 12, 'complete': False}
+
+
+def test_worse_keyphasor_is_no_change(ros_graph):
+    b, machine = MonitorBench(ros_graph, learning_averages=80), DrawnMachine(3)
+    b.play(machine, 120)
+    machine.keyphasor, machine.bias = 3.0, 0.02
+    b.play(machine, 120)
+    assert b.change()['changes'] == []
+    assert b.diagnostics()[0] == OK
+
+
+def test_missing_correction_is_said(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(4)
+    b.play(machine, 8)
+    machine.corrected = False
+    b.play(machine, 3)
+    level, text, values = b.diagnostics()
+    assert level == WARN
+    assert text.startswith('comparison of input: order_amplitude has no corrected amplitudes')
+    assert (values['uncorrected'], values['baseline_averages']) == ('3', '8')
+    machine.corrected = True
+    b.play(machine, 1)
+    b.diagnostics()
+    assert b.diagnostics()[0] == OK
+
+
+def test_shafts_are_monitored_apart_and_together(ros_graph):
+    b = MonitorBench(ros_graph, shafts=('input', 'output'))
+    first, second = DrawnMachine(5), DrawnMachine(6)
+    b.play(first, 60, shaft='input')
+    assert b.change()['baseline'] == {'averages': 60, 'complete': False}
+    b.play(second, 60, shaft='output')
+    assert b.change()['baseline'] == {'averages': 120, 'complete': True}
+    second.damage[0, 0] = 1.2
+    b.play(second, 40, shaft='output')
+    found, = b.change()['changes']
+    assert (found['shaft'], found['kind'], found['name']) == ('output', 'indicator', 'rms')
+
+
+def test_averager_without_indicators_is_monitored(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(7)
+    b.play(machine, 80, kinds=KINDS[:1])
+    assert b.change()['baseline']['complete']
+    machine.gain[0, 1] = 1.2
+    b.play(machine, 60, kinds=KINDS[:1])
+    assert [item['name'] for item in b.change()['changes']] == ['19']
+
+
+def test_wrong_messages_cost_themselves(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(8)
+    orders, indicators, errors = machine.messages()
+    b.send('input/order_amplitude', Float64MultiArray())
+    for kind, array in zip(KINDS, (orders, indicators, errors)):
+        message = messages.encode_average(kind, array)
+        if kind == 'condition_indicator':  # of one channel
+            message.layout.dim[0].size = 1
+            message.data = message.data[:7 + indicators.values.shape[1]]
+        b.send(f'input/{kind}', message)
+    level, text, values = b.diagnostics()
+    assert (level, values['messages_rejected']) == (WARN, '2')
+    assert '1 channels of indicators and 2 of orders' in text
+    b.play(machine, 4)
+    assert b.change()['baseline']['averages'] == 4
+
+
+def test_silence_is_reported(ros_graph, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(health, 'time', clock)
+    b = MonitorBench(ros_graph, stale_after=5.0)
+    b.play(DrawnMachine(9), 2)
+    clock.now += 8.0  # an average takes 2 s
+    level, text, values = b.diagnostics()
+    assert (level, text.partition(':')[0]) == (WARN, 'no /input/order_amplitude for 8 s')
+    assert values['average_age'] == '8.0'
+
+
+def test_parameters_that_do_not_fit_are_refused(ros_graph):
+    with pytest.raises(ParameterError, match='learn at least 8 groups, 80 averages'):
+        MonitorBench(ros_graph, learning_averages=79, group_averages=10)
+    b = MonitorBench(ros_graph)
+    accepted, reason = b.set_parameter('false_alarms_per_year', 0.0)
+    assert (accepted, 'more than 0.0' in reason) == (False, True)
+    assert b.set_parameter('false_alarms_per_year', 12.0)[0]
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def running(**parameters):
+    """Start a monitor, as a process would; end it."""
+    graph = Graph()
+    try:
+        yield MonitorBench(graph, **parameters)
+    finally:
+        graph.shutdown()
+
+
+@pytest.fixture
+def learned(tmp_path):
+    """Return a machine, the file that a monitor has kept of it, and its last answer: a change."""
+    machine, path = DrawnMachine(10), tmp_path / 'state' / 'baseline.npz'
+    with running(baseline_file=str(path)) as b:
+        b.play(machine, 80)
+        machine.gain[0, 1] = 1.1
+        b.play(machine, 40)
+        content = b.change()
+    assert content['changes']
+    return machine, path, content
+
+
+def test_baseline_and_changes_survive_a_restart(learned):
+    machine, path, content = learned
+    with running(baseline_file=str(path)) as b:
+        assert b.change() == content
+        assert b.diagnostics()[0] == WARN
+        b.play(machine, 40)
+        assert b.change()['changes'][0]['since_time'] == content['changes'][0]['since_time']
+        assert b.change()['baseline']['complete']
+
+
+def test_corrupt_file_is_refused_and_kept(learned, capfd):
+    machine, path, _ = learned
+    path.write_bytes(path.read_bytes()[:500])
+    before = path.read_bytes()
+    with running(baseline_file=str(path)) as b:
+        level, text, _ = b.diagnostics()
+        assert level == ERROR
+        assert text.startswith(f'{path}: is no intact baseline')
+        b.play(machine, 60)
+        assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
+    assert capfd.readouterr().err.count('is no intact baseline') == 1
+    assert path.read_bytes() == before
+
+
+def test_baseline_of_another_machine_is_refused_and_kept(learned):
+    machine, path, _ = learned
+    before = path.read_bytes()
+    with running(baseline_file=str(path), hardware_id='pump 4') as b:
+        level, text, _ = b.diagnostics()
+        assert (level, "machine 'pump 3', this one is 'pump 4'" in text) == (ERROR, True)
+        b.play(machine, 10)
+    with running(baseline_file=str(path)) as b:
+        orders, indicators, errors = machine.messages()
+        orders.values[..., 0] += 1.0
+        for kind, array in zip(KINDS, (orders, indicators, errors)):
+            b.send(f'input/{kind}', messages.encode_average(kind, array))
+        level, text, _ = b.diagnostics()
+        assert (level, 'orders 2, 20, 39' in text) == (ERROR, True)
+    assert path.read_bytes() == before
+
+
+def test_file_that_cannot_be_written_is_a_warning(ros_graph, tmp_path):
+    (tmp_path / 'file').write_text('in the way')
+    b = MonitorBench(ros_graph, baseline_file=str(tmp_path / 'file' / 'baseline.npz'))
+    b.play(DrawnMachine(11), 60)
+    level, text, _ = b.diagnostics()
+    assert level == WARN
+    assert text.startswith('baseline file: ')
+    assert 'the baseline cannot be written' in text
+    assert b.change()['baseline'] == {'averages': 60, 'complete': True}
+
+
+def test_arrays_hold_nan_and_nothing_else_happens(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(12)
+    for _ in range(60):
+        for kind, array in zip(KINDS, machine.messages()):
+            array.values[0] = array.values[0] if kind == 'order_amplitude' else np.nan
+            b.send(f'input/{kind}', messages.encode_average(kind, array))
+    assert b.change() == {'baseline': {'averages': 60, 'complete': True}, 'changes': []}
