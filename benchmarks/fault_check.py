@@ -20,8 +20,9 @@ with it. These must be the errors of the teeth within their standard errors, exc
 delay, which no vibration shows. Then the corrected values are true within their standard errors.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 from fault_graph import Received
@@ -142,18 +143,34 @@ class ShaftChecker:
         if abs(header.mean_trigger_speed - speed) > 1e-9 * speed:
             return f'speed {header.mean_trigger_speed} instead of {speed}'
         exponential = values['averaging'] == 'exponential'
-        pulses = self._pulses(run, first, last, step, values, LONGEST if exponential else count)
-        if isinstance(pulses, str):
-            return pulses
-        return self._agrees(Window(run, pulses, r, count), amplitude, waveform, values, first)
+        longest = LONGEST if exponential else count
+        found: Place | str = ''
+        for used in self._used_swapped(run, last - longest * step, last):
+            pulses = self._pulses(run, first, last, step, values, longest, used)
+            found = pulses if isinstance(pulses, str) else self._agrees(
+                Window(run, pulses, r, count), amplitude, waveform, values, first)
+            if isinstance(found, Place):
+                break
+        return found
+
+    def _used_swapped(self, run: Run, begin: int, end: int) -> Iterator[set[int]]:
+        """
+        Iterate over what may be used of the swapped teeth.
+
+        The tooth behind came before it, and waits: either of the two is out of order.
+        """
+        swapped = [tooth for tooth in run.swapped if begin <= tooth + 1 and tooth <= end]
+        for count in range(len(swapped) + 1 if self._delivered else 1):
+            yield from map(set, combinations(swapped, count))
 
     def _pulses(self, run: Run, first: int, last: int, step: int, values: Mapping[str, Any],
-                longest: int) -> FloatArray | str:
+                longest: int, used: set[int]) -> FloatArray | str:
         """Return the pulses (tau) of as many usable cycles as end at `last`, at least these."""
         pitch = 1.0 / (TEETH * run.speed)
-        absent = run.missing | run.undelivered if self._delivered else run.missing
-        absent = absent | {tooth for tooth, late in run.displaced.items()
-                           if abs(late) > BELIEVED * pitch}
+        absent = set(run.missing)
+        if self._delivered:
+            absent |= (run.undelivered - used) | {tooth + 1 for tooth in used}
+        absent |= {tooth for tooth, late in run.displaced.items() if abs(late) > BELIEVED * pitch}
         gaps = absent if values['missing_pulses'] == 'break' else set()
         begin = max(last - longest * step, 0)
         bad = [tooth for tooth in range(begin, last + 1) if tooth in gaps]
@@ -248,7 +265,9 @@ def check_correction(name: str, received: Received, place: Place,
     true -= true.mean()
     told = np.isfinite(errors)  # without ambiguity
     apart = np.abs(errors - np.mean(errors[told]) - true + np.mean(true[told]))[told]
-    apart /= standard_errors[told]
+    # All channels are multiples of one signal: what disturbs one disturbs all, and the recovery
+    # takes them for independent.
+    apart /= standard_errors[told] * np.sqrt(run.channels)
     if (told.all() and abs(errors.mean()) > MEAN) or not apart.max(initial=0.0) < LIMIT:
         raise WrongAverageError(f'{name}: errors of the pulses are {1e6 * true} us and not '
                                 f'{1e6 * errors}, {apart.max():.3g} standard errors apart')

@@ -44,8 +44,8 @@ class Run:
     Sample i has the header time `clock` + i / `RATE` and the index `index` + i, tooth j passes at
     `first_tooth` + j / (`TEETH` `speed`). `components` are (order of the tach shaft, amplitude,
     phase); channel c holds c + 1 times as much. `jitter` (s) and `displaced` (s) are errors of
-    teeth, others are `missing`; `strays` are pulses (tau) that no tooth made, `lost` spans (tau)
-    without vibration.
+    teeth, others are `missing`; of the `undelivered`, the `swapped` come behind the next one.
+    `strays` are pulses (tau) that no tooth made, `lost` spans (tau) without vibration.
     """
 
     number: int
@@ -60,6 +60,7 @@ class Run:
     displaced: dict[int, float] = field(default_factory=dict)
     missing: set[int] = field(default_factory=set)
     undelivered: set[int] = field(default_factory=set)
+    swapped: set[int] = field(default_factory=set)
     strays: list[float] = field(default_factory=list)
     lost: list[tuple[float, float]] = field(default_factory=list)
 
@@ -114,14 +115,15 @@ class Run:
         """
         Return the tooth whose pulse has this header time (s), or None.
 
-        That of a missing or displaced one may be half way between its neighbours.
+        That of one that is missing, displaced or swapped may be half way between its neighbours.
         """
         tau = time - self.clock
         tooth = round((tau - self.first_tooth) * TEETH * self.speed)
         if tooth < 0:
             return None
         exact = [self.times(np.array([tooth]))[0]]
-        if tooth in self.missing or tooth in self.undelivered or tooth in self.displaced:
+        if (tooth in self.missing or tooth in self.undelivered or tooth in self.displaced
+                or tooth - 1 in self.swapped):
             exact.append(self.times(np.array([tooth - 1, tooth + 1])).mean())
         # to the nanosecond in messages, and as absolute times round
         return tooth if min(abs(item - tau) for item in exact) < 3e-9 + 2e-15 * abs(time) else None

@@ -301,6 +301,7 @@ class FaultySource:
             if kind == 'late':
                 sent.append((tau + float(self.rng.uniform(2.2, 4.5)) * pitch, time, KEYPHASOR))
             elif kind == 'swapped':
+                run.swapped.add(tooth)
                 sent.append((tau + 1.01 * pitch, time, KEYPHASOR))
             elif kind == 'repeated':
                 sent.append((tau + 1e-6, time, KEYPHASOR))

@@ -120,6 +120,18 @@ def test_a_displaced_pulse_among_equal_intervals_is_no_tick_of_a_clock(marks, cl
             assert found.size > 195 * marks
 
 
+@pytest.mark.parametrize('marks', [1, 2, 4])
+def test_a_displaced_pulse_in_the_first_revolutions_is_in_no_cycle(rng, marks):
+    for trial in range(60):
+        pulses = 1.0 + 0.02 * np.arange(60.0) + rng.uniform(-2e-6, 2e-6, 60)
+        place = 3 + trial % 6
+        pulses[place] += rng.choice([-1.0, 1.0]) * rng.uniform(0.03, 0.1) * 0.02
+        validator = PulseValidator(pulses_per_revolution=marks, pulses_per_trigger=1)
+        found = np.append(validator.update(pulses).times, validator.flush().times)
+        assert pulses[place] not in found, trial
+        assert found.size > 54
+
+
 @pytest.mark.parametrize('clock', [0.0, 4000.0])
 @pytest.mark.parametrize('step', [1e-3, -1e-3])
 def test_a_step_of_the_time_among_equal_intervals_is_in_no_cycle(step, clock):

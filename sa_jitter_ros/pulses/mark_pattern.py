@@ -25,6 +25,7 @@ _SIGNIFICANT = 4.0
 # Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
 _UNEVEN = 0.5  # of levels: intervals of more than 1.6 times others are gaps
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
+_UNLIKE = 2.0  # tolerances by which the changes of speed may differ
 _CLEAN = 0.25  # of all pairs of revolutions are without a stray, at least
 
 
@@ -108,11 +109,14 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     first = np.lib.stride_tricks.sliding_window_view(levels[:-count], count)
     apart[np.ptp(first, axis=1) > _UNEVEN] = np.inf
     near = np.abs(windows).max(axis=1) <= _CHANGE
+    # A displaced pulse of two marks repeats, too, with a change of speed that the others lack.
+    slopes = windows.mean(axis=1)
+    unlike = np.abs(slopes - (np.median(slopes[near]) if near.any() else 0.0))
     for tolerance in _REPEATING:
-        fits = np.flatnonzero((apart <= tolerance) & near)
+        fits = np.flatnonzero((apart <= tolerance) & near & (unlike <= _UNLIKE * tolerance))
         if fits.size:
             begin = int(fits[0])
-            slope = float(windows[begin].mean()) / count
+            slope = float(slopes[begin]) / count
             two = (levels[begin:begin + 2 * count].reshape(2, count)
                    - slope * np.arange(2 * count).reshape(2, count))
             widths = two.mean(axis=0)
