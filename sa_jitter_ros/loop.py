@@ -36,7 +36,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
-from sa_jitter_ros.report.report import report, summary
+from sa_jitter_ros.report.report import parameters_text, report, summary
 
 Source = str | os.PathLike[str] | Recording
 Declared = str | os.PathLike[str] | Declaration | DeclaredModel | Mapping[str, Any]
@@ -82,8 +82,9 @@ class Loop:
     @cached_property
     def shafts(self) -> Mapping[str, Mapping[str, Any]]:
         """Return the report of each shaft by its name; undefined numbers are None."""
-        return {shaft: report(trace, recordings=self.recordings, shaft=shaft, unit=self.unit,
-                              created=self.created)
+        models = {shaft: trace.observation.model for shaft, trace in self.traces.items()}
+        return {shaft: report(trace, recordings=self.recordings, shaft=shaft, models=models,
+                              unit=self.unit, created=self.created)
                 for shaft, trace in self.traces.items()}
 
     @property
@@ -102,6 +103,15 @@ class Loop:
     def verdict(self) -> str:
         """Return `none`, `traced` or `unexplained`; with several shafts the last that occurs."""
         return max((trace.verdict for trace in self.traces.values()), key=_VERDICTS.index)
+
+    @property
+    def found(self) -> tuple[str, ...]:
+        """Return the missing effects with their parameters, a text for each."""
+        several = len(self.shafts) > 1
+        return tuple((f'{shaft}: ' if several else '')
+                     + f'{effect["name"]} {parameters_text(effect, content["unit"])}'
+                     for shaft, content in self.shafts.items()
+                     for effect in content['missing_effects'])
 
     def __repr__(self) -> str:
         """Return one line: the verdict and the missing effects of each shaft."""

@@ -19,6 +19,7 @@ import sys
 import numpy as np
 import pytest
 from sa_jitter_ros import json_values, loop
+from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, ParameterError, RecordingError
 from sa_jitter_ros.loop import close_loop
@@ -111,7 +112,14 @@ jitter_predictor:
     assert found.report == {'verdict': 'traced', 'shafts': found.shafts}
     differ = ('created', 'shaft', 'parameter_file')
     assert found.shafts['slow'] == {**one, **{key: found.shafts['slow'][key] for key in differ}}
-    assert 'slow.ratio' not in one['parameter_file']
+    assert 'slow.orders' not in one['parameter_file']
+    (tmp_path / 'again.yaml').write_text(found.shafts['slow']['parameter_file'])
+    again = read_declaration(tmp_path / 'again.yaml')
+    assert {shaft: (model.ratio, model.orders) for shaft, model in again.models.items()} == {
+        'fast': (2.0, (4.0, 8.0, 12.0)), 'slow': (1.0, (8.0, 16.0, 24.0))}
+    assert [effect.name for effect in again.effects] == ['excess_jitter']
+    assert [text.split(' = ')[0] for text in found.found] == [
+        'fast: excess_jitter std', 'slow: excess_jitter std']
     stds = [item['missing_effects'][0]['parameters']['std']['value']
             for item in found.shafts.values()]
     assert stds[0] == pytest.approx(stds[1], rel=1e-2)  # the same pulses, the same orders in Hz

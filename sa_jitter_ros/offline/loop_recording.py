@@ -110,13 +110,8 @@ def _finished(path: Path) -> Mapping[str, Any]:
 
 
 def _row(job: LoopJob, loop: Loop, remarks: tuple[str, ...]) -> LoopRow:
-    effects = [(f'{shaft}: ' if len(loop.shafts) > 1 else '') + effect['name'] + ''.join(
-        f' {name} {item["value"]:.4g} +- {item["standard_error"]:.2g} {item["unit"]}'.rstrip()
-        for name, item in effect['parameters'].items()
-        if item['value'] is not None and item['standard_error'] is not None)
-        for shaft, content in loop.shafts.items() for effect in content['missing_effects']]
     before, after = (max((content[name]['rms'] for content in loop.shafts.values()
                           if content[name]['rms'] is not None), default=math.nan)
                      for name in ('error_before', 'error_after'))
-    return LoopRow(job.name, job.path, verdict=loop.verdict, missing_effects=tuple(effects),
+    return LoopRow(job.name, job.path, verdict=loop.verdict, missing_effects=loop.found,
                    rms_before=before, rms_after=after, remarks=remarks)

@@ -19,6 +19,7 @@ from typing import Any
 
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report.figures import illustrate, Illustration
+from sa_jitter_ros.report.new_section import ONLY_SHAFT
 from sa_jitter_ros.report.number_text import measured_text, number_text, p_text, percent_text
 from sa_jitter_ros.report.report import parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
@@ -124,7 +125,7 @@ def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
         yield f'<p class="quiet">{_TITLE}</p>'
     count = sum(content['acquisitions'].values())
     orders = '; orders ' + number_text(content['orders']) if len(shafts) == 1 else ''
-    names = ', '.join(name for name in shafts if name not in ('', 'shaft'))
+    names = ', '.join(name for name in shafts if name != ONLY_SHAFT)
     analysed = ' '.join(filter(None, (
         content['created'].replace('T', ' ').replace('+00:00', ' UTC'),
         f'with sa_jitter_ros {content["version"]}')))

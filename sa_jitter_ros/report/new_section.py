@@ -17,32 +17,35 @@ from typing import Any
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.parameter_file import section_text
+from sa_jitter_ros.prediction.model import DeclaredModel
 
 _NODE = 'jitter_predictor'
-_ONLY_SHAFT = 'shaft'  # the name of a shaft that was given none
+ONLY_SHAFT = 'shaft'  # the name of a shaft that was given none
 _OF_SHAFT = ('ratio', 'orders')
 _DIGITS = 6
 
 
-def new_section(trace: Trace, *, shaft: str = '') -> str:
+def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
     """
     Return the section of `jitter_predictor` with the effects that were found, '' without any.
 
-    It declares the model as before, with the effects added; what is new has a remark. A `shaft`
-    with a name has its own ratio and orders.
+    It declares the `models` of all shafts, by their names, as before, with the effects added; what
+    is new has a remark.
     """
     found = {item.name: item.effect for item in trace.findings if item.effect is not None}
     if not found:
         return ''
     model, declared = trace.observation.model, {item.name: item for item in trace.declared}
-    named = shaft not in ('', _ONLY_SHAFT)
-    values: dict[str, Any] = {'shafts': [shaft]} if named else {}
+    named = set(models) != {ONLY_SHAFT}
+    values: dict[str, Any] = {'shafts': list(models)} if named else {}
     for item in fields(model):
-        value = trace.observation.declared_speed if item.name == 'trigger_speed' else getattr(
-            model, item.name)
-        if item.default is MISSING or value != item.default:
-            values[f'{shaft}.{item.name}' if named and item.name in _OF_SHAFT else item.name] = (
-                value)
+        places = {f'{shaft}.{item.name}': each for shaft, each in models.items()} if (
+            named and item.name in _OF_SHAFT) else {item.name: model}
+        for place, each in places.items():
+            value = trace.observation.declared_speed if item.name == 'trigger_speed' else getattr(
+                each, item.name)
+            if item.default is MISSING or value != item.default:
+                values[place] = value
     remarks = {}
     values['effects'] = {}
     for name, effect in {**declared, **found}.items():

@@ -13,6 +13,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 import math
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,20 +26,22 @@ from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.json_values import json_values
-from sa_jitter_ros.report.new_section import new_section
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.report.new_section import new_section, ONLY_SHAFT
 from sa_jitter_ros.report.number_text import measured_text
 from sa_jitter_ros.version import __version__
 
 Json = Any
 
 
-def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = '', unit: str = '',
+def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SHAFT,
+           models: Mapping[str, DeclaredModel] = MappingProxyType({}), unit: str = '',
            created: str = '') -> Mapping[str, Json]:
     """
     Return the content of `report.json`; undefined numbers are None.
 
-    `shaft` is the name of the shaft in a parameter file, '' for the only one; `unit` that of the
-    vibration; `created` the time of the analysis.
+    `shaft` is the name of the shaft, `models` are those of all shafts that are declared beside it;
+    `unit` is that of the vibration, `created` the time of the analysis.
     """
     observation = trace.observation
     orders = observation.orders
@@ -58,7 +61,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = '', uni
         'unit': unit,
         'created': created,
         'version': __version__,
-        'parameter_file': new_section(trace, shaft=shaft),
+        'parameter_file': new_section(trace, models or {shaft: observation.model}),
         'remarks': [*observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
