@@ -71,7 +71,8 @@ export function spectrumTable() {
 // --- trends --------------------------------------------------------------------------------------
 
 const trendCharts = new Map();  // by choice: 'order 19', 'indicator rms'
-let chosen = null;  // until somebody chooses: the strongest order and the first indicator
+let chosen = null;  // until somebody chooses: strongest order, first indicator, what has changed
+const MOST_CHANGED = 4;
 
 const namesOf = kind => ofShaft(kind === 'order' ? 'raw_trend' : 'indicator_trend')?.names ?? [];
 const choices = () => ['order', 'indicator'].flatMap(
@@ -88,8 +89,9 @@ function shownTrends() {
   if (chosen) return possible.filter(choice => chosen.has(choice));
   const last = shownPart('raw_trend')?.value.at(-1) ?? [];
   const strongest = last.indexOf(Math.max(...finite(last)));
+  const changed = possible.filter(choice => changeOf(...parted(choice))).slice(0, MOST_CHANGED);
   return possible.filter((choice, i) => i === Math.max(strongest, 0)
-    || i === namesOf('order').length);
+    || i === namesOf('order').length || changed.includes(choice));
 }
 
 // The choices as boxes, and a chart for each that is chosen.
@@ -144,7 +146,8 @@ function drawTrend(chart, choice) {
   const limits = curves.flatMap(([, , values, errors]) => values.flatMap((value, i) =>
     known(value) ? [value - 2 * (errors[i] ?? 0), value + 2 * (errors[i] ?? 0)] : []));
   chart.axes({
-    x: linear([-(span || 1) / size * 1.03, 0.02 * (span || 1) / size]),
+    x: linear([-(span || 1) / size * 1.03, 0.02 * (span || 1) / size],
+              Math.max(4, Math.min(10, chart.inner / 80))),
     xLabel: `end of the average before the last one [${letter}]`, y: linear(range(limits), 4),
     yLabel: measure ? `amplitude [${measure}]` : name,
     title: name + (change ? `: ${changeText(change)} since average ${change.since_sequence}` : '')});
@@ -207,7 +210,7 @@ function rowAxis(time) {
     const row = ages.findIndex(item => item <= age * (1 + 1e-9));
     const next = row > 0 ? (ages[row - 1] - age) / (ages[row - 1] - ages[row] || 1) : 1;
     return [row < 0 ? count - 1 : row > 0 ? row - 1 + next : 0, label];
-  });
+  }).filter(([row], i, all) => i === 0 || all[i - 1][0] - row > 0.08 * count);  // they would touch
   return {at: row => (row + 0.5) / count, ticks};
 }
 

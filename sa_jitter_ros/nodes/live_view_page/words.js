@@ -6,6 +6,7 @@ import {analysed, changes, changeText, channelName, find, finite, inBand, ofShaf
         state, timeUnit, unit, unitOf, withTimeUnit} from './model.js';
 
 const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
+const MOST_CHANGES = 5;
 const LOSSES = /dropped|gaps|restarts|clock_deviation|rejected|refused/;
 
 const rms = values => Math.sqrt(values.reduce((sum, x) => sum + x * x, 0) / values.length);
@@ -141,17 +142,23 @@ export function drawEffects() {
 
 // Above everything: what has changed, and which nodes lack something, with their own words.
 export function drawAttention() {
-  const bad = Object.entries(part('/diagnostics') ?? {}).map(([name, node]) => {
+  // What the monitor says of changes stands there already.
+  const said = node => changes().length && 'baseline_complete' in node.values
+    && node.message.includes('since average');
+  const bad = Object.entries(part('/diagnostics') ?? {}).filter(([, node]) => !said(node)).map(([name, node]) => {
     const age = state.now - node.received;
     return [age > 5 ? 3 : node.level, name, age > 5 ? `no status for ${age.toFixed(0)} s`
       : node.message];
   }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
-  const changed = changes().map(item => [1, item.kind === 'order' ? `order ${item.name}`
+  const changed = [...changes()].sort((a, b) => a.p_value - b.p_value).map(item => [1, item.kind === 'order' ? `order ${item.name}`
     : item.name.replaceAll('_', ' '), `of ${item.shaft}, ${channelName(item.channel)}: `
       + `${changeText(item)} since average ${item.since_sequence}`
       + (known(item.keyphasor_share) ? '; the keyphasor explains '
         + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
-  const lines = [...changed.map(([level, name, text]) => [level, `${name} ${text}`]),
+  const lines = [...changed.slice(0, MOST_CHANGES).map(
+    ([level, name, text]) => [level, `${name} ${text}`]),
+                 ...(changed.length > MOST_CHANGES
+                   ? [[1, `and ${changed.length - MOST_CHANGES} more changes`]] : []),
                  ...bad.map(([level, name, text]) => [level, `${name}: ${text}`])];
   find('attention').replaceChildren(...lines.map(([level, text]) => {
     const line = document.createElement('p');
