@@ -13,8 +13,11 @@ The sequential test of new values against the baseline, which they join while no
 
 Successive values may depend on each other, because a machine is not steady. Their scores are
 predicted from the one before by the correlation that the baseline shows, and what the prediction
-leaves is tested. What came since a change began is taken out of the baseline again. A change ends
-when the scores are again those of the baseline rather than those of the change.
+leaves is tested. If the sums of that over many values scatter more than those of independent
+values, it is divided by so much: a change is as large as it is against what the machine does over
+the time in which it would be found. What came since a change began is taken out of the baseline
+again. A change ends when the scores are again those of the baseline rather than those of the
+change.
 """
 
 from dataclasses import dataclass
@@ -35,10 +38,14 @@ LEAST_LEARNED = 8
 # Correlation counts from so many standard errors on, and up to the largest. Scores show it so many
 # values later: those of a sudden change, which are alike, are found before they count.
 _SURE_CORRELATION, _LARGEST_CORRELATION, _DELAY = 1.0, 0.95, 16
+# Values over which sums show slow unsteadiness, and for each of `SIZES` how many of these lengths
+# count: to find a change takes the longer, the smaller it is.
+_LENGTHS, _SLOW, _LEAST_BLOCKS = (32, 256), (2, 1, 2, 1, 0, 0), 4
 # A change ends when its absence is more likely by this factor. Of a change that lasts, the latest
 # values count most: so many of them.
 _ENDS, _MEMORY = 1e4, 64.0
-_LARGEST_SUM = 3.0 * math.log(_ENDS)
+# Which scores each size takes: those of changes up, or down.
+_WAY = [1 if size > 0.0 else 2 for size in SIZES]
 
 
 @dataclass(frozen=True)
@@ -46,14 +53,15 @@ class Estimate:
     """
     Changes against the baseline, each an array (unit, quantity), NaN where none is known.
 
-    `change` and `variance` are in the units of the values, as the `baseline` mean is; `freedom`
-    are the degrees of freedom of the variance, and `doubt` is how far the change may be due to the
-    doubt that grew.
+    `change` and `variance` are in the units of the values, as the `baseline` mean is; `noise` is
+    the published variance in the baseline, `freedom` are the degrees of freedom of the variance,
+    and `doubt` is how far the change may be due to the doubt that grew.
     """
 
     change: FloatArray
     variance: FloatArray
     baseline: FloatArray
+    noise: FloatArray
     freedom: FloatArray
     doubt: FloatArray
 
@@ -77,9 +85,12 @@ class ChangeTest:
         #: Index in `SIZES` of an active change, and mark of the value with which it began.
         self.size: NDArray[np.int64] = np.zeros(shape, np.int64)
         self.begun: FloatArray = np.full((2, len(SIZES), *shape), np.nan)
-        self._last: FloatArray = np.full(shape, np.nan)
+        self._last: FloatArray = np.full((3, *shape), np.nan)
         self._products: FloatArray = np.zeros((3, *shape))  # number, lagged, squared
         self._delayed: FloatArray = np.zeros((_DELAY, 3, *shape))  # and what joins them
+        # Of each length: unfinished sum, and number and total of squared sums over the length.
+        self._blocks: FloatArray = np.zeros((len(_LENGTHS), 3, *shape))
+        self._filled: NDArray[np.int64] = np.zeros((len(_LENGTHS), *shape), np.int64)
         self._level: FloatArray = np.zeros(shape)  # mean score of an active change
         self._farthest: FloatArray = np.zeros(shape)
         self._gone: FloatArray = np.zeros(shape)
@@ -108,12 +119,14 @@ class ChangeTest:
         place = self.bins.setdefault(key, SpeedBin(self.shape))
         spread = self.spread()
         scores, weights = place.score(values, noise, doubt, spread)
-        known = np.isfinite(scores) & (place.count >= LEAST_LEARNED)
+        known = np.isfinite(scores[0]) & (place.count >= LEAST_LEARNED)
         scores = np.where(known, scores, np.nan)
         innovations = self._innovations(scores)
         ready = known & (place.count >= self.learning - 0.5) & ~self.active
         place.learn(values, noise, doubt, weights, self.active)
-        none = self.evidence.update(np.where(ready, innovations, np.nan))
+        innovations = np.where(ready, innovations, np.nan)
+        none = self.evidence.update(innovations[_WAY] / np.sqrt(self._slowness()))
+        self._add_to_blocks(innovations[0])
         chosen = np.arange(len(SIZES))[:, None, None] == self.size
         none = np.where(self.active, ~chosen, none)
         began = ~none & np.isnan(self.begun[0])
@@ -124,20 +137,44 @@ class ChangeTest:
         for other in self.bins.values():
             if other is not place:
                 other.settle(none)
-        ended = self._end(scores, innovations)
+        ended = self._end(scores[0])
         return self._begin(threshold(scores_per_alarm)), ended
 
     def _innovations(self, scores: FloatArray) -> FloatArray:
         """Return what the score before does not predict, as standard normal scores."""
         correlation, last = self.correlation(), self._last
-        both = np.isfinite(scores) & np.isfinite(last) & ~self.active
-        pair, squared = scores * last, 0.5 * (scores**2 + last**2)
+        pair, squared = scores[0] * last[0], 0.5 * (scores[0] ** 2 + last[0] ** 2)
+        both = np.isfinite(pair) & ~self.active
         self._products = self._products + self._delayed[0]
         latest = np.where(both, np.stack((np.ones(self.shape), pair, squared)), 0.0)
         self._delayed = np.concatenate((self._delayed[1:], latest[None]))
         self._last = np.where(np.isfinite(scores), scores, last)
         return np.where(np.isfinite(last), (scores - correlation * last) / np.sqrt(
             1.0 - correlation**2), scores)
+
+    def _slowness(self) -> FloatArray:
+        """Return by how much sums of innovations scatter more than independent ones, by size."""
+        found = np.ones((1 + len(_LENGTHS), *self.shape))
+        for place, (_, number, total) in enumerate(self._blocks):
+            ratio = total / np.maximum(number, 1.0)
+            sure = ratio > 1.0 + np.sqrt(2.0 / np.maximum(number, 1.0))
+            found[place + 1] = np.maximum(found[place], np.where(
+                sure & (number >= _LEAST_BLOCKS), ratio, 1.0))
+        return found[list(_SLOW)]
+
+    def _add_to_blocks(self, innovations: FloatArray) -> None:
+        """Add innovations (unit, quantity) to the sums over many, none where NaN."""
+        known = np.isfinite(innovations)
+        self._blocks[:, 0] += np.where(known, innovations, 0.0)
+        self._filled += known
+        for place, length in enumerate(_LENGTHS):
+            full = self._filled[place] >= length
+            if full.any():
+                sums, number, total = self._blocks[place]
+                total += np.where(full, sums**2 / length, 0.0)
+                number += full
+                sums[full] = 0.0
+                self._filled[place][full] = 0
 
     def _begin(self, level: float) -> BoolArray:
         """Begin the changes whose evidence reaches a level."""
@@ -153,21 +190,21 @@ class ChangeTest:
                 state[changed] = size[changed]
             self._gone[changed] = 0.0
             self._delayed[:, :, changed] = 0.0
+            self._blocks[:, 0, changed], self._filled[:, changed] = 0.0, 0
         return changed
 
-    def _end(self, scores: FloatArray, innovations: FloatArray) -> BoolArray:
+    def _end(self, scores: FloatArray) -> BoolArray:
         """End the active changes that are gone; return which."""
         known = self.active & np.isfinite(scores)
         if not known.any():
             return np.zeros(self.shape, np.bool_)
-        correlation = self.correlation()
         step = np.where(known, scores - self._level, 0.0) / _MEMORY
         self._level = self._level + step
         farther = known & (np.abs(self._level) > np.abs(self._farthest))
         self._farthest = np.where(farther, self._level, self._farthest)
-        size = self._farthest * np.sqrt((1.0 - correlation) / (1.0 + correlation))
-        gain = 0.5 * size**2 - size * np.where(known, innovations, 0.0)
-        self._gone = np.where(known, np.maximum(self._gone + gain, 0.0), self._gone)
+        gain = 0.5 * self._farthest**2 - self._farthest * np.where(known, scores, 0.0)
+        self._gone = np.where(
+            known, np.maximum(self._gone + gain / self.spread(), 0.0), self._gone)
         ended = known & (self._gone > math.log(_ENDS))
         self.active = self.active & ~ended
         self.evidence.forget(ended)
@@ -179,8 +216,7 @@ class ChangeTest:
     def estimate(self) -> Estimate:
         """Return the active changes, over all bins of speed."""
         spread = self.spread()
-        total, weight, base, freedom = (np.zeros(self.shape) for _ in range(4))
-        doubt = np.zeros(self.shape)
+        total, weight, base, noise, doubt, freedom = (np.zeros(self.shape) for _ in range(6))
         for place in self.bins.values():
             change, variance, mean = place.change(self.size, spread)
             share = np.where(self.active & np.isfinite(change) & (variance > 0.0),
@@ -188,16 +224,18 @@ class ChangeTest:
             weight += share
             total += share * np.nan_to_num(change)
             base += share * np.nan_to_num(mean)
+            noise += share * np.nan_to_num(place.baseline().noise)
             doubt += share * place.excess_doubt()
             freedom = np.where(share > 0.0, np.maximum(freedom, place.count - 1.0), freedom)
         sure = np.where(weight > 0.0, weight, np.nan)
-        return Estimate(total / sure, 1.0 / sure, base / sure, np.where(
+        return Estimate(total / sure, 1.0 / sure, base / sure, noise / sure, np.where(
             weight > 0.0, freedom, np.nan), doubt / sure)
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return what `restore` needs: arrays by names."""
         found = {'active': self.active, 'size': self.size, 'begun': self.begun,
                  'last': self._last, 'lagged': self._products, 'delayed': self._delayed,
+                 'blocks': self._blocks, 'filled': self._filled,
                  'level': self._level, 'farthest': self._farthest, 'gone': self._gone,
                  'bins': np.array(list(self.bins), np.int64)}
         found.update({f'evidence.{name}': item for name, item in self.evidence.state().items()})
@@ -211,7 +249,8 @@ class ChangeTest:
         self.begun, self._last = state['begun'].copy(), state['last'].copy()
         self._products, self._level = state['lagged'].copy(), state['level'].copy()
         self._farthest, self._gone = state['farthest'].copy(), state['gone'].copy()
-        self._delayed = state['delayed'].copy()
+        self._delayed, self._blocks = state['delayed'].copy(), state['blocks'].copy()
+        self._filled = state['filled'].copy()
         self.evidence.restore({name.partition('.')[2]: item for name, item in state.items()
                                if name.startswith('evidence.')})
         self.bins = {}

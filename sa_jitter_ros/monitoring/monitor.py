@@ -128,13 +128,30 @@ class Baseline:
     What is known of a shaft at one speed, of means of a group of averages.
 
     `averages`, `mean` and `scatter` are arrays (channel, quantity), `covariance` (channel,
-    quantity, quantity). Indicators are logarithms.
+    quantity, quantity), of the values of a `MonitoredAverage`.
     """
 
     averages: FloatArray
     mean: FloatArray
     scatter: FloatArray
     covariance: FloatArray
+
+
+def _of_amplitude(change: float, error: float, doubt: float, square: float, least: float
+                  ) -> tuple[float, float, float]:
+    """
+    Return the relative change of an amplitude, its error and doubt, from those of its `square`.
+
+    Of an order that is not there the change is relative to the amplitude of its noise, whose
+    square is `least`.
+
+    >>> [round(item, 4) for item in _of_amplitude(0.21, 0.022, 0.002, 1.0, 1e-6)]
+    [0.1, 0.01, 0.001]
+    """
+    before, after = math.sqrt(max(square, 0.0)), math.sqrt(max(square + change, 0.0))
+    unit = math.sqrt(max(square, least)) or math.nan
+    return (after - before) / unit, error / (2.0 * max(after, 0.5 * unit) * unit), doubt / (
+        2.0 * unit**2)
 
 
 class _Group:
@@ -326,13 +343,14 @@ class ShaftMonitor:
         for place in np.flatnonzero(test.active[0]).tolist():
             channel, quantity = divmod(place, count)
             sequence, time = test.begun[:, test.size[0, place], 0, place].tolist()
-            change, variance, mean, freedom, doubt = (float(item[0, place]) for item in (
-                estimate.change, estimate.variance, estimate.baseline, estimate.freedom,
-                estimate.doubt))
+            change, variance, mean, noise, freedom, doubt = (float(item[0, place]) for item in (
+                estimate.change, estimate.variance, estimate.baseline, estimate.noise,
+                estimate.freedom, estimate.doubt))
             error = math.sqrt(variance)
             chance = float(2.0 * stats.t.sf(abs(change) / error, freedom))
             if quantity < len(self.layout.orders):
-                change, error, doubt = (item / abs(mean) for item in (change, error, doubt))
+                least = math.sqrt(noise * self.settings.group_averages)
+                change, error, doubt = _of_amplitude(change, error, doubt, mean, least)
             else:
                 change, error = math.expm1(change), error * math.exp(change)
             if not (math.isfinite(change) and math.isfinite(sequence)):

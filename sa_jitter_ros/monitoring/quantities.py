@@ -11,8 +11,10 @@
 """
 The numbers of an average that are monitored: corrected order amplitudes and condition indicators.
 
-Amplitudes are monitored as they are, because noise adds to them; indicators by their logarithms,
-because they are ratios and moments, whose scatter is relative.
+Amplitudes are monitored by their squares less those that the noise alone makes. These do not
+depend on the noise, also for weak and absent orders, where more noise makes a larger amplitude.
+Indicators are monitored by their logarithms, because they are ratios and moments, whose scatter is
+relative.
 """
 
 from dataclasses import dataclass
@@ -66,8 +68,9 @@ class MonitoredAverage:
     """
     The monitored quantities of one average, each array (channel, quantity), NaN where unknown.
 
-    `values` are amplitudes, then logarithms of indicators; `noise` are their published variances
-    without, and `doubt` the published errors of the correction for the keyphasor alone.
+    `values` are squares of amplitudes without noise, then logarithms of indicators; `noise` are
+    their published variances without, and `doubt` the published errors of the correction for the
+    keyphasor alone.
     """
 
     header: AverageHeader
@@ -133,12 +136,14 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
                        / np.where(total > 0.0, total, np.nan))
     corrected = np.isfinite(amplitude).any(axis=1, keepdims=True) if count else np.zeros(
         (channels, 1), np.bool_)
+    own = np.nan_to_num(noise) ** 2
+    square = amplitude**2 - 2.0 * own
     found = MonitoredAverage(
         amplitudes.header, Layout(channels, tuple(table[0, :, 0].tolist()) if channels else (),
                                   names),
-        np.concatenate((amplitude, np.log(values)), axis=1),
-        np.concatenate((noise**2, variance), axis=1),
-        np.concatenate((doubt, relative * power), axis=1))
+        np.concatenate((square, np.log(values)), axis=1),
+        np.concatenate((4.0 * own * np.maximum(square + own, own), variance), axis=1),
+        np.concatenate((2.0 * amplitude * doubt, relative * power), axis=1))
     for array in (found.values, found.noise, found.doubt):
         array[~(np.isfinite(array) & corrected)] = np.nan
     return found

@@ -136,9 +136,11 @@ class SpeedBin:
         Return the scores of values, and their weights as part of the baseline.
 
         `noise` is the published variance of the values, `doubt` how far each of them may be off
-        for one reason that stays. What either is more than in the baseline widens the scatter, or
-        is taken from the deviation. `spread` is how many times the variance of a mean is that of
-        the mean of independent values. Scores are NaN before the baseline has two values.
+        for one reason that stays. What the noise is more than in the baseline widens the scatter.
+        The scores are three: of the values as they are, of changes up, and of changes down, from
+        whose deviation is taken what the doubt is more. `spread` is how many times the variance of
+        a mean is that of the mean of independent values. Scores are NaN before the baseline has
+        two values.
         """
         self.reference = np.where(np.isnan(self.reference), values, self.reference)
         known = self.baseline()
@@ -148,8 +150,9 @@ class SpeedBin:
         usual = np.stack((known.noise, known.doubt))
         more = np.where(now > _AT_ONCE * usual, now, self.recent)
         more = np.nan_to_num(np.where(more > _IN_THE_MEAN * usual, more - usual, 0.0))
-        deviation = values - known.mean
-        deviation = np.sign(deviation) * np.maximum(np.abs(deviation) - more[1], 0.0)
+        deviation = np.broadcast_to(values - known.mean, (3, *values.shape))
+        if more[1].any():
+            deviation = deviation + np.stack((np.zeros(values.shape), -more[1], more[1]))
         variance = known.variance * (1.0 + spread / np.maximum(known.count, 1.0)) + more[0]
         scores = normal_scores(deviation / np.sqrt(variance), np.maximum(known.count - 1.0, 1.0))
         chance = _SURE_SKEWNESS * np.sqrt(6.0 / np.maximum(known.count, 1.0))
@@ -182,13 +185,14 @@ class SpeedBin:
         shifted = values - self.reference
         one = np.where(np.isnan(values), 0.0, 1.0)
         rows = np.nan_to_num(np.stack((one, shifted, shifted**2, one)))
-        faded = np.concatenate((fading * self.since[:3], fading**2 * self.since[3:]))
-        self.since = np.where(none, 0.0, faded + rows[:, None])
+        self.since[:3] *= fading
+        self.since[3] *= fading**2
+        self.since += np.where(none, 0.0, rows[:, None])
 
     def settle(self, none: BoolArray) -> None:
         """Make what is learned the state before a change where none has begun."""
-        self.before = np.where(none, self.learned[:, None], self.before)
-        self.since = np.where(none, 0.0, self.since)
+        np.copyto(self.before, self.learned[:, None], where=none)
+        np.copyto(self.since, 0.0, where=none)
 
     def take_out(self, changed: BoolArray, size: NDArray[np.int64]) -> None:
         """Take what came since the beginning of a change of a size out of the baseline."""

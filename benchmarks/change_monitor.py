@@ -1,0 +1,238 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+False alarms of the change monitor, and how soon it finds a growing fault.
+
+`python benchmarks/change_monitor.py` prints the tables of `docs/change_monitor.md`. The averages
+of many machines are drawn from their laws, one every ten minutes: amplitudes of orders with
+complex noise, indicators with normal and with skewed scatter, and a load that moves the orders.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.monitoring.change_test import ChangeTest
+from sa_jitter_ros.monitoring.monitor import Settings, YEAR
+
+FloatArray = NDArray[np.float64]
+
+INTERVAL = 600.0  # s between averages
+MONTH = YEAR / 12.0
+SETTINGS = Settings()
+#: Groups of averages in a month and in a year.
+GROUPS = round(MONTH / INTERVAL / SETTINGS.group_averages)
+SCORES_PER_ALARM = YEAR / INTERVAL / SETTINGS.group_averages / SETTINGS.false_alarms_per_year
+CHANNELS = 2
+#: Amplitudes of orders, their noise, and the relative scatter of indicators: normal, skewed.
+AMPLITUDES = {'order, noise 1 %': 1.0, 'order, noise 10 %': 0.1, 'absent order': 0.0}
+NOISE = 0.01
+INDICATORS = {'indicator, scatter 1 %': 0.01, 'indicator, skewed, scatter 30 %': 0.3}
+KINDS = (*AMPLITUDES, *INDICATORS)
+_SHAPE = 11.0  # of the gamma distribution of skewed indicators: scatter 0.3, skewness 0.6
+
+
+@dataclass
+class Machines:
+    """
+    Machines with `count` units; each draws groups of averages of its quantities.
+
+    `load` is the relative scatter of a load that moves all amplitudes and remembers `memory`
+    averages (1: none). The noise is `noise` times the usual, and the published errors say so.
+    """
+
+    count: int
+    seed: int
+    load: float = 0.0
+    memory: float = 1.0
+    noise: float = 1.0
+    growth: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Start without a fault."""
+        self._rng = np.random.default_rng(self.seed)
+        self.growth = np.zeros((self.count, CHANNELS * len(KINDS)))
+        self._load = self._rng.standard_normal((self.count, 1))
+
+    def _loads(self) -> FloatArray:
+        """Return the load of a group of averages, (average, unit, 1)."""
+        kept = 1.0 - 1.0 / self.memory
+        found = []
+        for _ in range(SETTINGS.group_averages):
+            self._load = kept * self._load + math.sqrt(1.0 - kept**2) * self._rng.standard_normal(
+                self._load.shape)
+            found.append(self._load)
+        return 1.0 + self.load * np.array(found)
+
+    def group(self) -> tuple[FloatArray, FloatArray]:
+        """Return the mean of a group of averages (unit, quantity), and its published variance."""
+        rng, size = self._rng, SETTINGS.group_averages
+        true = np.tile(list(AMPLITUDES.values()), CHANNELS)
+        count, noise = len(true), NOISE * self.noise
+        loads = self._loads()
+        true = true + np.where(true > 0.0, true, NOISE) * self.growth[:, :count]
+        shape = (size, self.count, count)
+        amplitudes = np.abs(loads * true + noise * (
+            rng.standard_normal(shape) + 1j * rng.standard_normal(shape)))
+        squares = amplitudes**2 - 2.0 * noise**2
+        half = (size, self.count, CHANNELS)
+        normal, skewed = INDICATORS.values()
+        indicators = np.concatenate((
+            self.noise * normal * rng.standard_normal(half),
+            np.log(rng.gamma(_SHAPE, 1.0 / _SHAPE, half))), axis=2) + np.log1p(
+                self.growth[:, count:])
+        values = np.concatenate((squares, indicators), axis=2).mean(axis=0)
+        published = np.concatenate((
+            4.0 * noise**2 * (np.tile(list(AMPLITUDES.values()), CHANNELS) ** 2 + noise**2),
+            np.full(CHANNELS, (self.noise * normal) ** 2),
+            np.full(CHANNELS, skewed**2))) / size
+        return values, np.broadcast_to(published, values.shape)
+
+
+class Watch:
+    """The test of many machines; `take` draws the next averages and returns who alarms."""
+
+    def __init__(self, machines: Machines) -> None:
+        self.machines = machines
+        self.test = ChangeTest(machines.growth.shape, learning=SETTINGS.learning_groups)
+        self._doubt = np.zeros(machines.growth.shape)
+        self._number = 0
+
+    def take(self) -> NDArray[np.bool_]:
+        """Return which quantities (unit, quantity) are found changed now, and begin again."""
+        values, published = self.machines.group()
+        mark = (float(self._number), 0.0)
+        self._number += 1
+        found, _ = self.test.update(0, values, published, self._doubt, mark, SCORES_PER_ALARM)
+        again = found.any(axis=1)
+        if again.any():
+            self.test.active[again] = False
+            self.test.evidence.ratios[:, again] = self.test.evidence.sums[:, again] = 0.0
+        return found
+
+
+@dataclass(frozen=True)
+class Case:
+    """What machines do that do not change; `later` is the factor of the noise from half time."""
+
+    name: str
+    load: float = 0.0
+    memory: float = 1.0
+    later: float = 1.0
+
+
+CASES = (
+    Case('steady machine'),
+    Case('load scatters by 2 %', 0.02),
+    Case('load scatters by 2 %, remembers 10 averages', 0.02, 10.0),
+    Case('load scatters by 2 %, remembers 50 averages', 0.02, 50.0),
+    Case('keyphasor exchanged for one with twice the noise', later=2.0),
+)
+
+
+def false_alarms(case: Case, months: int, years: float, seed: int) -> tuple[int, float]:
+    """Return the number of false alarms, and the years that machines were watched for."""
+    count = max(round(months / 12.0 / years), 1)
+    watch = Watch(Machines(count, seed, case.load, case.memory))
+    length, found = round(12.0 * years * GROUPS), 0
+    for number in range(SETTINGS.learning_groups + length):
+        if number == SETTINGS.learning_groups + length // 2:
+            watch.machines.noise = case.later
+        found += int(watch.take().any(axis=1).sum())
+    return found, count * length / (12.0 * GROUPS)
+
+
+def false_alarm_table(months: int, years: float, seed: int) -> Iterator[str]:
+    """Iterate over the lines of the table of false alarms."""
+    yield '| machine | months | false alarms | a year |'
+    yield '|---|---|---|---|'
+    for number, case in enumerate(CASES):
+        found, watched = false_alarms(case, months, years, seed + number)
+        yield (f'| {case.name} | {12.0 * watched:.0f} | {found} | {found / watched:.2f} ± '
+               f'{math.sqrt(max(found, 1)) / watched:.2f} |')
+
+
+def detections(count: int, seed: int) -> Iterator[tuple[str, float, float, bool]]:
+    """
+    Iterate over faults of machines: kind of quantity, growth a month, days until found, found.
+
+    A fault is in any quantity with equal probability, begins at any time in the second to fourth
+    month, and grows linearly, from 1 % to 100 % a month with equal probability of its logarithm. A
+    machine whose alarm came before its fault began is left out. An absent order grows in units of
+    its noise.
+    """
+    rng = np.random.default_rng(seed)
+    watch = Watch(Machines(count, seed + 1, load=0.01))
+    place = rng.integers(0, CHANNELS * len(KINDS), count)
+    begin = rng.uniform(1.0, 4.0, count) * GROUPS
+    growth = 10.0 ** rng.uniform(-2.0, 0.0, count)
+    end, false = np.full(count, math.nan), np.zeros(count, np.bool_)
+    unit = np.arange(count)
+    for number in range(10 * GROUPS):
+        watch.machines.growth[unit, place] = growth * np.maximum(number - begin, 0.0) / GROUPS
+        found = watch.take()
+        alarmed = found.any(axis=1) & np.isnan(end)
+        false |= alarmed & (number < begin)
+        end[alarmed & found[unit, place]] = number
+        if not np.isnan(end[~false]).any():
+            break
+    names = [*(name for _ in range(CHANNELS) for name in AMPLITUDES),
+             *(name for name in INDICATORS for _ in range(CHANNELS))]
+    days = (end - begin) / GROUPS * MONTH / 86400.0
+    for item in np.flatnonzero(~false).tolist():
+        known = bool(np.isfinite(days[item]))
+        yield (names[place[item]], float(growth[item]),
+               float(days[item]) if known else math.inf, known)
+
+
+def detection_table(count: int, seed: int) -> Iterator[str]:
+    """Iterate over the lines of the table of growing faults."""
+    bands = ((0.01, 0.03), (0.03, 0.1), (0.1, 0.3), (0.3, 1.0))
+    faults = [*detections(count, seed)]
+    yield '| fault in | ' + ' | '.join(
+        f'{100.0 * low:.0f} to {100.0 * high:.0f} % a month' for low, high in bands) + ' |'
+    yield '|---|' + '---|' * len(bands)
+    for kind in KINDS:
+        cells = []
+        for low, high in bands:
+            some = [(days, growth) for name, growth, days, _ in faults
+                    if name == kind and low <= growth < high]
+            days = np.array([item[0] for item in some])
+            size = 100.0 * np.array([item[1] for item in some]) * days * 86400.0 / MONTH
+            cells.append(f'{np.median(days):.1f} d, {np.median(size):.1f} % '
+                         f'({np.quantile(days, 0.9):.1f} d)' if len(some) > 4 else '')
+        yield f'| {kind} | ' + ' | '.join(cells) + ' |'
+    yield ''
+    yield f'{len(faults)} faults, {sum(item[3] for item in faults)} found'
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--months', type=int, default=2400,
+                        help='simulated months of each machine; 0: no table')
+    parser.add_argument('--years', type=float, default=8.0, help='years that a machine runs')
+    parser.add_argument('--faults', type=int, default=600, help='growing faults; 0: no table')
+    parser.add_argument('--seed', type=int, default=1000)
+    options = parser.parse_args()
+    if options.months:
+        for line in false_alarm_table(options.months, options.years, options.seed):
+            print(line, flush=True)
+        print()
+    if options.faults:
+        print('\n'.join(detection_table(options.faults, options.seed)), flush=True)
+
+
+if __name__ == '__main__':
+    main()
