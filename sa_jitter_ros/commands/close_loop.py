@@ -64,7 +64,7 @@ def main(args: Sequence[str] | None = None) -> int:
             progress.step('writing the report')
             found.write(options.output)
     except (SaJitterError, OSError) as error:
-        print(f'close_loop: {failure(error, options.output)}', file=sys.stderr)
+        progress.say(failure(error, options.output))
         return 2
     return show('close_loop', found, f'report: {options.output / "report.html"}')
 

@@ -145,8 +145,8 @@ def _found(content: Mapping[str, Json]) -> Iterator[str]:
     found = list(findings(content))
     if found or content['remarks']:
         yield '<h2>What was found</h2>'
-    for effect, meaning in found:
-        yield f'<p><b>{_kept(effect)}</b><br>{escape(meaning)}</p>'
+    for meaning, effect in found:
+        yield f'<p><b>{escape(meaning)}</b><br>{_kept(effect)}</p>'
     for remark in content['remarks']:
         yield f'<p>Note: {escape(remark)}.</p>'
 

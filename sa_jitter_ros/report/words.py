@@ -83,13 +83,14 @@ def _equals(probability: Json) -> str:
 
 
 def findings(content: Mapping[str, Json]) -> Iterator[tuple[str, str]]:
-    """Iterate over what was found: the effect with its numbers, and what that means."""
+    """Iterate over what was found: what it means, and the effect with its numbers."""
     for item in content['missing_effects']:
-        meaning = _sentence(EFFECTS[item['name']].meaning) if item['name'] in EFFECTS else ''
+        kind = EFFECTS.get(item['name'])
+        text = f'{item["name"]}: {parameters_text(item, content["unit"])}.'
         if item['indistinguishable_from']:
             others = _listed(item['indistinguishable_from'], 'or')
-            meaning += f' It may also be {others}: these data do not tell them apart.'
-        yield f'{item["name"]}: {parameters_text(item, content["unit"])}', meaning.strip()
+            text += f' It may also be {others}: these data do not tell them apart.'
+        yield _sentence((kind.meaning or kind.summary) if kind else item['name']), text
 
 
 def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
