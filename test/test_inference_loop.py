@@ -32,6 +32,7 @@ from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.html_report import report_files
 from sa_jitter_ros.report.report import report, summary
+from sa_jitter_ros.report.words import next_steps
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
@@ -349,6 +350,8 @@ def test_where_nothing_can_be_compared_the_report_says_why(made, model, reason, 
     files = report_files(found, content)
     assert set(files) == {'report.json', 'report.html'}
     assert b'nothing could have been seen' in files['report.html']
+    remedy = content['remarks'][-1].rpartition('; ')[2]
+    assert next_steps(content) == [f'{remedy[0].upper()}{remedy[1:]}.']
 
 
 def test_pulses_that_are_not_resolved_have_large_standard_errors(rng):

@@ -123,8 +123,7 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
                      f'an amplitude by {percent_text(_LARGEST)} or more. A longer recording '
                      'can.')
     if not content['lines']:
-        steps.append('Declare orders that stand above the noise, use a quieter channel, or record '
-                     'a better keyphasor beside this one (reference_pulse_times).')
+        steps += [_sentence(remark.rpartition('; ')[2]) for remark in content['remarks'][-1:]]
     return steps or ['Nothing: predictions of the declared model hold for this machine.']
 
 
