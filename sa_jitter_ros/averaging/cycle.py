@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
 from sa_jitter_ros.pulses.resampling import (
-    impulse_response, interpolate, interpolate_between, margin)
+    impulse_response, interpolate_between, margin)
 from scipy.fft import next_fast_len
 from scipy.interpolate import CubicSpline
 
@@ -41,6 +41,8 @@ ComplexArray = NDArray[np.complex128]
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
 _SMALL_GRID = 64  # points of a cycle up to which its amplitudes are one plain product
+# Samples in front of a cycle where its positions begin, which are thus positive.
+_AHEAD = 1 << 12
 #: Points on either side of a pulse that have a share in the amplitudes of both cycles.
 EDGE = 8
 _EDGE_POWERS = 10  # of the polynomials through the shares: exact to 1e-8
@@ -99,35 +101,37 @@ class CycleSamples:
         """Return some of the cycles."""
         return replace(self, first=self.first + first, count=end - first)
 
-    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0) -> FloatArray:
+    def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
+           kept: NDArray[np.bool_] | None = None) -> FloatArray:
         """
         Return values (point, channel) at fractions `u` of every cycle, cycle after cycle.
 
-        `u` (u,) are the same in all cycles, or (cycle, u) those of each, of which NaN are left
-        out. They may lie somewhat outside of the cycle.
+        `u` (u,) are the same in all cycles, or (cycle, u) those of each; they may lie somewhat
+        outside of the cycle. `kept` (cycle, u) are those that are wanted, None for all.
         """
         pulses = (self.pulses - self.start_time) * self.rate
-        # Positions in a cycle count from the sample in front of it, so that they do not depend on
+        # Positions in a cycle count from a sample in front of it, so that they do not depend on
         # the cycles that are resampled together.
-        origins = np.floor(pulses[self.first:self.first + self.count])
+        origins = np.floor(pulses[self.first:self.first + self.count]) - _AHEAD
         positions = run_times(law, pulses, self.first, origins, u)
         if self.ripple:
-            positions = positions - self.rate * self.ripple * u * (1.0 - u)
-        before = origins - self.first_index
-        whole = np.floor(positions)
-        fraction = positions - whole
-        index = np.add(whole, before[:, None], out=whole)
-        if u.ndim == 2:
-            index, fraction = index[~np.isnan(u)], fraction[~np.isnan(u)]
-        return interpolate_between(self.samples, index.ravel().astype(np.int32), fraction.ravel(),
-                                   method=method, cutoff=cutoff)
+            positions -= self.rate * self.ripple * u * (1.0 - u)
+        index = positions.astype(np.int32)
+        fraction = np.subtract(positions, index, out=positions)
+        index += (origins - self.first_index).astype(np.int32)[:, None]
+        if kept is not None:
+            index, fraction = index[kept], fraction[kept]
+        return interpolate_between(self.samples, index.ravel(), fraction.ravel(), method=method,
+                                   cutoff=cutoff)
 
     def end(self, *, method: str) -> FloatArray:
         """Return the values (channel,) at the last pulse."""
         pulse = (self.pulses[self.first + self.count] - self.start_time) * self.rate
-        last = min(pulse - self.first_index, len(self.samples) - 1.0)
-        return np.asarray(
-            interpolate(self.samples, np.array([max(last, 0.0)]), method=method)[0])
+        origin = math.floor(pulse) - _AHEAD  # so that it rounds as the begin of the next cycle
+        index = int(pulse - origin)
+        return np.asarray(interpolate_between(
+            self.samples, np.array([index + origin - self.first_index], np.int32),
+            np.array([pulse - origin - index]), method=method)[0])
 
     @property
     def first_index(self) -> int:

@@ -271,8 +271,9 @@ class ShaftAverager:
         if self._needs_edges(n) and cutoff == 1.0:
             return self._resample_uneven(cycles, points)
         u = points.fractions()
-        u[np.arange(u.shape[1]) >= points.number[:, None]] = np.nan
-        self._add_points(points, cycles.at(self._law, u, method=method, cutoff=cutoff))
+        inside = np.arange(u.shape[1]) < points.number[:, None]
+        self._add_points(points, cycles.at(
+            self._law, u, method=method, cutoff=cutoff, kept=inside))
         return self._project(cycles, size)
 
     def _project(self, cycles: CycleSamples, size: int,

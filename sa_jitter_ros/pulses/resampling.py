@@ -201,6 +201,13 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
                      polynomials)
 
 
+@lru_cache(maxsize=8)
+def _steps(taps: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the steps from the first to every weight of `_PIECE` sums, and where each begins."""
+    return (np.tile(np.arange(taps, dtype=np.int32), _PIECE),
+            np.arange(0, taps * _PIECE + 1, taps, dtype=np.int32))
+
+
 def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArray,
               polynomials: FloatArray) -> FloatArray:
     """Return the weighted sums of the samples from `begin` (m,) on, for each `fraction` (m,)."""
@@ -208,8 +215,7 @@ def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArra
     channels, size = samples.shape[1], min(begin.size, _PIECE)
     values = np.zeros((begin.size, channels))
     powers, weights = np.ones((order, size)), np.empty((size, taps))
-    steps = np.tile(np.arange(taps, dtype=np.int32), size)
-    rows = np.arange(0, taps * size + 1, taps, dtype=np.int32)
+    steps, rows = _steps(taps)
     for start in range(0, begin.size, size):
         count = min(size, begin.size - start)
         power = powers[:, :count]
@@ -221,7 +227,7 @@ def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArra
         columns = np.repeat(begin[start:start + count], taps)
         columns += steps[:columns.size]
         # What csr_matrix calls for a product, without its checks, which take as long here.
-        matrix = count, len(samples), rows, columns, weights.reshape(-1)
+        matrix = count, len(samples), rows[:count + 1], columns, weights.reshape(-1)
         found = values[start:start + count].reshape(-1)
         if channels == 1:
             _sparsetools.csr_matvec(*matrix, samples.reshape(-1), found)
