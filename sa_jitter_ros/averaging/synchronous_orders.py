@@ -75,10 +75,11 @@ class LineSearch:
         points, count, _ = samples.shape
         first = max(count - _SEARCHED_CYCLES, 0) // 2
         part = samples[:, first:first + _SEARCHED_CYCLES]
-        part = part - part.mean(axis=(0, 1))
-        window = np.sin(pi * np.arange(points) / points) ** 2
+        mean, window = part.mean(axis=(0, 1)), np.sin(pi * np.arange(points) / points) ** 2
+        spectra = np.empty((points // 2 + 1, *part.shape[1:]), np.complex128)
         # A taper over the cycles keeps strong orders from showing at their neighbours.
-        spectra = rfft(part * np.multiply.outer(window, _taper(part.shape[1]))[:, :, None], axis=0)
+        for cycle, share in enumerate(_taper(part.shape[1])):
+            spectra[:, cycle] = rfft((part[:, cycle] - mean) * (share * window)[:, None], axis=0)
         top = 0.4 * points / cycle_length
         others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
@@ -99,8 +100,9 @@ class LineSearch:
         lines = self._lines(errors, g)
         power = np.abs(lines) ** 2
         # With repeated values at the border order 1 could not exceed its background.
-        background = np.maximum(median_filter(power, size=(_NEIGHBOURHOOD, 1), mode='reflect'),
-                                np.finfo(float).tiny)
+        background = np.maximum(np.stack([
+            median_filter(row, size=_NEIGHBOURHOOD, mode='reflect')
+            for row in np.ascontiguousarray(power.T)], axis=1), np.finfo(float).tiny)
         level = np.median(background, axis=0)
         contrast = np.max(power / background, axis=1)
         telling = np.max((g**2)[:, None] * power / level, axis=1)
@@ -119,10 +121,9 @@ class LineSearch:
 
         What is far below the level of `significant_orders` need not be fitted.
         """
-        count = self.spectra.shape[1]
-        series = np.zeros((len(g), *self.spectra.shape[1:]), np.complex128)
-        for weight, spectra in self._lobes(errors, g, tapered=False):
-            series += weight[:, :, None] * spectra
+        _, count, channels = self.spectra.shape
+        series = np.array([np.einsum('bk,bkc->kc', weight, spectra) for weight, spectra in
+                           self._lobes(errors, g, tapered=False)]).reshape(-1, count, channels)
         if count < 2:
             return np.ones(len(g), np.bool_)
         mean = series.mean(axis=1)
@@ -162,31 +163,31 @@ class LineSearch:
         return np.asarray(np.abs(self._lines(errors, g, tapered=tapered)) ** 2)
 
     def _lines(self, errors: FloatArray, g: FloatArray, *, tapered: bool = True) -> ComplexArray:
-        line = np.zeros((len(g), self.spectra.shape[2]), np.complex128)
-        for weight, spectra in self._lobes(errors, g, tapered=tapered):
-            line += np.einsum('gk,gkc->gc', weight, spectra)
-        return line
+        channels = self.spectra.shape[2]
+        # The bins around an order are one piece of memory, so that this is a product.
+        return np.array([weight.ravel() @ spectra.reshape(-1, channels) for weight, spectra in
+                         self._lobes(errors, g, tapered=tapered)]).reshape(-1, channels)
 
     def _lobes(self, errors: FloatArray, g: FloatArray, *, tapered: bool
                ) -> Iterator[tuple[ComplexArray, ComplexArray]]:
-        """Yield weights (order, cycle) and bins (order, cycle, channel), whose products add up."""
-        count = self.spectra.shape[1]
+        """Yield weights (bin, cycle) and bins (bin, cycle, channel) around each order."""
+        lines, count, _ = self.spectra.shape
         errors = errors[self.first:self.first + count + 1]
         angle = self.cycle_length * (self.first + np.arange(count)) + errors[:-1]
-        position = np.outer(g, self.cycle_length + np.diff(errors))
         nearest = np.rint(g * self.cycle_length).astype(np.intp)
-        beside = position - nearest[:, None]
-        beside[np.abs(beside - np.rint(beside)) < _POLE] += 2.0 * _POLE
-        phase = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + beside)) * (
-            0.5 / pi * np.sin(pi * beside) / (1.0 if tapered else _taper(count)))
-        for offset in range(-_MAIN_LOBE, _MAIN_LOBE + 1):
-            bins = nearest + offset
-            # Hann's lobe 0.5 sin(pi x) / (pi x (1 - x^2)) times exp(-j pi x): the signs that an
-            # offset gives to both cancel.
-            x = beside - offset
-            weight = phase / (x * (1.0 - x * x))
-            weight[(bins < 0) | (bins >= len(self.spectra))] = 0.0
-            yield weight, self.spectra.take(bins, axis=0, mode='clip')
+        x = np.outer(g, self.cycle_length + np.diff(errors)) - nearest[:, None]
+        x[np.abs(x - np.rint(x)) < _POLE] += 2.0 * _POLE
+        # Hann's lobe 0.5 sin(pi x) / (pi x (1 - x^2)) times exp(-j pi x): the signs that an offset
+        # gives to both cancel.
+        common = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + x)) * np.sin(pi * x) / (2.0 * pi)
+        if not tapered:
+            common = common / _taper(count)
+        x = x[:, None] - np.arange(-_MAIN_LOBE, _MAIN_LOBE + 1)[:, None]
+        weights = common[:, None] / (x * (1.0 - x) * (1.0 + x))
+        for near, weight in zip(nearest.tolist(), weights):
+            begin, end = max(near - _MAIN_LOBE, 0), min(near + _MAIN_LOBE + 1, lines)
+            shift = _MAIN_LOBE - near
+            yield weight[begin + shift:max(end, begin) + shift], self.spectra[begin:end]
 
 
 def _taper(count: int) -> FloatArray:
