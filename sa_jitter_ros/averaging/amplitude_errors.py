@@ -62,6 +62,11 @@ _ROUNDING = 1e-9
 # No limit is more than so many times the amplitude: jitter that leaves less leaves no information.
 _LEAST_LEFT = 0.02
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
+# Noise of a weak order beside leakage that jitter explains: least share of its scatter, and rounds
+# of its estimate.
+_LEAST_NOISE, _ROUNDS = 1e-3, 8
+# Degrees of freedom of what jitter shortens, the square of its variance, for each of the variance.
+_GUESSED = 0.67
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -227,12 +232,12 @@ class Repeatability:
 
     @classmethod
     def of(cls, cycles: ComplexArray, clean: ComplexArray, orders: FloatArray,
-           jitter: float | None = None) -> 'Repeatability':
+           jitter: float | None = None, *, cycle_length: float = 1.0) -> 'Repeatability':
         """
         Return that of amplitudes (cycle, channel, order) of trigger cycles.
 
         `clean` are the same without the leakage between the orders; `jitter` is known, or None:
-        the cycles show it. Errors are NaN for one cycle.
+        the cycles show it. `cycle_length` is r. Errors are NaN for one cycle.
         """
         count = len(cycles)
         if count < 2:
@@ -258,10 +263,18 @@ class Repeatability:
         # Jitter shortens a phasor in proportion to the square of its turn.
         shortened = _ALONG * (1.0 - _OWN / count) * turned**2 / size**2
         noise = np.maximum(scatter.noise - shortened / _COMMON, 0.0)
+        guessed_from = np.inf if jitter is not None or count >= _MANY else (
+            _GUESSED * (count - 1.0))
         along = np.sqrt(widened(np.sqrt(noise / count), scatter.freedom) ** 2
-                        + shortened / count + scatter.leaked**2)
-        return cls(orders, along, np.hypot(widened(np.sqrt(across / count), freedom),
-                                           scatter.leaked), float(np.sqrt(variance)))
+                        + widened(np.sqrt(shortened / count), guessed_from) ** 2
+                        + scatter.leaked**2)
+        across = np.hypot(widened(np.sqrt(across / count), freedom), scatter.leaked)
+        if variance > 0.0 and shows.any() and not shows.all() and count > 2:
+            own, turned = _weak_noise(scatter, orders, shows, variance, cycle_length)
+            beside = np.hypot(own, scatter.leaked)
+            along = np.where(shows, along, np.minimum(along, beside))
+            across = np.where(shows, across, np.minimum(across, np.hypot(beside, turned)))
+        return cls(orders, along, across, float(np.sqrt(variance)))
 
     def errors(self, amplitudes: ComplexArray, least_jitter: float = 0.0) -> AmplitudeErrors:
         """
@@ -302,6 +315,63 @@ def corrected_errors(cycles: ComplexArray, clean: ComplexArray, orders: FloatArr
     common = 2.0 * pi * orders * jitter / np.sqrt(len(cycles) + 1.0)
     along = np.sqrt(noise**2 + size**2 * (unsure**2 + _MODEL**2))
     return AmplitudeErrors.of(amplitudes, along, np.hypot(noise, size * common), largest=largest)
+
+
+def _weak_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], variance: float,
+                cycle_length: float) -> tuple[FloatArray, FloatArray]:
+    """
+    Return the standard errors (channel, order) of means that noise and jitter of others give.
+
+    Jitter of a pulse makes an order that `shows` leak into all others, with opposite signs in the
+    two cycles beside it: the scatter of the cycles shows much of it, their mean little. What the
+    spectrum of the scatter has beyond it is noise (maximum likelihood). The second result is what
+    jitter, of this `variance`, turns the orders themselves.
+    """
+    count = len(scatter.radial)
+    power = 0.5 * (_spectrum(scatter.radial) + _spectrum(scatter.tangential))
+    omega = 2.0 * pi * np.arange(1, len(power) + 1) / count
+    expected, mean = np.zeros(power.shape), np.zeros(power.shape[1:])
+    sources = np.where(shows, scatter.mean, 0.0)
+    signed = np.concatenate((orders, -orders))
+    size = 2.0 * pi * signed * np.concatenate((sources, np.conj(sources)), axis=1)
+    begin, end = _leak(signed[:, None] - orders, cycle_length)
+    turns = np.mod(cycle_length * (signed[:, None] - orders), 1.0)
+    for turn in np.unique(np.round(turns, 6)):
+        same = np.isclose(np.mod(turns - turn + 0.5, 1.0), 0.5, atol=1e-6, rtol=0.0)
+        first, last = (size @ np.where(same, item, 0.0) for item in (begin, end))
+        for sign in (1.0, -1.0):
+            wave = np.exp(1j * (sign * omega - 2.0 * pi * turn))[:, None, None]
+            expected += 0.25 * variance * np.abs(first + last * wave) ** 2
+        both = first + last * np.exp(-2j * pi * turn)
+        mean += 0.5 * variance / count**2 * (
+            np.abs(first) ** 2 + np.abs(last) ** 2 + (count - 1.0) * np.abs(both) ** 2)
+    noise = np.maximum(power.mean(axis=0), _TINY)
+    least = _LEAST_NOISE * noise
+    for _ in range(_ROUNDS):
+        weight = np.where(power < _OUTLIER * (noise + expected), 1.0, 0.0) / (
+            noise + expected) ** 2
+        noise = np.maximum(np.sum(weight * (power - expected), axis=0)
+                           / np.maximum(weight.sum(axis=0), _TINY), least)
+    freedom = 4.0 * np.sum((noise / (noise + expected)) ** 2, axis=0)
+    own = np.hypot(widened(np.sqrt(noise / count), freedom), np.sqrt(mean))
+    return own, 2.0 * pi * orders * np.abs(scatter.mean) * math.sqrt(variance / count)
+
+
+def _leak(apart: FloatArray, cycle_length: float
+          ) -> tuple[ComplexArray, ComplexArray]:
+    """
+    Return what the errors at both ends of a cycle give to an order that is `apart` from another.
+
+    These are the integrals of (1 - u) and of u times exp(j 2 pi r apart u) over the cycle; zero
+    for an order itself.
+    """
+    angle = 2.0 * pi * cycle_length * apart
+    near = np.abs(angle) < 1e-9
+    angle = np.where(near, 1.0, angle)
+    turned = np.exp(1j * angle)
+    whole = (turned - 1.0) / (1j * angle)
+    rising = (turned - whole) / (1j * angle)
+    return (np.where(near, 0.0, whole - rising), np.where(near, 0.0, rising))
 
 
 def _total_variance(scatter: Scatter, turn: FloatArray, shows: NDArray[np.bool_]) -> float:

@@ -129,7 +129,8 @@ class CorrectingAverager:
             raw = average.cycle_amplitudes
             errors = Repeatability.of(
                 raw, _clean(average, raw, self.settings), average.orders,
-                _in_cycles(correction.jitter_std, average, self.settings)).errors(
+                _in_cycles(correction.jitter_std, average, self.settings),
+                cycle_length=self.settings.cycle_length).errors(
                     average.amplitudes)
         return replace(average, correction=correction, amplitude_errors=errors)
 

@@ -464,7 +464,8 @@ class ShaftAverager:
             cycles = self._window()
             clean = without_leakage(cycles, orders, cycle_length,
                                     cycle_length * np.array(self._numbers))
-            self._noise = radial_noise(clean), Repeatability.of(cycles, clean, np.array(orders))
+            self._noise = radial_noise(clean), Repeatability.of(
+                cycles, clean, np.array(orders), cycle_length=cycle_length)
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise
 
