@@ -220,11 +220,11 @@ def detection_table(count: int, seed: int) -> Iterator[str]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--months', type=int, default=2400,
-                        help='simulated months of each machine; 0: no table')
-    parser.add_argument('--years', type=float, default=8.0, help='years that a machine runs')
-    parser.add_argument('--faults', type=int, default=600, help='growing faults; 0: no table')
-    parser.add_argument('--seed', type=int, default=1000)
+    parser.add_argument('--months', type=int, default=1000,
+                        help='simulated months of each row; 0: no table')
+    parser.add_argument('--years', type=float, default=4.0, help='years that a machine runs')
+    parser.add_argument('--faults', type=int, default=400, help='growing faults; 0: no table')
+    parser.add_argument('--seed', type=int, default=2024)
     options = parser.parse_args()
     if options.months:
         for line in false_alarm_table(options.months, options.years, options.seed):

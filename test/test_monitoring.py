@@ -18,12 +18,17 @@ import zipfile
 from drawn_machine import DrawnMachine as Machine, LEVELS, SECONDS, SETTINGS
 import numpy as np
 import pytest
+import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.indicators import GearSettings
+from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
 from sa_jitter_ros.monitoring.change_test import ChangeTest
 from sa_jitter_ros.monitoring.evidence import Evidence, threshold
+from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Settings, YEAR
 from sa_jitter_ros.monitoring.quantities import monitored
+from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
 
 # --- false alarms --------------------------------------------------------------------------------
 
@@ -424,3 +429,40 @@ def test_full_disk_and_unwritable_folder_keep_the_older_file(kept, monkeypatch):
         write_baseline(path / 'below.npz', 'pump 3', {'input': monitor}, SETTINGS)
     write_baseline(path, 'pump 3', {'input': monitor}, SETTINGS)
     assert path.read_bytes() != before
+
+
+# --- with true averages --------------------------------------------------------------------------
+
+
+def averages_of(rate, *, seed, seconds=75.0, damaged=False):
+    """Return the arrays of averages of a simulated gear whose keyphasor is sampled at a rate."""
+    harmonics = [1.0, 0.55 if damaged else 0.5, 0.25]
+    gear = Gearbox(
+        mesh('input', 19, harmonics=harmonics), 12e3, shafts={'input': 2.40789},
+        speed=[(0.0, 16.6)], seed=seed, effects=[
+            DeclaredJitter('uniform', 1.0 / rate / np.sqrt(12.0)), AdditiveNoise(0.3)])
+    results = ShaftResults(GearSettings([19]))
+    for average in sa.average(
+            gear.vibration(0, int(12e3 * seconds)), 12e3, gear.pulses(0.0, seconds).times,
+            ratio=2.40789, trigger_cycles=12, orders=[11.0, 19.0, 38.0, 57.0],
+            correct_jitter=True, keyphasor_rate=rate):
+        yield results.of(average)
+
+
+@pytest.mark.machines
+def test_exchanged_keyphasor_of_a_simulated_gear_is_no_change_and_damage_is():
+    monitor = MachineMonitor('gear', ['input'], Settings(learning_averages=80, group_averages=4))
+
+    def watch(**options):
+        return [line for arrays in averages_of(**options) for kind in KINDS if kind in arrays
+                for line in monitor.take('input', kind, arrays[kind])]
+    assert watch(rate=20e3, seed=1) + watch(rate=20e3, seed=2) == []
+    assert monitor.is_complete
+    # order 57 keeps a fifth of its amplitude in the raw average
+    assert watch(rate=2e3, seed=3) + watch(rate=2e3, seed=4) == []
+    lines = watch(rate=2e3, seed=5, damaged=True)
+    assert any(line.startswith('order 38 of input, channel 0: +') for line in lines)
+    found = {item.name: item for item in monitor.changes()}
+    assert found['38'].change == pytest.approx(0.1, abs=4.0 * found['38'].standard_error)
+    assert found['38'].keyphasor_share < 0.01
+    assert not {'11', '19', '57'} & found.keys()

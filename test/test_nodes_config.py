@@ -88,7 +88,8 @@ def test_sections_describe_the_same_machine():
 
 
 def test_nodes_of_the_machine_file_find_the_truth_of_its_simulator(ros_graph):
-    names = ('synchronous_averager', 'jitter_predictor', 'residual_analyser', 'live_view')
+    names = ('synchronous_averager', 'jitter_predictor', 'residual_analyser', 'live_view',
+             'change_monitor')
     changes = {'residual_analyser': {'acquisitions': 12}, 'live_view': {'port': 0}}
     for name in names:
         add(ros_graph, name, **changes.get(name, {}))
@@ -147,10 +148,11 @@ CHAIN = 'from sa_jitter_ros.commands.chain import main; raise SystemExit(main())
 def test_chain_runs_its_nodes_in_one_process(process_environment):
     process = subprocess.Popen(
         [sys.executable, '-c', CHAIN, '--params', str(MACHINE), '--with', 'live_view',
+         'change_monitor',
          '--ros-args', '-p', 'port:=0', '-p', 'trigger_cycles:=12'],
         env=process_environment, text=True, stderr=subprocess.PIPE)
     lines = []
-    while sum('started' in line for line in lines) < 4:
+    while sum('started' in line for line in lines) < 5:
         lines.append(process.stderr.readline())
         assert lines[-1], ''.join(lines)
     process.send_signal(signal.SIGTERM)
@@ -158,7 +160,7 @@ def test_chain_runs_its_nodes_in_one_process(process_environment):
     assert process.returncode == 0, errors
     text = ''.join(lines)  # -p wins over the section of the node
     assert '[synchronous_averager]: started: averages 12 trigger cycles of input' in text
-    for name in ('jitter_predictor', 'residual_analyser', 'live_view'):
+    for name in ('jitter_predictor', 'residual_analyser', 'live_view', 'change_monitor'):
         assert f'[{name}]: started' in text
 
 

@@ -37,7 +37,7 @@ BoolArray = NDArray[np.bool_]
 LEAST_LEARNED = 8
 # Correlation counts from so many standard errors on, and up to the largest. Scores show it so many
 # values later: those of a sudden change, which are alike, are found before they count.
-_SURE_CORRELATION, _LARGEST_CORRELATION, _DELAY = 1.0, 0.95, 16
+_SURE_CORRELATION, _LARGEST_CORRELATION, _DELAY = 2.0, 0.95, 16
 # Values over which sums show slow unsteadiness, and for each of `SIZES` how many of these lengths
 # count: to find a change takes the longer, the smaller it is.
 _LENGTHS, _SLOW, _LEAST_BLOCKS = (32, 256), (2, 1, 2, 1, 0, 0), 4
@@ -157,7 +157,7 @@ class ChangeTest:
         found = np.ones((1 + len(_LENGTHS), *self.shape))
         for place, (_, number, total) in enumerate(self._blocks):
             ratio = total / np.maximum(number, 1.0)
-            sure = ratio > 1.0 + np.sqrt(2.0 / np.maximum(number, 1.0))
+            sure = ratio > 1.0 + _SURE_CORRELATION * np.sqrt(2.0 / np.maximum(number, 1.0))
             found[place + 1] = np.maximum(found[place], np.where(
                 sure & (number >= _LEAST_BLOCKS), ratio, 1.0))
         return found[list(_SLOW)]
