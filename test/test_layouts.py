@@ -44,6 +44,7 @@ TABLES = {
     '/prediction': (len(fields(PredictionMessage)) - 1, PREDICTION_FIELDS),
     '/residual': (len(fields(ResidualMessage)) - 1, RESIDUAL_FIELDS)}
 SPEED = '/shaft_speed'
+TEXTS = '/missing_effect', '/change'  # JSON
 WAVEFORMS = ('/shaft/synchronous_average', '/shaft/corrected_average')
 # Title, and per curve the topic, the field and the row (order of channel 0, or channel).
 PLOTS = {
@@ -125,11 +126,14 @@ def foxglove() -> str:
     right = [plot('Waveform of one revolution', [
         (f'{topic}.data[{start}:]', text)
         for topic, text in zip(WAVEFORMS, ('raw', 'corrected'))], 'index')]
-    panels['RawMessages!missing_effect'] = {'topicPath': '/missing_effect.data'}
+    texts = []
+    for topic in TEXTS:
+        texts.append(f'RawMessages!{topic[1:]}')
+        panels[texts[-1]] = {'topicPath': f'{topic}.data'}
     panels['DiagnosticSummary!all'] = {
         'topicToRender': '/diagnostics', 'minLevel': 0, 'pinnedIds': [], 'hardwareIdFilter': '',
         'sortByLevel': True}
-    right += ['RawMessages!missing_effect', 'DiagnosticSummary!all']
+    right += [*texts, 'DiagnosticSummary!all']
     return json.dumps({
         'configById': panels, 'globalVariables': {}, 'userNodes': {},
         'playbackConfig': {'speed': 1},
@@ -157,7 +161,8 @@ def topics():
     context = Context()
     context.init(args=[])
     try:
-        for name in ('synchronous_averager', 'jitter_predictor', 'residual_analyser'):
+        for name in ('synchronous_averager', 'jitter_predictor', 'residual_analyser',
+                     'change_monitor'):
             node = node_class(name)(context=context)
             found |= {publisher.topic_name for publisher in node.publishers}
             assert name != 'synchronous_averager' or len(
@@ -189,7 +194,7 @@ def test_foxglove_shows_published_topics_in_every_panel(topics):
     shown = {path.partition('.')[0] for path in paths} | {
         panel[key].partition('.')[0] for panel in panels.values()
         for key in ('topicPath', 'topicToRender') if key in panel}
-    assert shown == {SPEED, '/missing_effect', '/diagnostics', *WAVEFORMS, *TABLES} <= topics
+    assert shown == {SPEED, '/diagnostics', *TEXTS, *WAVEFORMS, *TABLES} <= topics
     assert sorted(leaves(layout['layout'])) == sorted(panels)
 
 
