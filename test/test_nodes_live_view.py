@@ -391,6 +391,7 @@ def test_snapshot_has_a_limited_size(bench, rng):
     part = b.part('shaft/order_amplitude')
     assert np.shape(part['order']) == (board.CHANNELS, board.ORDERS)
     assert len(part['history']) == 1
+    assert b.part('shaft/synchronous_average')['count'] == 100
     channels = b.part('shaft/synchronous_average')['channels']
     assert np.shape(channels) == (board.CHANNELS, board.ALL_POINTS // board.CHANNELS)
 

@@ -283,10 +283,11 @@ def rounded(values: FloatArray) -> FloatArray:
 
 
 def waveform_content(average: AverageMessage) -> Json:
-    """Return a waveform: header, points per revolution, curves by channel."""
+    """Return a waveform: header, points per revolution, number of channels, curves of most."""
     shown = average.values[:CHANNELS]
     points = int(np.clip(ALL_POINTS // max(len(shown), 1), 200, CURVE_POINTS))
     return {'header': header_content(average.header), 'points': average.values.shape[1],
+            'count': len(average.values),
             'channels': json_values(rounded(envelope(shown, points)))}
 
 

@@ -23,7 +23,8 @@ export function drawWaveforms() {
     chart.render();
   }
   find('waveform-axes').textContent = raw ? `vibration [${unit()}] over the angle of `
-    + `${find('shaft').value} [degrees]` : '';
+    + `${find('shaft').value} [degrees]` + (raw.count > count
+      ? `; the first ${count} of ${raw.count} channels` : '') : '';
 }
 
 function drawWaveform(chart, place) {
