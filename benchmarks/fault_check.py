@@ -34,6 +34,7 @@ AMPLITUDE = 5e-4  # of the largest value: error of an amplitude by band-limited 
 POINT = 4e-3  # the same of a point of the waveform with samples on one side only
 BELIEVED = 0.04  # of the pitch: pulses displaced by more must not be used
 LONGEST = 60  # trigger cycles of an exponential average that are computed
+MOST_DROPPED = 3  # teeth of an average that are dropped beside those with a fault
 RUNS = 8  # latest runs among which the source of an average is looked for
 LIMIT = 6.0  # standard errors: two of a thousand million normal variables are farther out
 MEAN = 1e-12  # s that recovered errors may be off on average: rounding
@@ -145,31 +146,41 @@ class ShaftChecker:
         exponential = values['averaging'] == 'exponential'
         longest = LONGEST if exponential else count
         found: Place | str = ''
-        for used in self._used_swapped(run, last - longest * step, last):
-            pulses = self._pulses(run, first, last, step, values, longest, used)
+        for dropped, used in self._possible(run, last - longest * step, last, values):
+            pulses = self._pulses(run, first, last, step, values, longest, dropped, used)
             found = pulses if isinstance(pulses, str) else self._agrees(
                 Window(run, pulses, r, count), amplitude, waveform, values, first)
             if isinstance(found, Place):
                 break
         return found
 
-    def _used_swapped(self, run: Run, begin: int, end: int) -> Iterator[set[int]]:
+    def _possible(self, run: Run, begin: int, end: int, values: Mapping[str, Any]
+                  ) -> Iterator[tuple[set[int], set[int]]]:
         """
-        Iterate over what may be used of the swapped teeth.
+        Iterate over what the validation may have made of faults: teeth dropped, and swapped used.
 
-        The tooth behind came before it, and waits: either of the two is out of order.
+        The tooth behind a swapped one came before it, and waits: either is out of order. Of two
+        teeth, one of which is displaced or a stray, neither may be certain: where missing ones are
+        bridged, it matters that both are.
         """
-        swapped = [tooth for tooth in run.swapped if begin <= tooth + 1 and tooth <= end]
-        for count in range(len(swapped) + 1 if self._delivered else 1):
-            yield from map(set, combinations(swapped, count))
+        options: list[tuple[int, bool]] = []
+        if self._delivered:
+            options += [(tooth + 1, True) for tooth in run.swapped if begin - 1 <= tooth <= end]
+        if values['missing_pulses'] == 'bridge':
+            options += [(tooth + beside, False) for tooth in run.faults(begin - 1, end + 1)
+                        for beside in (-1, 0, 1)]
+        for count in range(min(len(options), MOST_DROPPED) + 1):
+            for chosen in combinations(options, count):
+                yield ({tooth for tooth, _ in chosen},
+                       {tooth - 1 for tooth, swapped in chosen if swapped})
 
     def _pulses(self, run: Run, first: int, last: int, step: int, values: Mapping[str, Any],
-                longest: int, used: set[int]) -> FloatArray | str:
+                longest: int, dropped: set[int], used: set[int]) -> FloatArray | str:
         """Return the pulses (tau) of as many usable cycles as end at `last`, at least these."""
         pitch = 1.0 / (TEETH * run.speed)
-        absent = set(run.missing)
+        absent = run.missing | dropped
         if self._delivered:
-            absent |= (run.undelivered - used) | {tooth + 1 for tooth in used}
+            absent |= run.undelivered - used
         absent |= {tooth for tooth, late in run.displaced.items() if abs(late) > BELIEVED * pitch}
         gaps = absent if values['missing_pulses'] == 'break' else set()
         begin = max(last - longest * step, 0)

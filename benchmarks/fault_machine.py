@@ -115,18 +115,25 @@ class Run:
         """
         Return the tooth whose pulse has this header time (s), or None.
 
-        That of one that is missing, displaced or swapped may be half way between its neighbours.
+        That of one beside a fault may be interpolated between the pulses around it.
         """
         tau = time - self.clock
         tooth = round((tau - self.first_tooth) * TEETH * self.speed)
         if tooth < 0:
             return None
-        exact = [self.times(np.array([tooth]))[0]]
-        if (tooth in self.missing or tooth in self.undelivered or tooth in self.displaced
-                or tooth - 1 in self.swapped):
-            exact.append(self.times(np.array([tooth - 1, tooth + 1])).mean())
+        before, last, exact, following, after = self.times(np.arange(tooth - 2, tooth + 3))
+        times = [exact]
+        if self.faults(tooth - 2, tooth + 2):
+            times += [0.5 * (last + following), (2.0 * last + after) / 3.0,
+                      (before + 2.0 * following) / 3.0]
         # to the nanosecond in messages, and as absolute times round
-        return tooth if min(abs(item - tau) for item in exact) < 3e-9 + 2e-15 * abs(time) else None
+        return tooth if min(abs(item - tau) for item in times) < 3e-9 + 2e-15 * abs(time) else None
+
+    def faults(self, first: int, last: int) -> list[int]:
+        """Return the teeth, from `first` to `last`, with a fault or a stray beside them."""
+        beside = {round((stray - self.first_tooth) * TEETH * self.speed) for stray in self.strays}
+        every = beside.union(self.missing, self.undelivered, self.displaced)
+        return sorted(tooth for tooth in every if first <= tooth <= last)
 
     def sent(self, begin: float, end: float) -> bool:
         """Whether all vibration in a span (tau) was sent and could be used."""

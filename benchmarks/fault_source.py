@@ -236,8 +236,7 @@ class FaultySource:
             bad.data[place] = float(rng.choice(wrong))
             return [bad, good]
         if kind == 'not finite':
-            samples = block.samples.copy()
-            samples[int(rng.integers(len(samples)))] = rng.choice([np.nan, np.inf, -np.inf])
+            samples = np.full_like(block.samples, rng.choice([np.nan, np.inf, -np.inf]))
             return [encode_samples(replace(block, samples=samples))]
         if kind == 'channels':
             return [encode_samples(replace(block, samples=np.vstack((

@@ -57,8 +57,9 @@ class Averager:
     The averages depend on the data only: not on the sizes of the blocks, and not on whether pulses
     come before or after their samples. An average contains consecutive trigger cycles only, unless
     `maximum_discarded` (0 to 1) lets up to this share of N_t discarded ones lie between them.
-    NaN and infinite samples are a gap; stray pulses are dropped; cycles with displaced, late or
-    missing pulses are discarded. `messages` describes what was discarded, `counts` counts it.
+    Samples that are NaN or infinite in all channels are a gap, in one of them they cost this
+    channel alone, which is NaN; stray pulses are dropped; cycles with displaced, late or missing
+    pulses are discarded. `messages` describes what was discarded, `counts` counts it.
     Samples wait for their pulses, and pulses for their samples, up to `buffer_seconds`: set a
     limit if one of the two may fail. Raises `ParameterError` for parameters that cannot be used.
 

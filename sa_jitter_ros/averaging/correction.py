@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected_errors,
                                                       Repeatability)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
+from sa_jitter_ros.averaging.channel_gaps import ChannelGaps, telling
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
@@ -46,7 +47,7 @@ _CLEAR, _WEAK, _CAUTION = 0.0118, 0.015, 3.0
 _SURE, _AMBIGUOUS = 0.05, 0.3
 # Evidence that noise has by chance, how fast more of it is rarer, and what noise never has.
 _DOUBT, _DECAY, _EVIDENT = 2.0, 3.0, 10.0
-_TINY = float(np.finfo(np.float64).tiny)
+_TINY = 1e-150  # whose square is not 0
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(6), (1.0, 0.0)))
 
 
@@ -60,6 +61,7 @@ class CorrectingAverager:
     def __init__(self, settings: AverageSettings) -> None:
         self._shaft = ShaftAverager(settings)
         self._cycles: list[CycleSamples] = []
+        self._gaps = ChannelGaps()
 
     @property
     def settings(self) -> AverageSettings:
@@ -69,6 +71,7 @@ class CorrectingAverager:
     def reset(self) -> bool:
         """Begin again at angle 0; return whether an unfinished average was lost."""
         self._cycles.clear()
+        self._gaps = ChannelGaps()
         return self._shaft.reset()
 
     def skip(self, count: int) -> bool:
@@ -78,6 +81,7 @@ class CorrectingAverager:
     def change(self, settings: AverageSettings) -> bool:
         """Continue at the same angle with other settings; return whether an average was lost."""
         self._cycles.clear()
+        self._gaps = ChannelGaps()
         return self._shaft.change(settings)
 
     def margin(self, period: float, rate: float) -> int:
@@ -97,15 +101,14 @@ class CorrectingAverager:
     def update(self, cycles: CycleSamples) -> Average | None:
         """Take cycles, not more than `room`; return the average and its correction when due."""
         average = self._shaft.update(cycles)
-        if not self._keeps_cycles:
-            return average
-        self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
+        self._gaps.take(cycles)
+        if self._keeps_cycles:
+            self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
         return self._completed(average)
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
-        average = self._shaft.finish()
-        return self._completed(average) if self._keeps_cycles else average
+        return self._completed(self._shaft.finish())
 
     @property
     def _keeps_cycles(self) -> bool:
@@ -117,9 +120,11 @@ class CorrectingAverager:
         cycles, self._cycles = self._cycles, []
         if self.settings.correct_jitter:
             average = self._corrected(average, cycles)
-        if average.correction is None or not average.correction.accepted:
+        if self._keeps_cycles and (
+                average.correction is None or not average.correction.accepted):
             average = replace(average, envelope=_envelope(average, cycles, self.settings))
-        return average
+        return self._gaps.blank(average, averaging=self.settings.averaging,
+                                trigger_cycles=self.settings.trigger_cycles)
 
     def _corrected(self, average: Average, cycles: list[CycleSamples]) -> Average:
         correction = correct_average(average, cycles, self.settings)
@@ -292,9 +297,28 @@ def _recovered(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSe
         recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
         additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
-    if not raw.discarded_cycles:
-        return recover(grid, periods=raw.periods), grid
-    return _recovered_over_gaps(raw, grid, recover, settings.cycle_length), grid
+    told = telling(grid, cycles)
+    if not told.any():
+        told[:] = True
+    seen = grid[..., told]
+    if raw.discarded_cycles:
+        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[told]), seen, recover,
+                                     settings.cycle_length)
+    else:
+        found = recover(seen, periods=raw.periods)
+    return _of_all_channels(found, told), grid
+
+
+def _of_all_channels(recovery: PulseErrorRecovery, told: NDArray[np.bool_]) -> PulseErrorRecovery:
+    """Return what was recovered from the channels that `told` (channel,) as one of all."""
+    if told.all():
+        return recovery
+    shape = told.size, recovery.orders.size
+    amplitudes = np.zeros(shape, np.complex128)
+    noise, aligned = np.full(shape, np.nan), np.full(shape, np.nan)
+    amplitudes[told], noise[told], aligned[told] = (
+        recovery.amplitudes, recovery.noise, recovery.aligned)
+    return replace(recovery, amplitudes=amplitudes, noise=noise, aligned=aligned)
 
 
 def _recovered_over_gaps(raw: Average, grid: FloatArray,

@@ -45,6 +45,7 @@ _SMALL_GRID = 64  # points of a cycle up to which its amplitudes are one plain p
 _AHEAD = 1 << 12
 #: Points on either side of a pulse that have a share in the amplitudes of both cycles.
 EDGE = 8
+_BESIDE = 32  # samples on either side of a cycle that may lie in its averages
 _EDGE_POWERS = 10  # of the polynomials through the shares: exact to 1e-8
 _LARGE = 1 << 61  # of what integers of 64 bits hold
 
@@ -58,7 +59,8 @@ class CycleSamples:
     are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
     are those that the angle law uses; the `count` cycles begin at `pulses[first]`. With a speed
     ripple inside the cycles the shaft passes the fraction u of one by `ripple` u (1 - u) s earlier
-    than the angle law says.
+    than the angle law says. The channels `lacking` (cycle,) samples in or beside a cycle have 0 in
+    their place; empty if there are none.
     """
 
     samples: FloatArray
@@ -69,6 +71,7 @@ class CycleSamples:
     lead: float = 0.0
     ripple: float = 0.0
     count: int = 1
+    lacking: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
     def cut(cls, samples: FloatArray, *, start_time: float, rate: float, pulses: FloatArray,
@@ -86,6 +89,18 @@ class CycleSamples:
         return cls(samples[begin:math.ceil(high) + margin + 1], start_time, rate, pulses, first,
                    lead=(offset + begin) / rate, ripple=ripple, count=count)
 
+    def without_gaps(self) -> 'CycleSamples':
+        """Return the same cycles with 0 for NaN."""
+        gaps = np.isnan(self.samples)
+        if not gaps.any():
+            return self
+        at = (self.edges - self.start_time) * self.rate - self.first_index
+        begins = np.maximum(np.floor(at[:-1]).astype(np.int64) - _BESIDE, 0)
+        ends = np.ceil(at[1:]).astype(np.int64) + _BESIDE
+        lacking = tuple(tuple(np.flatnonzero(gaps[begin:end].any(axis=0)).tolist())
+                        for begin, end in zip(begins.tolist(), ends.tolist()))
+        return replace(self, samples=np.where(gaps, 0.0, self.samples), lacking=lacking)
+
     @property
     def edges(self) -> FloatArray:
         """Return the pulses (s) between which the cycles lie."""
@@ -99,7 +114,8 @@ class CycleSamples:
 
     def part(self, first: int, end: int) -> 'CycleSamples':
         """Return some of the cycles."""
-        return replace(self, first=self.first + first, count=end - first)
+        return replace(self, first=self.first + first, count=end - first,
+                       lacking=self.lacking[first:end])
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
            kept: NDArray[np.bool_] | None = None) -> FloatArray:

@@ -435,6 +435,8 @@ class StreamingAverager:
         cycles = CycleSamples.cut(
             segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses, first=first,
             margin=margin, offset=segment.index - clock.index, count=count)
+        if segment.lacks_channels:
+            cycles = cycles.without_gaps()
         for name, shaft in self.shafts.items():
             try:
                 average = shaft.update(cycles)

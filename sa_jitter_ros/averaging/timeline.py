@@ -46,7 +46,9 @@ class SampleClock:
 
 class Segment:
     """
-    Consecutive finite samples on one clock, added at the end and removed at the start.
+    Consecutive samples on one clock, added at the end and removed at the start.
+
+    NaN is what a single channel lacks (`lacks_channels`).
 
     `epoch` is how often time ran back before this segment; `closed` means that no sample follows.
     Every sample is counted once: `use` marks it as averaged, `trim` returns how many samples were
@@ -56,6 +58,7 @@ class Segment:
     def __init__(self, clock: SampleClock, epoch: int, index: int, samples: FloatArray) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
         self._data = np.ascontiguousarray(samples.T)
+        self.lacks_channels = False
         self._begin, self._end = 0, len(self._data)
         self._index = self._settled = index  # samples before `_settled` are counted
         self._begins_run = index == clock.index
@@ -220,6 +223,7 @@ class VibrationTimeline:
     _clock: SampleClock | None = None
     _gap: tuple[int, int] = (0, 0)  # first index that is missing, and the next received one
     _ledger: SampleLedger = field(default_factory=SampleLedger)
+    _lacking: list[int] = field(default_factory=list)  # channels that lacked samples before
 
     @property
     def layout(self) -> tuple[int, float] | None:
@@ -431,25 +435,37 @@ class VibrationTimeline:
             self.segments[-1].closed = True
 
     def _store(self, samples: FloatArray, index: int) -> None:
-        """Keep the finite samples; others are a gap."""
+        """Keep the samples that at least one channel has; others are a gap."""
         assert self._clock is not None
         every = np.isfinite(samples)
         if every.all():
+            self._lacking = []
             self._put(samples, index)
             return
-        bad = int(np.count_nonzero(~every.all(axis=0)))
-        channels = np.flatnonzero(~every.all(axis=1)).tolist()
-        self.counts.non_finite += bad
+        some = every.any(axis=0)
+        self.counts.non_finite += int(np.count_nonzero(~every.all(axis=0)))
+        bad = int(np.count_nonzero(~some))
         self.counts.samples_dropped += bad
-        self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in '
-                             f'channels {channels}: their cycles are discarded')
-        spans = finite_spans(samples)
+        if bad:
+            self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in all '
+                                 'channels: their cycles are discarded')
+        self._name_channels(np.flatnonzero(~every[:, some].all(axis=1)).tolist(), index)
+        kept = np.where(every, samples, np.nan)
+        spans = finite_spans(np.where(some, 0.0, np.nan)[None])
         if not spans or spans[0][0] > 0:
             self._close()
         for begin, end in spans:
-            self._put(samples[:, begin:end], index + begin)
+            self._put(kept[:, begin:end], index + begin)
+            self.segments[-1].lacks_channels |= bool(self._lacking)
             if end < samples.shape[1]:
                 self._close()
+
+    def _name_channels(self, channels: list[int], index: int) -> None:
+        """Say which channels lack samples, when they begin to."""
+        if set(channels) - set(self._lacking):
+            self.messages.append(f'samples from index {index} on are NaN or infinite in channels '
+                                 f'{channels}: they have no average there')
+        self._lacking = channels
 
     def _put(self, samples: FloatArray, index: int) -> None:
         assert self._clock is not None

@@ -48,10 +48,12 @@ class ShaftOutput:
         if self._results.problem:
             self._node.warn(f'{self._name}: {self._results.problem}')
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])
-        for channel, is_constant in enumerate(constant.tolist()):
+        lacking = np.all(np.isnan(average.waveform), axis=1)
+        for channel, (is_constant, is_lacking) in enumerate(zip(constant, lacking)):
+            what = f'constant at {average.waveform[channel, 0]:.6g}' if is_constant else (
+                'NaN or infinite' if is_lacking and average.fundamental_cycles else '')
             self._node.set_missing(f'channel {channel} of vibration', (
-                f'constant at {average.waveform[channel, 0]:.6g}, look at its sensor and cable'
-                if is_constant else ''))
+                f'{what}, look at its sensor and cable' if what else ''))
         correction = average.correction
         refusal = '' if correction is None or correction.accepted else correction.reason
         self._node.set_missing(f'correction of {self._name}',
