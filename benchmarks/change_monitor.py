@@ -163,7 +163,8 @@ def false_alarm_table(months: int, years: float, seed: int) -> Iterator[str]:
                f'{math.sqrt(max(found, 1)) / watched:.2f} |')
 
 
-def detections(count: int, seed: int) -> Iterator[tuple[str, float, float, bool]]:
+def detections(count: int, seed: int, months: int = 10
+               ) -> Iterator[tuple[str, float, float, bool]]:
     """
     Iterate over faults of machines: kind of quantity, growth a month, days until found, found.
 
@@ -179,7 +180,7 @@ def detections(count: int, seed: int) -> Iterator[tuple[str, float, float, bool]
     growth = 10.0 ** rng.uniform(-2.0, 0.0, count)
     end, false = np.full(count, math.nan), np.zeros(count, np.bool_)
     unit = np.arange(count)
-    for number in range(10 * GROUPS):
+    for number in range(months * GROUPS):
         watch.machines.growth[unit, place] = growth * np.maximum(number - begin, 0.0) / GROUPS
         found = watch.take()
         alarmed = found.any(axis=1) & np.isnan(end)
@@ -208,13 +209,20 @@ def detection_table(count: int, seed: int) -> Iterator[str]:
         for low, high in bands:
             some = [(days, growth) for name, growth, days, _ in faults
                     if name == kind and low <= growth < high]
-            days = np.array([item[0] for item in some])
-            size = 100.0 * np.array([item[1] for item in some]) * days * 86400.0 / MONTH
-            cells.append(f'{np.median(days):.1f} d, {np.median(size):.1f} % '
-                         f'({np.quantile(days, 0.9):.1f} d)' if len(some) > 4 else '')
+            days = sorted(item[0] for item in some)
+            size = sorted(100.0 * item[0] * item[1] * 86400.0 / MONTH for item in some)
+            middle, late = len(some) // 2, 9 * len(some) // 10
+            cells.append('' if len(some) < 5 else 'not found' if math.isinf(days[middle]) else
+                         f'{days[middle]:.1f} d, {size[middle]:.1f} % ({_days(days[late])})')
         yield f'| {kind} | ' + ' | '.join(cells) + ' |'
     yield ''
-    yield f'{len(faults)} faults, {sum(item[3] for item in faults)} found'
+    yield (f'{len(faults)} faults, {sum(item[3] for item in faults)} found in the ten months '
+           'that were simulated')
+
+
+def _days(value: float) -> str:
+    """Return a number of days, or that there is none."""
+    return f'{value:.1f} d' if math.isfinite(value) else 'later'
 
 
 def main() -> None:

@@ -262,3 +262,16 @@ def test_soak_follows_memory_and_writes_its_page(process_environment, tmp_path):
     assert {'synchronous_averager', 'jitter_predictor', 'source'} == found['rss'].keys()
     assert '| jitter_predictor |' in page.read_text()
     assert (tmp_path / 'soak.png').exists()
+
+
+@pytest.mark.campaign
+def test_months_of_averages_are_simulated(benchmark):
+    monitor = benchmark('change_monitor')
+    found, years = monitor.false_alarms(monitor.CASES[0], 24, 0.5, seed=1)
+    assert years == pytest.approx(2.0, rel=0.01)
+    assert found <= years + 4.0 * np.sqrt(years)
+    faults = [*monitor.detections(30, seed=2, months=5)]
+    assert len(faults) >= 15  # others had an alarm before, one a year, or began later
+    quick = [days for kind, growth, days, known in faults
+             if kind == 'order, noise 1 %' and growth > 0.1]
+    assert all(days < 5.0 for days in quick)
