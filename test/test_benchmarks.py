@@ -114,6 +114,13 @@ def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
     assert raw.upper['absent'].mean() > 0.92
 
 
+@pytest.mark.campaign
+def test_average_is_timed_as_a_user_starts_it(benchmark):
+    found = benchmark('average_speed').measured(4.0, 1)
+    assert found.keys() == {'start', 'average', 'corrected'}
+    assert min(found.values()) > 0.0
+
+
 def test_methods_are_timed_in_turns(benchmark):
     calls = []
     timings = benchmark('timing').interleaved(
