@@ -64,7 +64,7 @@ _LEAST_LEFT = 0.02
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
 # Noise of a weak order beside leakage that jitter explains: least share of its scatter, and rounds
 # of its estimate.
-_LEAST_NOISE, _ROUNDS = 1e-3, 8
+_LEAST_NOISE, _ROUNDS = 0.03, 8
 # Degrees of freedom of what jitter shortens, the square of its variance, for each of the variance.
 _GUESSED = 0.67
 _TINY = float(np.finfo(np.float64).tiny)
