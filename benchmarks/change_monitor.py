@@ -157,10 +157,18 @@ def false_alarm_table(months: int, years: float, seed: int) -> Iterator[str]:
     """Iterate over the lines of the table of false alarms."""
     yield '| machine | months | false alarms | a year |'
     yield '|---|---|---|---|'
+    total = [0, 0.0]
     for number, case in enumerate(CASES):
         found, watched = false_alarms(case, months, years, seed + number)
-        yield (f'| {case.name} | {12.0 * watched:.0f} | {found} | {found / watched:.2f} ± '
-               f'{math.sqrt(max(found, 1)) / watched:.2f} |')
+        total = [total[0] + found, total[1] + watched]
+        yield _row(case.name, found, watched)
+    yield _row('all', int(total[0]), total[1])
+
+
+def _row(name: str, found: int, years: float) -> str:
+    """Return a row of the table of false alarms."""
+    return (f'| {name} | {12.0 * years:.0f} | {found} | {found / years:.2f} ± '
+            f'{math.sqrt(max(found, 1)) / years:.2f} |')
 
 
 def detections(count: int, seed: int, months: int = 10

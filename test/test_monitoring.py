@@ -321,6 +321,35 @@ def test_averages_that_are_not_corrected_or_overlap_are_left_out():
     assert (monitor.averages, monitor.overlapping) == (12, 3)
 
 
+def test_raw_amplitudes_are_monitored_on_request():
+    machine = Machine(14)
+    machine.corrected = False
+    settings = replace(SETTINGS, allow_uncorrected=True)
+    monitor, lines = MachineMonitor('pump 3', ['input'], settings), []
+    for number in range(600):
+        if number == 400:
+            machine.gain[1, 1] = 1.1
+        arrays = machine.messages()
+        arrays[0].values[..., 7] = arrays[0].values[..., 8] = 0.01
+        for kind, array in zip(KINDS, arrays):
+            lines += monitor.take('input', kind, array)
+    line, = lines
+    assert line.startswith('order 19 of input, channel 1: +')
+    monitor.use(SETTINGS)
+    for kind, array in zip(KINDS, machine.messages()):
+        monitor.take('input', kind, array)
+    assert monitor.monitors['input'].uncorrected == 1
+
+
+def test_average_without_indicators_keeps_none_waiting():
+    machine, monitor = Machine(15), MachineMonitor('pump 3', ['input'], SETTINGS)
+    for number in range(20):
+        for kind, array in zip(KINDS, machine.messages()):
+            if kind == 'order_amplitude' or number % 3 != 1:
+                monitor.take('input', kind, array)
+    assert monitor.averages == 19  # the last one, without indicators, waits for them
+
+
 def test_arrays_that_do_not_fit_are_refused():
     orders, indicators, errors = Machine(12).messages()
     with pytest.raises(MessageError, match='1 channels of indicators and 2 of orders'):

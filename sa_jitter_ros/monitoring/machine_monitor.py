@@ -30,9 +30,15 @@ _WITHOUT = 3
 
 
 class Pairing:
-    """Puts the arrays of one average together, which come on topics of their own."""
+    """
+    Puts the arrays of one average together, which come on topics of their own.
+
+    Each topic keeps its order: when an average is complete, those before it will not become more.
+    With `allow_uncorrected` raw amplitudes count where there are no corrected ones.
+    """
 
     def __init__(self) -> None:
+        self.allow_uncorrected = False
         self._waiting: dict[tuple[int, float], dict[str, AverageMessage]] = {}
 
     def add(self, kind: str, message: AverageMessage) -> list[MonitoredAverage]:
@@ -43,11 +49,13 @@ class Pairing:
         """
         key = message.header.sequence, message.header.start_time
         self._waiting.setdefault(key, {})[kind] = message
-        ready: list[dict[str, AverageMessage]] = []
-        while self._waiting and (len(self._waiting) > _WAITING or len(
-                next(iter(self._waiting.values()))) == len(KINDS)):
-            ready.append(self._waiting.pop(next(iter(self._waiting))))
-        return [monitored(*(parts.get(name) for name in KINDS))  # type: ignore[arg-type]
+        keys = [*self._waiting]
+        count = max(len(keys) - _WAITING, 0)
+        if len(self._waiting[key]) == len(KINDS):
+            count = max(count, keys.index(key) + 1)
+        ready = [self._waiting.pop(item) for item in keys[:count]]
+        return [monitored(parts[KINDS[0]], parts.get(KINDS[1]), parts.get(KINDS[2]),
+                          allow_uncorrected=self.allow_uncorrected)
                 for parts in ready if KINDS[0] in parts]
 
 
@@ -70,14 +78,17 @@ class MachineMonitor:
             self._others = {name: item for name, item in found.items() if name not in shafts}
         self._pairings = {shaft: Pairing() for shaft in shafts}
         self._without = dict.fromkeys(shafts, 0)
+        self.use(settings)
         #: Whether the latest average of each shaft had corrected amplitudes.
         self.corrected: dict[str, bool] = {}
         #: Whether the file lacks what is known now.
         self.unsaved = False
 
     def use(self, settings: Settings) -> None:
-        """Use another rate of false alarms."""
+        """Use another rate of false alarms, and take uncorrected averages or not."""
         self._settings = settings
+        for pairing in self._pairings.values():
+            pairing.allow_uncorrected = settings.allow_uncorrected
         for item in self.monitors.values():
             item.settings = settings
 
@@ -90,7 +101,7 @@ class MachineMonitor:
         """
         lines: list[str] = []
         for average in self._pairings[shaft].add(kind, message):
-            self.corrected[shaft] = average.is_corrected
+            self.corrected[shaft] = average.is_known
             monitor = self.monitors.get(shaft) or self._begin(shaft, average)
             if monitor is not None:
                 lines += monitor.update(average)
@@ -102,8 +113,8 @@ class MachineMonitor:
         if not average.layout.channels:
             raise MessageError('average of no channel: publish at least one')
         self._without[shaft] += 1
-        if not (average.is_corrected and (average.layout.indicators
-                                          or self._without[shaft] >= _WITHOUT)):
+        if not (average.is_known and (average.layout.indicators
+                                      or self._without[shaft] >= _WITHOUT)):
             return None
         self.monitors[shaft] = ShaftMonitor(
             shaft, average.layout, self._settings, share=1.0 / len(self.shafts))

@@ -45,6 +45,8 @@ PARAMETERS = (
               'ones are tested', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
     Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
               maximum=10000, read_only=True),
+    Parameter('allow_uncorrected', False, 'take raw amplitudes and indicators where an average '
+              'has no correction; then another keyphasor is a change, too'),
     Parameter('speed_bin', 0.05, 'relative width of a bin of speed, in each of which the machine '
               'has a baseline of its own', minimum=1e-4, maximum=1.0, read_only=True),
 )
@@ -58,6 +60,7 @@ class Settings:
     learning_averages: int = 200
     group_averages: int = 5
     speed_bin: float = 0.05
+    allow_uncorrected: bool = False
 
     def __post_init__(self) -> None:
         """Check that the baseline has enough groups."""
@@ -212,7 +215,7 @@ class ShaftMonitor:
         if header.start_time < self._end - 1e-9 and header.end_time > self._end:
             self.overlapping += 1
             return []
-        if not average.is_corrected:
+        if not average.is_known:
             self.uncorrected += 1
             return []
         key = self._bin_of(header.mean_trigger_speed)

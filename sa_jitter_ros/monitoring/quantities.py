@@ -80,8 +80,8 @@ class MonitoredAverage:
     doubt: FloatArray
 
     @property
-    def is_corrected(self) -> bool:
-        """Return whether the average has corrected amplitudes."""
+    def is_known(self) -> bool:
+        """Return whether the average has amplitudes that can be monitored."""
         return bool(np.isfinite(self.values[:, :len(self.layout.orders)]).any())
 
     def fitted(self, layout: Layout) -> 'MonitoredAverage | None':
@@ -107,11 +107,13 @@ class MonitoredAverage:
 
 
 def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
-              errors: AverageMessage | None = None) -> MonitoredAverage:
+              errors: AverageMessage | None = None, *, allow_uncorrected: bool = False
+              ) -> MonitoredAverage:
     """
     Return what is monitored of the arrays of one average.
 
-    Without corrected amplitudes all is unknown: what is not corrected shows the keyphasor, too.
+    Without corrected amplitudes all is unknown, because what is not corrected shows the keyphasor,
+    too. With `allow_uncorrected` the raw ones, with their standard errors, take their place.
     Raises MessageError for arrays whose channels or indicators differ.
     """
     table = amplitudes.values
@@ -128,6 +130,9 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
             variance = (errors.values / values) ** 2
     amplitude, error, noise = (table[..., _FIELD[name]] for name in (
         'corrected_amplitude', 'corrected_standard_error', 'noise_standard_deviation'))
+    if allow_uncorrected and not np.isfinite(amplitude).any():
+        amplitude, error = (table[..., _FIELD[name]]
+                            for name in ('raw_amplitude', 'raw_standard_error'))
     noise = np.fmin(noise, error)
     doubt = np.sqrt(np.maximum(error**2 - noise**2, 0.0))
     power = np.array([_POWERS.get(name, 1.0) for name in names])

@@ -167,7 +167,7 @@ class ChangeMonitor(MonitoringNode):
             self.set_missing(f'comparison of {shaft}', '' if latest else (
                 'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
                 'averager; if the averager refuses the correction (see its diagnostics), use a '
-                'better keyphasor'))
+                'better keyphasor, or allow_uncorrected: true if it will never be exchanged'))
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return what is learnt and how many quantities have changed."""
