@@ -48,7 +48,8 @@ class Run:
     What the loop reported of one machine.
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
-    right. `before` and `after` are RMS residuals less their standard errors, in quadrature;
+    right. Effects that are `present` change no average. `before` and `after` are RMS residuals less
+    their standard errors, in quadrature;
     `errors` are those of the parameters in stated standard errors.
     """
 
@@ -61,6 +62,7 @@ class Run:
     verdict: str
     noisy: bool
     found: tuple[str, ...]
+    present: tuple[str, ...]
     rivals: tuple[str, ...]
     before: float
     after: float
@@ -74,7 +76,7 @@ class Run:
         if set(self.effects) & set(UNKNOWN):
             return self.verdict == 'unexplained' and not self.found
         found = set(self.found) - ({'additive_noise'} if self.noisy else set())
-        return self.status == 0 and found == set(self.effects) and (
+        return self.status == 0 and found <= set(self.effects) <= found | set(self.present) and (
             self.verdict == ('traced' if self.found else 'none'))
 
 
@@ -111,13 +113,14 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
     if status:
         nan = float('nan')
         return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', False, (),
-                   (), nan, nan, nan, nan, {})
+                   (), (), nan, nan, nan, nan, {})
     found = report['missing_effects']
     chi2 = [float('nan') if value is None else value for value in (
         report[when]['chi2_per_dof'] for when in ('error_before', 'error_after'))]
     return Run(
         effects, seed, text, seconds, status, error.getvalue().strip(), report['verdict'],
         item.noise_colour > 0.0, tuple(one['name'] for one in found),
+        tuple(one['name'] for one in report['present']),
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
         _rms(report['error_before']), _rms(report['error_after']),
         *chi2,

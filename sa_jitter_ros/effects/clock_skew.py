@@ -21,6 +21,9 @@ from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
+_USUAL = 2e-3  # clocks seldom differ by more
+
+
 def _growing(setting: Setting) -> Array:
     """
     Return the delay in trigger periods of pulses whose clock began with that of the vibration.
@@ -42,7 +45,9 @@ class ClockSkew(Effect):
     meaning: ClassVar[str] = (
         'the clock of the pulses runs at another speed than that of the vibration')
     remedy: ClassVar[str] = 'time pulses and vibration by one clock'
-    timing: ClassVar[Pattern] = Pattern(_growing, show_in_times=False)
+    timing: ClassVar[Pattern] = Pattern(
+        _growing, show_in_times=False, usual=lambda setting: (
+            _USUAL * setting.model.trigger_period / setting.unit))
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
 

@@ -28,6 +28,7 @@ from sa_jitter_ros.prediction.influence import mean_period, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
+_USUAL = 5e-3  # s: filters and converters seldom delay by more
 _STEADY = 1e-4  # relative spread of the speed: below it a delay is a phase
 
 
@@ -51,7 +52,8 @@ class PathDelay(Effect):
         'the pulses come late by a constant time, which turns the phases as the speed '
         'changes')
     remedy: ClassVar[str] = 'give the delay to the averager (path_delay)'
-    timing: ClassVar[Pattern] = Pattern(_of_speed, show_in_times=False)
+    timing: ClassVar[Pattern] = Pattern(
+        _of_speed, show_in_times=False, usual=lambda setting: _USUAL / setting.unit)
     delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
                              's', minimum=-1.0, maximum=1.0)
 

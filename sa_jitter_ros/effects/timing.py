@@ -76,13 +76,16 @@ class Pattern:
 
     With `about` (value, tolerance) the size of the first column is a number that the effect
     prescribes. `replaces_jitter` says that the declared jitter is no longer of known size. Errors
-    that do not `show_in_times` are those of all pulses alike, relative to the vibration.
+    that do not `show_in_times` are those of all pulses alike, relative to the vibration; they may
+    absorb a part of what is none of them. `usual` returns the size that machines have, in units:
+    a normal prior, None for any size.
     """
 
     columns: Callable[[Setting], Array]
     about: tuple[float, float] | None = None
     replaces_jitter: bool = False
     show_in_times: bool = True
+    usual: Callable[[Setting], float] | None = None
 
 
 def relative_speed(setting: Setting) -> Array:

@@ -30,7 +30,7 @@ Array = NDArray[Any]
 
 METHODS = ('linear', 'cubic', 'spline')
 _PLACES = 32
-_CERTAIN = 1e-9
+_CERTAIN = 1e-6
 _OFF = 0.15  # depth beside that of samples at even places between the others
 _KNOWN = 0.05  # error of the shape
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise

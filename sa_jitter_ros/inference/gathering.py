@@ -12,19 +12,20 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
-from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
+from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
-from sa_jitter_ros.inference.tone import find_tone
+from sa_jitter_ros.inference.record_recovery import doubtful_lines
 from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import stats
@@ -35,7 +36,7 @@ _STRONG, _COHERENT = 0.2, 0.9
 _PRECISE = 0.25
 _CERTAIN = 1e-4
 _GROUPS = 3
-_RESOLVED = 1.5  # of what a stretch resolves: lines that may be one
+_LEAKS = 0.5  # lines of the average between which everything leaks
 # A clock this much faster than the declared one has no visible effect.
 _FINE = 50.0
 
@@ -176,26 +177,37 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
                      * model.fundamental_frequency / observation.sample_rate)
     evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
                        beat_gain=beat.gain)
-    times, angle = _middles(observation, shortest)
-    tone = find_tone(cycles[:len(times)], times, angle, evidence.order)
-    return replace(evidence, tone=None if _turns(observation, tone.frequency) else tone)
+    return replace(evidence, tone=_tone(observation, lines))
 
 
-def _turns(observation: Observation, frequency: float) -> bool:
-    """
-    Tell whether a tone is an order that certainly turns with the shaft.
-
-    Single cycles show an order at all lines of the trigger cycle away from it.
-    """
+def _tone(observation: Observation, lines: Lines) -> Tone | None:
+    """Return the line of no shaft that scatters an average most, None without one."""
     model = observation.model
-    for recovery in observation.recoveries:
-        for fit in recovery.fits:
-            orders = fit.orders[fit.declared:][fit.turning[fit.declared:]]
-            apart = model.cycle_length * (frequency / model.fundamental_frequency - orders)
-            away = np.abs(apart - np.rint(apart)) * (fit.errors.size - 1)
-            if np.any(away < _RESOLVED):
-                return True
-    return False
+    fit = max((fit for recovery in observation.recoveries for fit in recovery.fits),
+              key=lambda item: item.errors.size, default=None)
+    if fit is None:
+        return None
+    frequency = np.append(fit.orders * model.fundamental_frequency, fit.tones)
+    amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
+    chosen = np.flatnonzero(doubtful_lines(fit, model))
+    if not chosen.size:
+        return None
+    apart = frequency[chosen, None] - observation.orders[lines.order] * model.fundamental_frequency
+    level = np.abs(amplitudes[:, :fit.declared]).max(axis=1)
+    size = np.max(np.abs(amplitudes[:, chosen]) / level[:, None], axis=0)
+    # beyond half a line of the average all are taken to leak as the sides of a sinc do
+    leak = 1.0 / np.maximum(np.abs(apart) * model.duration, _LEAKS).min(axis=1)
+    best = int(chosen[np.argmax(size * leak)])
+    channel = int(np.argmax(np.abs(amplitudes[:, best]) / fit.amplitude_errors[:, best]))
+    amplitude = float(np.abs(amplitudes[channel, best]))
+    error = float(fit.amplitude_errors[channel, best])
+    power = float(np.sum((np.abs(amplitudes[:, best]) / fit.amplitude_errors[:, best]) ** 2))
+    duration = model.trigger_period * (fit.errors.size - 1)
+    # of a line that begins and ends: sqrt(12) errors of its phase over its duration
+    of_frequency = math.sqrt(12.0) * error / amplitude / (2.0 * np.pi * duration)
+    tried = 0.5 * observation.sample_rate * duration
+    return Tone(float(frequency[best]), amplitude, of_frequency, error, min(
+        1.0, tried * float(stats.chi2.sf(power, 2 * len(amplitudes)))))
 
 
 def _cycles(observation: Observation) -> Array:
@@ -203,24 +215,6 @@ def _cycles(observation: Observation) -> Array:
     shortest = min(len(item.cycles) for item in observation.acquisitions)
     return np.array([item.cycles[:shortest, :, :observation.orders.size]
                      for item in observation.acquisitions])
-
-
-def _middles(observation: Observation, cycles: int) -> tuple[Array, Array]:
-    """
-    Return time (s) and fundamental cycles (acquisition, cycle) of the middles of the cycles.
-
-    Of several recordings, whose clocks differ, only the first is used.
-    """
-    times, places = [], []
-    number = observation.pulses.number
-    for i, item in enumerate(observation.acquisitions):
-        if i and item.first <= observation.acquisitions[i - 1].first:
-            break
-        errors = np.where(np.isfinite(item.errors), item.errors, 0.0)
-        true = item.bridged - np.interp(np.arange(item.bridged.size), item.number, errors)
-        times.append(0.5 * (true[:-1] + true[1:])[:cycles])
-        places.append(number[item.first] + 0.5 + np.arange(cycles))
-    return np.array(times), np.array(places) * observation.model.cycle_length
 
 
 def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:

@@ -93,8 +93,10 @@ class RecordFit:
     2) are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
     `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
-    lines; `amplitudes` (channel, order) complex peak amplitudes. `turning` (order,) tells which
-    orders certainly turn with the shaft: the speed varies enough to show it. `jitter_std` (s) is
+    lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
+    amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
+    imaginary parts. `turning` (order,) tells which orders certainly turn with the shaft: the speed
+    varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s) is
     the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
     bends that the fit expected, towards 0.
     """
@@ -108,6 +110,8 @@ class RecordFit:
     orders: Array
     tones: Array
     amplitudes: ComplexArray
+    tone_amplitudes: ComplexArray
+    amplitude_errors: Array
     turning: BoolArray
     jitter_std: float
     expected_std: Array
@@ -545,14 +549,18 @@ class _States:
 
     def prune(self, least: float) -> None:
         """Take out undeclared lines whose amplitudes are noise."""
-        channels, lines = self.amplitudes.shape
-        schur = self.solved[2]
-        variance = np.diag(cho_solve(schur, np.eye(len(schur[0])))).reshape(channels, 2, lines)
-        power = np.abs(self.amplitudes) ** 2 / variance.mean(axis=1)
+        lines = self.amplitudes.shape[1]
+        power = np.abs(self.amplitudes) ** 2 / self._amplitude_variances()
         kept = (np.arange(lines) < self.declared) | (power.mean(axis=0) > 2.0 * least)
         orders, tones = np.split(kept, [self.orders.size])
         self.orders, self.tones = self.orders[orders], self.tones[tones]
         self.amplitudes = self.amplitudes[:, kept]
+
+    def _amplitude_variances(self) -> Array:
+        """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
+        schur = self.solved[2]
+        variance = np.diag(cho_solve(schur, np.eye(len(schur[0]))))
+        return np.asarray(variance.reshape(len(self.amplitudes), 2, -1).mean(axis=1))
 
     # --- what comes out ---
 
@@ -577,7 +585,8 @@ class _States:
         return RecordFit(
             errors, np.sqrt(self._variances(0)), self._autocovariance(), bends, bend_errors,
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
-            self._turning(), float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
+            self.amplitudes[:, self.orders.size:],
+            np.sqrt(self._amplitude_variances()), self._families(self._turning()), float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
 
     def _autocovariance(self) -> Array:
         """Return the mean posterior autocovariance of the pulse errors about their mean."""
@@ -597,6 +606,15 @@ class _States:
         return np.asarray(np.mean(
             found[each, np.arange(chosen.size)[:, None]] - shared[each]
             - shared[chosen][:, None] + mean, axis=0))
+
+    def _families(self, turning: BoolArray) -> BoolArray:
+        """Return which orders turn: sidebands as far from declared lines, or from 0, turn alike."""
+        near = np.append(self.orders[:self.declared], 0.0)
+        distance = np.abs(self.orders[self.declared:, None] - near).min(axis=1)
+        alike = np.abs(distance[:, None] - distance) * self.span < _APART
+        found = turning.copy()
+        found[self.declared:] = np.any(alike & turning[self.declared:], axis=1)
+        return found
 
     def _turning(self) -> BoolArray:
         """Tell which orders have more power over angle than any tone near them has over time."""

@@ -47,6 +47,7 @@ _OUTLIER = 6.0
 _SMOOTH = 1.5
 # Lines of an average within which an order is one that the shafts are known to have; amplitude, in
 # parts of the channel's strongest declared order, and number of orders that leak.
+_SMEARED = 4.0  # in what a stretch resolves: a beat that is even in time, over angle
 _ON_LINE, _STRONG, _MOST = 0.1, 5e-3, 20
 # A modulation that lines share: so many sidebands, of more than one line; how much of their power
 # may be no part of it; factor by which images of an interpolator may be larger or smaller;
@@ -249,56 +250,65 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     declared = fit.declared
     level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
     share = np.max(np.abs(fit.amplitudes) / level, axis=0)
-    modulating = _modulating(fit, model)
+    kept_out = modulating_lines(fit, model) | doubtful_lines(fit, model)
     found: list[float] = []
     for i in (declared + np.argsort(-share[declared:])).tolist():
         if share[i] < _STRONG or len(found) == _MOST:
             break
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact
-        wanted = order == round(order) or (
-            not modulating[i] and (exact is not None or fit.turning[i]))
+        wanted = order == round(order) or not kept_out[i]
         if wanted and order not in (*model.orders, *found):
             found.append(order)
     return found
 
 
-def _modulating(fit: RecordFit, model: DeclaredModel) -> BoolArray:
+def doubtful_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
+    """Tell which orders, and tones after them (line,), may be those of no shaft."""
+    found = ~modulating_lines(fit, model)
+    exact = np.array([_exact(float(order), model) is not None for order in fit.orders])
+    found[:fit.orders.size] &= ~(exact | fit.turning)
+    return found
+
+
+def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
     """
-    Tell which undeclared orders (order,) are sidebands of a modulation that the lines share.
+    Tell which orders, and tones after them (line,), are sidebands of a modulation of all lines.
 
     An interpolator with the response H makes images of all lines, H(f + fs) and H(f - fs) over
     H(f) times as large, which the drift between two clocks puts beside the lines; a gain that
-    varies makes sidebands of one size. In both cases one phase goes with all of them.
+    varies makes sidebands of one size. In both cases one phase goes with all of them. What turns
+    the lines alike was taken for pulse errors, so that the sum of both sides is compared.
     """
-    declared = fit.orders[:fit.declared]
-    least = _APART / (model.cycle_length * (fit.errors.size - 1))
-    apart = fit.orders[:, None] - declared
+    orders = np.append(fit.orders, fit.tones / model.fundamental_frequency)
+    amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
+    declared = orders[:fit.declared]
+    least = _SMEARED / (model.cycle_length * (fit.errors.size - 1))
+    apart = orders[:, None] - declared
     near = np.argmin(np.abs(apart), axis=1)
     offsets = apart[np.arange(near.size), near]
     relative = declared * model.fundamental_frequency / model.sample_rate
-    shapes = [(np.ones((2, declared.size)), np.inf)]
+    shapes = [(np.ones(declared.size), np.inf)]
     for method in METHODS:
         images = np.array([gain(method, relative + turn) for turn in (-1.0, 1.0)])
-        images = np.abs(images / gain(method, relative))
-        shapes += [(images, _OTHER_SIZE), (images[::-1], _OTHER_SIZE)]
-    found = np.zeros(fit.orders.size, np.bool_)
+        shapes.append((np.abs(images / gain(method, relative)).sum(axis=0), _OTHER_SIZE))
+    found = np.zeros(orders.size, np.bool_)
+    level = np.abs(amplitudes[:, :fit.declared])
     for distance in np.unique(np.abs(offsets[fit.declared:])):
-        sides = np.zeros((2, *fit.amplitudes[:, :fit.declared].shape), np.complex128)
-        for i in np.flatnonzero(np.abs(np.abs(offsets) - distance) < least):
-            if i >= fit.declared:
-                side = fit.amplitudes[:, i] / fit.amplitudes[:, near[i]]
-                sides[int(offsets[i] < 0.0)][:, near[i]] = (
-                    side if offsets[i] > 0.0 else side.conj())
-        if np.count_nonzero(np.any(sides != 0.0, axis=1)) < _FEWEST_SIDES:
+        beside = np.flatnonzero(np.abs(np.abs(offsets) - distance) < least)
+        beside = beside[beside >= fit.declared]
+        if len({(near[i], offsets[i] < 0.0) for i in beside}) < _FEWEST_SIDES:
             continue
-        if any(_follow(sides, shape[:, None], np.abs(fit.amplitudes[:, :fit.declared]), most)
-               for shape, most in shapes):
-            strong = np.abs(fit.amplitudes).max(axis=0)
+        sides = np.zeros(level.shape, np.complex128)
+        for i in beside:
+            side = amplitudes[:, i] / amplitudes[:, near[i]]
+            sides[:, near[i]] += side if offsets[i] > 0.0 else side.conj()
+        if any(_follow(sides, shape, level, most) for shape, most in shapes):
+            strong = np.abs(amplitudes).max(axis=0)
             strong[:fit.declared] = np.inf
             for multiple in distance * np.arange(1, _MULTIPLES + 1):
-                beside = np.abs(np.abs(fit.orders[:, None] - fit.orders) - multiple) < least
-                found |= np.any(beside & (strong > strong[:, None]), axis=1)
+                away = np.abs(np.abs(orders[:, None] - orders) - multiple) < least
+                found |= np.any(away & (strong > strong[:, None]), axis=1)
     found[:fit.declared] = False
     return found
 
@@ -307,11 +317,11 @@ def _follow(sides: ComplexArray, shape: FloatArray, level: FloatArray, most: flo
     """
     Tell whether sidebands follow a shape, up to a phase and a size that is known to a factor.
 
-    `sides` (side, channel, line) are sidebands over their lines, 0 where none was found, conjugate
-    below the lines; `level` (channel, line) are the lines.
+    `sides` (channel, line) are those of both sides over their lines, 0 where none was found;
+    `shape` is (line,); `level` (channel, line) are the lines.
     """
     weight = np.where(sides != 0.0, shape * level, 0.0)
-    scaled = np.divide(sides, shape, where=weight > 0.0, out=np.zeros_like(sides))
+    scaled = sides / shape
     common = np.sum(weight * scaled) / weight.sum()
     away = np.sum(weight * np.abs(scaled - common) ** 2) / weight.sum()
     return bool(away < _UNLIKE * abs(common) ** 2 and 1.0 / most < abs(common) < most)

@@ -29,12 +29,12 @@ from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
-from sa_jitter_ros.effects.timing import Setting, SOURCE
+from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser, DECIDED, RIPPLE
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
-from sa_jitter_ros.inference.timing_fit import JITTER
+from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
 from scipy import stats
 from scipy.special import ndtr
 
@@ -338,19 +338,20 @@ def _of_speed(choice: Choice) -> Finding | None:
     data = fit.data
     if data.series < 3:  # nothing is known of what happens inside the cycles
         return None
-    source = sum(float(np.average(fit.contribution(name)[:, 2, 2].real, weights=data.size))
-                 for name, item in fit.spectra.items() if item.direction == SOURCE)
+    made = {name: float(np.average(fit.contribution(name)[:, 2, 2].real, weights=data.size))
+            for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
+    share = made[SHAFT] / sum(made.values())  # the rest are bends of a source that moves
     parts, count = [], 0
     for item in data.stretches:
         if not np.isfinite(item.bend_std):
             continue
         for part in np.array_split(item.bends, max(1, item.bends.size // _PART)):
-            parts.append(np.mean(part**2) - item.bend_std**2 - source * data.unit**2)
+            parts.append(share * (np.mean(part**2) - item.bend_std**2))
             count += part.size
     if len(parts) < _FEWEST_PARTS:
         return None
     power, error = float(np.mean(parts)), float(np.std(parts, ddof=1) / math.sqrt(len(parts)))
-    noise = float(np.mean([item.bend_std**2 for item in data.stretches]))
+    noise = share * float(np.mean([item.bend_std**2 for item in data.stretches]))
     chance = float(stats.norm.sf(power / (noise * math.sqrt(2.0 / count) + 1e-300)))
     if power <= 0.0 or chance > _CHANCE:
         return None

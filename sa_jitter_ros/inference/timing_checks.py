@@ -32,7 +32,9 @@ _DRAWS, _SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
 _EDGE = 3  # pulses at either end of a stretch that filters do not reach
+_MOTIONS = -1, 0, 1  # aliases of a motion that needs no explanation
 _FEWEST = 40  # pulses whose distribution is looked at
+_EVEN, _TINY = 512, 1e-12  # frequencies of a response; power that is none, in unit^2
 _OFTEN, _TAIL = 0.02, 0.9  # shares of the draws: of the p values that they tell, and their tail
 
 
@@ -58,13 +60,22 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     # of a motion of the source nothing is known but its bandwidth
     directions = [PULSES, *([] if any(
         EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
-    found = [check(choice.fit, direction) for direction in directions
-             for check in (_power, _sinusoid)]
-    return (*found, _shape(chooser, choice), _steadiness(chooser, choice))
+    fit = choice.fit
+    # where a smooth motion does not end, nothing is known: it may leave out any frequency
+    found = [max((check(fit, fit.beside_motion(alias), direction) for alias in _MOTIONS),
+                 key=lambda item: item.p_value)
+             for direction in directions for check in (_power, _sinusoid)]
+    lasting = [name for name, item in fit.spectra.items() if len(item.upper) > 1]
+    return (*found, _shape(chooser, choice), *(_events(chooser, choice, name) for name in lasting),
+            _steadiness(chooser, choice))
 
 
-def _power(fit: TimingFit, direction: str) -> Check:
-    """Test whether the power in a direction is the expected one, in neighbouring bins together."""
+def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
+    """
+    Test whether the power in a direction is the expected one, in neighbouring bins together.
+
+    `inverse` (bin, 3, 3) is that of the cross-spectrum.
+    """
     data = fit.data
     size = data.size
     window = np.ones(min(_BINS, size.size))
@@ -74,11 +85,11 @@ def _power(fit: TimingFit, direction: str) -> Check:
         return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
 
     draws = np.random.default_rng(_SEED).gamma(size, 1.0 / size, (_DRAWS, size.size))
-    ratio = fit.excess(direction)
+    ratio = fit.excess(direction, inverse)
     gain = statistic(ratio)[0]
     top = int(np.argmax(gain))
     near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
-    more = np.sum((size * np.abs(ratio - 1.0) * fit.floor(direction))[near]) / size.sum()
+    more = np.sum((size * np.abs(ratio - 1.0) * fit.floor(direction, inverse))[near]) / size.sum()
     return Check(_chance(float(gain[top]), statistic(draws).max(axis=1)), direction,
                  data.unit * math.sqrt(more),
                  f'the power of the {direction} from {data.frequency[near][0]:.3g} to '
@@ -86,12 +97,12 @@ def _power(fit: TimingFit, direction: str) -> Check:
                  f'{float(np.average(ratio[near], weights=size[near])):.3g} times the expected')
 
 
-def _sinusoid(fit: TimingFit, direction: str) -> Check:
-    """Test whether a sinusoid in a direction stands out."""
+def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
+    """Test whether a sinusoid in a direction stands out; `inverse` is as in `_power`."""
     data = fit.data
     frequency = np.sort(np.concatenate([np.arange(1, n // 2 + 1) / n for n in data.lengths]))
     tried = frequency > _SLOWEST / data.longest
-    inverse = fit.inverse[data.bin]
+    inverse = inverse[data.bin]
     wave = np.einsum('fij,fj->fi', data.passed, steering(direction, data.frequency, data.frequency)
                      )[data.bin]
     known = np.einsum('fi,fij,fj->f', wave.conj(), inverse, wave).real
@@ -113,8 +124,9 @@ def _shape(chooser: Chooser, choice: Choice) -> Check:
     """
     fit, data = choice.fit, chooser.data
     larger = JITTER in fit.starts and fit.starts[JITTER][0] > 0.0
-    p_value = max(_likeness(chooser, choice, scaled) for scaled in ((False, True) if larger else (
-        False,)))
+    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
+    p_value = max(_likeness(chooser, choice, scaled, white) for scaled in (
+        (False, True) if larger else (False,)))
     names = [*fit.spectra, *([JITTER] if JITTER in fit.place else [])]
     power = sum(float(np.average(fit.contribution(name)[:, 1, 1].real, weights=data.size))
                 for name in names)
@@ -122,16 +134,41 @@ def _shape(chooser: Chooser, choice: Choice) -> Check:
                  'skewness and kurtosis of the pulse errors')
 
 
-def _likeness(chooser: Chooser, choice: Choice, scaled: bool) -> float:
-    """Return the p value of skewness and kurtosis."""
+def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
+    """
+    Test whether single events make what is taken for normal errors with a memory.
+
+    An event that the memory lets fade is what the matched filter of a component shows best.
+    """
     fit, data = choice.fit, chooser.data
-    white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
+    total = fit.spectrum(fit.parameters)[:, 1, 1].real
+    made = fit.contribution(name)[:, 1, 1].real
+    even = np.interp(np.arange(_EVEN + 1) / (2.0 * _EVEN), data.frequency, np.log(made + _TINY))
+    response = np.interp(data.frequency, np.arange(_EVEN + 1) / (2.0 * _EVEN), _minimum_phase(even))
+    return Check(_likeness(chooser, choice, True, response.conj() / total), fit.moves(name),
+                 data.unit * math.sqrt(float(np.average(made, weights=data.size))),
+                 f'skewness and kurtosis of the events behind {name}')
+
+
+def _minimum_phase(log_power: Array) -> Array:
+    """Return the response, causal as its inverse, of a log power from frequency 0 to a half."""
+    cepstrum = np.fft.irfft(log_power)
+    folded = cepstrum.copy()
+    half = cepstrum.size // 2
+    folded[1:half] *= 2.0
+    folded[half + 1:] = 0.0
+    return np.asarray(np.exp(0.5 * np.fft.rfft(folded)))
+
+
+def _likeness(chooser: Chooser, choice: Choice, scaled: bool, gain: Array) -> float:
+    """Return the p value of skewness and kurtosis of errors through a filter."""
+    data = chooser.data
     p_values = []
     for item in data.stretches:
         if item.errors.size < _FEWEST:
             continue
-        seen = _moments(_filtered(_left(chooser, choice, item), white, data))
-        null = _moments(_filtered(_drawn(choice, item, scaled), white, data))
+        seen = _moments(_filtered(_left(chooser, choice, item), gain, data))
+        null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
         for value, draws in zip(seen, null):
             middle = np.median(draws)
             p_values.append(_chance(abs(float(value - middle)), np.abs(draws - middle)))

@@ -35,7 +35,7 @@ Array = NDArray[Any]
 
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
 RIPPLE = 'ripple'
-_ODDS = 4.0  # against an effect, as a logarithm: one in fifty-five
+_ODDS = 5.0  # against an effect, as a logarithm: one in 150
 #: Logarithm of the odds of two explanations, 20 to 1, from which on one of them is the answer.
 DECIDED = math.log(20.0)
 _MOST = 4  # effects at once
@@ -96,13 +96,16 @@ class Choice:
 
 def score(names: frozenset[str], fit: TimingFit) -> float:
     """Return the logarithm of the evidence for a set of effects, its prior odds included."""
+    prior = 0.0
     for name in names & fit.columns.keys():
-        about = fit.patterns[name][0].about
-        if about is not None and abs(fit.pattern(name)[0][0] - about[0]) > about[1]:
+        pattern, size = fit.patterns[name][0], fit.pattern(name)[0]
+        if pattern.about is not None and abs(size[0] - pattern.about[0]) > pattern.about[1]:
             return -_RARE
+        if pattern.usual is not None:
+            prior += 0.5 * float(size[0] / pattern.usual(fit.data.stretches[0].setting)) ** 2
     if not math.isfinite(fit.value):
         return -_RARE
-    return fit.value - 0.5 * fit.count * math.log(fit.data.cycles) - _ODDS * len(names)
+    return fit.value - prior - 0.5 * fit.count * math.log(fit.data.cycles) - _ODDS * len(names)
 
 
 class Chooser:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
-from sa_jitter_ros.inference.timing_data import TimingData
+from sa_jitter_ros.inference.timing_data import ALIASES, TimingData
 from scipy.optimize import minimize
 
 Array = NDArray[Any]
@@ -169,19 +169,20 @@ class TimingFit:
             return white(values, alias)
         return self.spectra[name].density(values, alias)
 
-    def _direction(self, name: str) -> str:
+    def moves(self, name: str) -> str:
+        """Return the direction of a random component."""
         return {SHAFT: MOTION, JITTER: PULSES}.get(name) or self.spectra[name].direction
 
     def contribution(self, name: str) -> Array:
         """Return the cross-spectrum (bin, 3, 3) that a component makes."""
-        return self._of(self._direction(name), self.density(name, self.parameters))
+        return self._of(self.moves(name), self.density(name, self.parameters))
 
     def spectrum(self, parameters: Array) -> Array:
         """Return what all components make of the three series together (bin, 3, 3)."""
         total = self._fixed + self.data.noise * np.exp(parameters[self.place[NOISE]][0])
         for name in self.place:
             if name != NOISE:
-                total = total + self._of(self._direction(name), self.density(name, parameters))
+                total = total + self._of(self.moves(name), self.density(name, parameters))
         return np.asarray(total)
 
     def _prior(self, parameters: Array) -> tuple[float, Array]:
@@ -220,7 +221,7 @@ class TimingFit:
                 slope[place] += np.einsum('fij,fji->', change, data.noise).real * np.exp(
                     parameters[place])
                 continue
-            direction = self._direction(name)
+            direction = self.moves(name)
             if direction not in along:
                 along[direction] = np.einsum('fij,afji->af', change, data.steer[direction]).real
                 if direction == PULSES:
@@ -284,14 +285,24 @@ class TimingFit:
         """Return the inverse of the cross-spectrum (bin, 3, 3)."""
         return np.asarray(np.linalg.inv(self.spectrum(self.parameters)))
 
-    def floor(self, direction: str) -> Array:
-        """Return the variance (bin,), in unit^2, of what the data tell of power in a direction."""
-        steer = self.data.steer[direction][len(self.data.steer[direction]) // 2]
-        return np.asarray(1.0 / np.einsum('fij,fji->f', self.inverse, steer).real)
+    def beside_motion(self, alias: int) -> Array:
+        """Return the inverse (bin, 3, 3) in which any motion at an alias counts nothing."""
+        steer = self.data.steer[MOTION][len(ALIASES) // 2 + alias]
+        found = self.inverse @ steer @ self.inverse
+        return np.asarray(self.inverse - found / np.einsum(
+            'fij,fji->f', self.inverse, steer).real[:, None, None])
 
-    def excess(self, direction: str) -> Array:
+    def floor(self, direction: str, inverse: Array) -> Array:
+        """Return the variance (bin,), in unit^2, of what the data tell of power in a direction."""
+        return np.asarray(1.0 / np.einsum('fij,fji->f', inverse, self._at_zero(direction)).real)
+
+    def excess(self, direction: str, inverse: Array) -> Array:
         """Return the power (bin,) in a direction over that of the fit; 1 where all is right."""
-        steer = self.data.steer[direction][len(self.data.steer[direction]) // 2]
-        weight = self.inverse @ steer @ self.inverse
+        steer = self._at_zero(direction)
+        weight = inverse @ steer @ inverse
         return np.asarray(np.einsum('fij,fji->f', weight, self.data.binned(self.left)).real
-                          / np.einsum('fij,fji->f', self.inverse, steer).real)
+                          / np.einsum('fij,fji->f', inverse, steer).real)
+
+    def _at_zero(self, direction: str) -> Array:
+        steer = self.data.steer[direction]
+        return np.asarray(steer[len(steer) // 2])

@@ -30,10 +30,10 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
-from sa_jitter_ros.effects.timing import SOURCE
+from sa_jitter_ros.effects.timing import Pattern, SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
-    best_of, Candidate, least_change, SIGNIFICANT, too_small, try_all)
+    best_of, Candidate, least_change, too_small, try_all)
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
@@ -58,8 +58,10 @@ _SPEED = 'speed_fluctuation'
 # A tone turns a line by itself, and errors that grow turn it by more than its phase tells.
 _TURNING = {'interfering_tone', 'clock_skew'}
 _UNDECIDED = 1e-2  # change of an average by what may be there
-_AGAINST, _PRIOR = 54.6, 0.018  # odds against an effect (e^4), and its probability before data
+_AGAINST, _PRIOR = 148.4, 0.0067  # odds against an effect (e^5), and its probability before
+_REMAINS = 0.005  # p value of what is unexplained
 _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
+_PLAIN = 1e-12  # p value of a pattern that no other error can make
 _SCATTER = 'the scatter of the amplitudes'
 _UNSEEN = 'nothing of it shows in this recording'
 _FEWEST = 4
@@ -200,7 +202,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     left = _unexplained(bench, timing, chosen)
     unexplained = remains(after, moves) or left is not None
     absorbed = left.text if left is not None else _SCATTER if (
-        after.p_amplitude < SIGNIFICANT) else ''
+        after.p_amplitude < _REMAINS) else ''
     if absorbed:
         chosen, candidates = _beyond_doubt(chosen, candidates, absorbed, left is None)
         effects = _effects(chosen)
@@ -281,11 +283,19 @@ def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], le
                   of_lines: bool) -> tuple[list[Finding], list[Candidate]]:
     """Return the effects that do not merely absorb a part of what is left, and the candidates."""
     kept = [finding for finding in chosen if finding.effect is not None and not (
-        finding.effect.scatters if of_lines else finding.effect.random)]
+        finding.effect.scatters if of_lines else _absorbs(finding))]
     names = {finding.name for finding in kept}
     return kept, [item if item.rejected_because or item.name in names else replace(
         item, rejected_because=f'it absorbs a part of what no effect explains: {left}')
         for item in candidates]
+
+
+def _absorbs(finding: Finding) -> bool:
+    """Return whether an effect may absorb a part of what is none of it."""
+    effect = finding.effect
+    return effect is not None and (effect.random or (
+        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times
+        and finding.p_value > _PLAIN))
 
 
 def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
@@ -346,7 +356,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
 
 def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
     """Return whether a residual or one of its dependences is significant."""
-    return left.p_value < SIGNIFICANT or moving(moves) is not None
+    return left.p_value < _REMAINS or moving(moves) is not None
 
 
 def make_bench(observation: Observation, observations: Sequence[Observation],

@@ -103,7 +103,7 @@ def superposed_cumulants(cycles: CycleMoments, trigger_cycles: int) -> tuple[Arr
     require_cycles(trigger_cycles)
     size = np.abs(cycles.mean)
     clear = np.real(cycles.variance[0]) < _CLEAR * size**2
-    m = np.where(clear, cycles.mean, 1.0)
+    m, size = np.where(clear, cycles.mean, 1.0), np.where(clear, size, 1.0)
     block = math.ceil(trigger_cycles / _MOST_BLOCKS)
     count = round(trigger_cycles / block)
     steps = np.arange(1 - block, block)
