@@ -120,7 +120,7 @@ def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Ar
 
 def placed_on_grid(errors: Array, clock_rate: float) -> tuple[Array, float]:
     """Return errors (n,) in s moved within half a tick where possible, and the RMS beyond it."""
-    tick = 1.0 / clock_rate
+    tick, errors = 1.0 / clock_rate, errors - np.median(errors)
     offsets = np.linspace(-tick, tick, 201)
     excess = np.maximum(np.abs(errors[None, :] + offsets[:, None]) - 0.5 * tick, 0.0)
     cost = np.mean(excess**2, axis=1)

@@ -16,7 +16,8 @@ against any effect. Effects are added, taken out and exchanged while that raises
 were tried give each effect its probability.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
@@ -40,7 +41,7 @@ _ODDS = 5.0  # against an effect, as a logarithm: one in 150
 DECIDED = math.log(20.0)
 _MOST = 4  # effects at once
 _BESIDE_CLOCK = 2  # patterns beside that of a clock
-_STEPS = np.linspace(-4.0, 4.0, 161)  # standard errors that the size of one may be wrong by
+_STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
 _BETTER = 0.01
 _RARE = 1e9
 _ROOM = 0.02  # of a tick that errors may leave it by
@@ -144,22 +145,28 @@ class Chooser:
             [row[i] for row in rows], in_times=pattern.show_in_times) for i in range(count)],
                         axis=-1)
 
-    def _made(self, names: frozenset[str], fit: TimingFit) -> Iterator[list[Array]]:
+    def _on_ticks(self, names: frozenset[str]) -> TimingFit | None:
         """
-        Yield what the patterns of a set make of all pulses, in units.
+        Return the fit of patterns beside which ticks can make all errors, None where they cannot.
 
-        The size of a single one may be wrong by some standard errors.
+        The size of a single pattern may be any that leaves the errors within the ticks.
         """
+        fit = self.fit(names)
         found = {name: np.concatenate([self.patterns[name][0].columns(item.setting)
                                        for item in self.data.stretches], axis=1) for name in names}
         sizes = {name: fit.pattern(name)[0] for name in names}
-        yield [sizes[name] @ columns for name, columns in found.items()]
-        if len(names) == 1:
-            (name,) = names
-            if sizes[name].size == 1:
-                error = float(np.sqrt(fit.pattern(name)[1][0, 0]))
-                for step in _STEPS:
-                    yield [(sizes[name] + step * error) @ found[name]]
+        if len(names) != 1 or fit.sizes.size != 1:
+            return fit if self._room([sizes[name] @ found[name] for name in names]) else None
+        (column,) = found[min(names)]
+        step = _STEP / (self.setting.clock_rate * self.data.unit * float(np.ptp(column)))
+        tried = fit.sizes[0] + step * np.arange(-_STEPS, _STEPS + 1)
+        possible = tried[[self._room([size * column]) for size in tried]]
+        if not possible.size:
+            return None
+        fit = copy(fit)  # any of them is as likely
+        fit.sizes = possible.mean(keepdims=True)
+        fit.size_covariance = np.array([[(np.ptp(possible) + step) ** 2 / 12.0]])
+        return fit
 
     def _room(self, known: Sequence[Array]) -> bool:
         """Tell whether the ticks can make the errors less `known` ones (all pulses), in units."""
@@ -263,8 +270,8 @@ class Chooser:
             for count in range(_BESIDE_CLOCK + 1):
                 for some in combinations(others, count):
                     alone = frozenset(some)
-                    fit = self.fit(alone)
-                    if any(self._room(made) for made in self._made(alone, fit)):
+                    fit = self._on_ticks(alone)
+                    if fit is not None:
                         self.fits[alone | clocks] = fit
                         return alone | clocks
         return frozenset()
