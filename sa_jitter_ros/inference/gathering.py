@@ -94,8 +94,8 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     if usable and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
                  for i in range(int(group.max()) + 1)]
-    again = [None if motion is None or smooth is None else _unskewed(observation, motion, smooth)
-             for motion in again]
+    again = [None if motion is None or smooth is None else _unskewed(
+        observation.acquisitions, motion, smooth) for motion in again]
     spread = [motion for motion in again if motion is not None]
     error_std = [0.0 if motion is None else _uncertainty(observation, motion, spread)
                  for motion in again]
@@ -243,7 +243,7 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
     usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
     if not usable:
         return 0.0, 0.0
-    errors = np.array([item.errors for item in usable])
+    errors = _unskewed(usable, np.array([item.errors for item in usable]), smooth)
     error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
         [item.standard_errors**2 for item in usable])))
     if not ticks_leave_room(errors, np.array(error), clock):
@@ -262,9 +262,8 @@ def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
     return np.array([values[item.first:item.first + item.times.size] for item in items])
 
 
-def _unskewed(observation: Observation, motion: Array, smooth: Array) -> Array:
+def _unskewed(items: Sequence[Acquisition], motion: Array, smooth: Array) -> Array:
     """Return recovered errors (acquisition, pulse) less a slope over time that no grid causes."""
-    items = observation.acquisitions
     grid = _of_acquisitions(smooth, items)
     times = np.array([item.times - item.times.mean() for item in items])
     left = motion - grid
