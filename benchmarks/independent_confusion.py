@@ -48,9 +48,9 @@ class Run:
     What the loop reported of one machine.
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
-    right. Effects that are `present` change no average. `before` and `after` are RMS residuals less
-    their standard errors, in quadrature;
-    `errors` are those of the parameters in stated standard errors.
+    right. Effects that are `present` change no average. `before` and `after` are RMS residuals
+    less their standard errors, in quadrature; `errors` are those of the parameters in stated
+    standard errors.
     """
 
     effects: tuple[str, ...]

@@ -38,7 +38,7 @@ class CorrelatedJitter(Effect):
         'set the trigger level on the steepest part of the edge, and check the supply of '
         'the sensor')
     timing: ClassVar[Spectrum] = Spectrum(
-        PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5)), (-9.0, -2.0), (9.0, 2.6))
+        PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5), (-1.5, 0.6)), (-9.0, -2.0), (9.0, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
                                    minimum=-0.999, maximum=0.999)

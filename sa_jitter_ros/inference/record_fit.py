@@ -96,8 +96,8 @@ class RecordFit:
     lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
     amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
     imaginary parts. `turning` (order,) tells which orders certainly turn with the shaft: the speed
-    varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s) is
-    the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
+    varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s)
+    is the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
     bends that the fit expected, towards 0.
     """
 
@@ -586,7 +586,8 @@ class _States:
             errors, np.sqrt(self._variances(0)), self._autocovariance(), bends, bend_errors,
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
             self.amplitudes[:, self.orders.size:],
-            np.sqrt(self._amplitude_variances()), self._families(self._turning()), float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
+            np.sqrt(self._amplitude_variances()), self._families(self._turning()),
+            float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
 
     def _autocovariance(self) -> Array:
         """Return the mean posterior autocovariance of the pulse errors about their mean."""
@@ -608,7 +609,7 @@ class _States:
             - shared[chosen][:, None] + mean, axis=0))
 
     def _families(self, turning: BoolArray) -> BoolArray:
-        """Return which orders turn: sidebands as far from declared lines, or from 0, turn alike."""
+        """Return which orders turn: sidebands as far from declared lines or 0 turn alike."""
         near = np.append(self.orders[:self.declared], 0.0)
         distance = np.abs(self.orders[self.declared:, None] - near).min(axis=1)
         alike = np.abs(distance[:, None] - distance) * self.span < _APART

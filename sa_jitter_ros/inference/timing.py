@@ -36,19 +36,15 @@ from sa_jitter_ros.inference.timing_choice import Choice, Chooser, DECIDED, RIPP
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
 from scipy import stats
-from scipy.special import ndtr
 
 Array = NDArray[Any]
 
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
 _VISIBLE = 0.02  # of a tick: errors of a grid below it are none
-_SEED = 11
 _CERTAIN = 1e-12  # p value of what the pulse times themselves show
 _PART, _FEWEST_PARTS, _CHANCE = 20, 4, 1e-4  # cycles whose mean power scatters by itself
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
-_DRAWN = 4000
-_EDGE = 3  # pulses at either end of a stretch that are not checked
 
 
 @dataclass(frozen=True)
@@ -177,7 +173,7 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
         choice = chooser.choose()
     else:
         chooser.fit(names)
-        choice = Choice(names, chooser.fits, chooser.setting, tuple(chooser.declared.values()))
+        choice = chooser.choice(names)
     findings = tuple(_findings(chooser, choice))
     checks = check_timing(chooser, choice) if names is None else ()
     return Timing(findings, _probabilities(choice, findings), chooser, choice, checks)
@@ -268,7 +264,10 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
             f'{0.5 * scale * error:.2g} times the declared ones; probability '
             f'{choice.probabilities[JITTER]:.3g} beside all other sets of effects')
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
-    odds = _odds_of_scale(chooser, choice, scale) if scale > 1.0 else math.inf
+    odds = math.inf
+    if scale > 1.0:  # the same power, but the distribution tells
+        odds = chooser.of_shape(choice.best, fit, scale**2) - chooser.of_shape(
+            choice.best, fit, 1.0)
     if odds > DECIDED:
         if scale > 1.0:
             text += '; their distribution is the declared one, as wide'
@@ -283,40 +282,6 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
         rivals = (JITTER, *rivals)
     return Finding(_EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,
                    deciding_measurement=EFFECTS[_EXCESS].deciding_measurement if rivals else '')
-
-
-def _odds_of_scale(chooser: Chooser, choice: Choice, scale: float) -> float:
-    """
-    Return the logarithm of the odds that the declared errors are `scale` times as large.
-
-    The alternative adds normal errors of the same power. Only the distribution of single errors
-    tells the two apart, so that only a declared distribution other than the normal one can.
-    """
-    model = choice.setting.model
-    if model.jitter_distribution == 'normal' or len(choice.best) > 1:
-        return 0.0
-    total = 0.0
-    draws = np.random.default_rng(_SEED)
-    for item in chooser.data.stretches:
-        errors = item.errors[item.measured][_EDGE:-_EDGE]
-        trend = np.polynomial.Polynomial.fit(np.arange(errors.size), errors, 3)
-        left = errors - trend(np.arange(errors.size))
-        table = np.asarray(model.distribution.draw(draws, _DRAWN))
-        table = table - table.mean()
-        wider = math.hypot(item.error_std, math.sqrt(scale**2 - 1.0) * float(np.std(table)))
-        for sign, size, noise in ((1.0, scale, item.error_std), (-1.0, 1.0, wider)):
-            total += sign * _log_density(left, size * table, noise)
-    return float(total)
-
-
-def _log_density(errors: Array, table: Array, noise: float) -> float:
-    """Return the log likelihood of errors that are draws of a table plus normal noise."""
-    edges = np.quantile(table, np.linspace(0.0, 1.0, 201))
-    low, high = edges[:-1], np.maximum(edges[1:], edges[:-1] + 1e-12)
-    width = max(noise, 1e-3 * float(np.std(table)))
-    inside = ndtr((errors[:, None] - low) / width) - ndtr((errors[:, None] - high) / width)
-    density = np.mean(inside / (high - low), axis=1)
-    return float(np.sum(np.log(np.maximum(density, 1e-12 / np.std(errors)))))
 
 
 def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:

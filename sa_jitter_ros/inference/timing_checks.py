@@ -25,16 +25,16 @@ from sa_jitter_ros.effects.timing import PULSES, SOURCE
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser
 from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
+from sa_jitter_ros.inference.timing_shape import EDGE, through
 
 Array = NDArray[Any]
 
 _DRAWS, _SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
-_EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _MOTIONS = -1, 0, 1  # aliases of a motion that needs no explanation
 _FEWEST = 40  # pulses whose distribution is looked at
-_EVEN, _TINY = 512, 1e-12  # frequencies of a response; power that is none, in unit^2
+_EVEN, _TINY = 513, 1e-12  # frequencies of a response; power that is none, in unit^2
 _OFTEN, _TAIL = 0.02, 0.9  # shares of the draws: of the p values that they tell, and their tail
 
 
@@ -143,8 +143,9 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
     fit, data = choice.fit, chooser.data
     total = fit.spectrum(fit.parameters)[:, 1, 1].real
     made = fit.contribution(name)[:, 1, 1].real
-    even = np.interp(np.arange(_EVEN + 1) / (2.0 * _EVEN), data.frequency, np.log(made + _TINY))
-    response = np.interp(data.frequency, np.arange(_EVEN + 1) / (2.0 * _EVEN), _minimum_phase(even))
+    even = np.linspace(0.0, 0.5, _EVEN)
+    response = np.interp(data.frequency, even, _minimum_phase(
+        np.interp(even, data.frequency, np.log(made + _TINY))))
     return Check(_likeness(chooser, choice, True, response.conj() / total), fit.moves(name),
                  data.unit * math.sqrt(float(np.average(made, weights=data.size))),
                  f'skewness and kurtosis of the events behind {name}')
@@ -167,7 +168,7 @@ def _likeness(chooser: Chooser, choice: Choice, scaled: bool, gain: Array) -> fl
     for item in data.stretches:
         if item.errors.size < _FEWEST:
             continue
-        seen = _moments(_filtered(_left(chooser, choice, item), gain, data))
+        seen = _moments(_filtered(chooser.left(choice.best, choice.fit, item), gain, data))
         null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
         for value, draws in zip(seen, null):
             middle = np.median(draws)
@@ -200,18 +201,10 @@ def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None
     """Return the power of whitened errors (part, draw) in parts of a stretch."""
     fit, data = choice.fit, choice.fit.data
     white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
-    errors = _left(chooser, choice, item) if drawn is None else drawn
+    errors = chooser.left(choice.best, choice.fit, item) if drawn is None else drawn
     values = _filtered(errors, white, data)
     parts = np.array_split(values, max(1, values.shape[-1] // _FEWEST), axis=-1)
     return [np.asarray(np.mean(part**2, axis=-1)) for part in parts]
-
-
-def _left(chooser: Chooser, choice: Choice, item: Stretch) -> Array:
-    """Return the errors (pulse,) that patterns and a trend leave, in units."""
-    errors = item.errors / choice.fit.data.unit - chooser.known_errors(choice, item)
-    errors = np.where(item.measured, errors, np.mean(errors[item.measured]))
-    place = np.arange(errors.size)
-    return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
 
 
 def _drawn(choice: Choice, item: Stretch, scaled: bool) -> Array:
@@ -226,20 +219,11 @@ def _drawn(choice: Choice, item: Stretch, scaled: bool) -> Array:
     gain = np.abs(data.passed[:, 1, 1])
     total = fit.spectrum(fit.parameters)[:, 1, 1].real
     rest = np.sqrt(np.maximum(total - data.measured * power * gain**2, 0.0))
-    return (_through(declared, gain, data) + _through(rng.standard_normal(shape), rest, data))
+    return (through(declared, gain, data) + through(rng.standard_normal(shape), rest, data))
 
 
 def _filtered(values: Array, gain: Array, data: TimingData) -> Array:
-    return _through(values, gain, data)[..., _EDGE:-_EDGE]
-
-
-def _through(values: Array, gain: Array, data: TimingData) -> Array:
-    """Return values (..., pulse) through a filter whose `gain` is given in bins of frequency."""
-    count = values.shape[-1]
-    transform = np.fft.rfft(values, axis=-1) * np.interp(
-        np.arange(count // 2 + 1) / count, data.frequency, gain)
-    transform[..., 0] = 0.0
-    return np.asarray(np.fft.irfft(transform, count, axis=-1))
+    return through(values, gain, data)[..., EDGE:-EDGE]
 
 
 def _moments(values: Array) -> tuple[Array, Array]:

@@ -31,6 +31,7 @@ from sa_jitter_ros.effects.lattice import placed_on_grid
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
+from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 
 Array = NDArray[Any]
 
@@ -52,12 +53,13 @@ class Choice:
     """
     The best set of effects, and all sets that were tried with their evidence.
 
-    `fits` maps sets of names to their fits. `declared` are the effects that are part of the
-    declared model: in a set, their parameters are in question.
+    `fits` maps sets of names to their fits, `scores` to their evidence. `declared` are the effects
+    that are part of the declared model: in a set, their parameters are in question.
     """
 
     best: frozenset[str]
     fits: Mapping[frozenset[str], TimingFit]
+    scores: Mapping[frozenset[str], float]
     setting: Setting
     declared: tuple[Effect, ...]
 
@@ -78,9 +80,8 @@ class Choice:
         names = frozenset().union(*self.fits)
         if self.ticked:
             return {name: float(name in self.best) for name in names}
-        scores = {key: score(key, fit) for key, fit in self.fits.items()}
-        top = max(scores.values())
-        odds = {key: math.exp(max(value - top, -700.0)) for key, value in scores.items()}
+        top = max(self.scores.values())
+        odds = {key: math.exp(max(value - top, -700.0)) for key, value in self.scores.items()}
         total = sum(odds.values())
         return {name: sum(value for key, value in odds.items() if name in key) / total
                 for name in names}
@@ -89,24 +90,9 @@ class Choice:
         """Return what explains the data in place of `name` with odds that decide nothing."""
         if self.ticked:
             return ()
-        least = score(self.best, self.fit) - DECIDED
+        least = self.scores[self.best] - DECIDED
         return tuple(other for other in self.probabilities if other not in self.best and (
-            swapped := (self.best - {name}) | {other}) in self.fits
-            and score(swapped, self.fits[swapped]) > least)
-
-
-def score(names: frozenset[str], fit: TimingFit) -> float:
-    """Return the logarithm of the evidence for a set of effects, its prior odds included."""
-    prior = 0.0
-    for name in names & fit.columns.keys():
-        pattern, size = fit.patterns[name][0], fit.pattern(name)[0]
-        if pattern.about is not None and abs(size[0] - pattern.about[0]) > pattern.about[1]:
-            return -_RARE
-        if pattern.usual is not None:
-            prior += 0.5 * float(size[0] / pattern.usual(fit.data.stretches[0].setting)) ** 2
-    if not math.isfinite(fit.value):
-        return -_RARE
-    return fit.value - prior - 0.5 * fit.count * math.log(fit.data.cycles) - _ODDS * len(names)
+            self.scores.get((self.best - {name}) | {other}, -_RARE) > least))
 
 
 class Chooser:
@@ -126,6 +112,9 @@ class Chooser:
         if marks is not None:
             self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
         self.fits: dict[frozenset[str], TimingFit] = {}
+        model = self.setting.model
+        # normal errors stay normal whatever is beside them
+        self.shapes = None if model.jitter_distribution == 'normal' else Shapes(model.distribution)
 
     @property
     def pool(self) -> Sequence[str]:
@@ -182,13 +171,46 @@ class Chooser:
         noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
         return bool(np.mean(beyond) < max(noise, (_ROOM / rate) ** 2))
 
-    def known_errors(self, choice: Choice, stretch: Stretch) -> Array:
-        """Return what declared patterns, and those of a choice, make of the pulses, in units."""
+    def score(self, names: frozenset[str], fit: TimingFit) -> float:
+        """Return the logarithm of the evidence for a set of effects, its prior odds included."""
+        prior = 0.0
+        for name in names & fit.columns.keys():
+            pattern, size = fit.patterns[name][0], fit.pattern(name)[0]
+            if pattern.about is not None and abs(size[0] - pattern.about[0]) > pattern.about[1]:
+                return -_RARE
+            if pattern.usual is not None:
+                prior += 0.5 * float(size[0] / pattern.usual(self.setting)) ** 2
+        if not math.isfinite(fit.value):
+            return -_RARE
+        shape = max(self.of_shape(names, fit, power) for power in self._powers(fit))
+        return fit.value + shape - prior - 0.5 * fit.count * math.log(
+            self.data.cycles) - _ODDS * len(names)
+
+    def of_shape(self, names: frozenset[str], fit: TimingFit, power: float) -> float:
+        """Return what the distribution of single errors adds to the likelihood of a fit."""
+        if self.shapes is None or any(item.replaces_jitter for item, _ in fit.patterns.values()):
+            return 0.0
+        return self.shapes.gain(fit, [self.left(names, fit, item) for item in self.data.stretches],
+                                power)
+
+    def _powers(self, fit: TimingFit) -> Sequence[float]:
+        """Return the powers of declared errors, in unit^2: more may be of normal ones beside."""
+        if JITTER not in fit.starts:
+            return (1.0,)
+        power = math.exp(fit.starts[JITTER][0])
+        return (power, 1.0) if power > 1.0 else (power,)
+
+    def left(self, names: frozenset[str], fit: TimingFit, stretch: Stretch) -> Array:
+        """Return the errors (pulse,) that patterns and a trend leave, in units."""
+        return errors_left(stretch, self.data.unit, self._known_errors(names, fit, stretch))
+
+    def _known_errors(self, names: frozenset[str], fit: TimingFit, stretch: Stretch) -> Array:
+        """Return what declared patterns, and those of a set, make of the pulses, in units."""
         total = np.zeros(stretch.errors.size)
         for name in self.patterns.keys() & EFFECTS.keys():
             columns = self.patterns[name][0].columns
-            if name in choice.best:
-                total += choice.fit.pattern(name)[0] @ columns(stretch.setting)
+            if name in names:
+                total += fit.pattern(name)[0] @ columns(stretch.setting)
             elif name in self.declared:
                 total += self.declared[name].in_timing(self.setting) @ columns(stretch.setting)
         return total
@@ -245,8 +267,8 @@ class Chooser:
         """
         best = self._of_ticks()
         if best:
-            return self._choice(best)
-        top = score(best, self.fit(best))
+            return self.choice(best)
+        top = self.score(best, self.fit(best))
         pool = self.pool
         while True:
             moves = [best | {name} for name in pool if name not in best]
@@ -254,13 +276,13 @@ class Chooser:
             moves += [(best - {name}) | {other} for name in best for other in pool
                       if other not in best]
             start = self.fits[best].starts
-            scores = {move: score(move, self.fit(move, start)) for move in moves
+            scores = {move: self.score(move, self.fit(move, start)) for move in moves
                       if len(move) <= _MOST}
             better = max(scores, key=lambda move: scores[move])
             if scores[better] <= top + _BETTER:
                 break
             best, top = better, scores[better]
-        return self._choice(best)
+        return self.choice(best)
 
     def _of_ticks(self) -> frozenset[str]:
         """Return a clock and the fewest other patterns beside which its ticks make all errors."""
@@ -276,11 +298,13 @@ class Chooser:
                         return alone | clocks
         return frozenset()
 
-    def _choice(self, best: frozenset[str]) -> Choice:
+    def choice(self, best: frozenset[str]) -> Choice:
         """Return the choice of a set."""
+        scores = {names: self.score(names, fit) for names, fit in self.fits.items()}
         possible = {names: fit for names, fit in self.fits.items()
-                    if names == best or score(names, fit) > -_RARE}
-        return Choice(best, possible, self.setting, tuple(self.declared.values()))
+                    if names == best or scores[names] > -_RARE}
+        return Choice(best, possible, {names: scores[names] for names in possible}, self.setting,
+                      tuple(self.declared.values()))
 
 
 def _of(spectrum: Spectrum, sizes: Array) -> Callable[[Array], Array]:

@@ -1,0 +1,96 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the distribution of single pulse errors tells beside their spectrum.
+
+The likelihood of the timing takes all errors for normal. Those of a declared distribution are not,
+and normal errors beside them, with or without a memory, round its edges off. Each error is
+compared with what the others let expect of it: the declared distribution, widened by the rest,
+over a normal one of the same size.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_fit import TimingFit
+from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
+from scipy.special import ndtr
+
+Array = NDArray[Any]
+
+EDGE = 3  # pulses at either end of a stretch that filters do not reach
+_CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
+_LEAST = 0.02  # of the declared jitter: what is beside it at least
+_STRAY = 0.02  # share of errors that may be anything
+_DRAWN, _SEED, _PARTS = 4000, 11, 50
+
+
+def through(values: Array, gain: Array, data: TimingData) -> Array:
+    """Return values (..., pulse) through a filter whose `gain` is given in bins of frequency."""
+    count = values.shape[-1]
+    transform = np.fft.rfft(values, axis=-1) * np.interp(
+        np.arange(count // 2 + 1) / count, data.frequency, gain)
+    transform[..., 0] = 0.0
+    return np.asarray(np.fft.irfft(transform, count, axis=-1))
+
+
+def errors_left(item: Stretch, unit: float, known: Array) -> Array:
+    """Return the errors (pulse,) that `known` ones and a trend leave, in units."""
+    errors = item.errors / unit - known
+    errors = np.where(item.measured, errors, np.mean(errors[item.measured]))
+    place = np.arange(errors.size)
+    return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
+
+
+class Shapes:
+    """Distributions of single errors that are a declared one, of any size, and normal ones."""
+
+    def __init__(self, distribution: PulseErrorDistribution) -> None:
+        draws = np.asarray(distribution.draw(np.random.default_rng(_SEED), (_DRAWN,)))
+        draws = (draws - draws.mean()) / draws.std()
+        self.edges = np.quantile(draws, np.linspace(0.0, 1.0, _PARTS + 1))
+
+    def gain(self, fit: TimingFit, errors: list[Array], power: float) -> float:
+        """
+        Return the log likelihood that the declared distribution gains over a normal one.
+
+        `errors` (pulse,) of each stretch are in units; declared ones have the `power`.
+        """
+        data = fit.data
+        inverse = 1.0 / fit.spectrum(fit.parameters)[:, 1, 1].real
+        mean = float(np.average(inverse, weights=data.size))
+        rest = math.sqrt(max(1.0 / mean - power, _LEAST**2))
+        total = 0.0
+        for item, values in zip(data.stretches, errors):
+            if item.error_std > _CLEAR * data.unit:
+                continue
+            told = item.measured.copy()  # by the others: a missing one tells nothing
+            told[1:] &= item.measured[:-1]
+            told[:-1] &= item.measured[1:]
+            beyond = through(values, inverse / mean, data)[told][EDGE:-EDGE]
+            normal = _normal(beyond, 1.0 / mean)
+            shaped = self._density(beyond, math.sqrt(power), rest)
+            total += float(np.sum(np.log((1.0 - _STRAY) * shaped / normal + _STRAY)))
+        return total
+
+    def _density(self, errors: Array, size: float, rest: float) -> Array:
+        """Return the density of errors of the declared shape with normal ones beside them."""
+        low, high = size * self.edges[:-1], size * self.edges[1:]
+        width = np.maximum(high - low, 1e-12 * size)
+        inside = ndtr((errors[:, None] - low) / rest) - ndtr((errors[:, None] - high) / rest)
+        return np.asarray(np.mean(inside / width, axis=1))
+
+
+def _normal(errors: Array, variance: float) -> Array:
+    return np.asarray(np.exp(-0.5 * errors**2 / variance) / math.sqrt(2.0 * math.pi * variance))
