@@ -610,9 +610,11 @@ class _States:
 
     def _families(self, turning: BoolArray) -> BoolArray:
         """Return which orders turn: sidebands as far from declared lines or 0 turn alike."""
-        near = np.append(self.orders[:self.declared], 0.0)
-        distance = np.abs(self.orders[self.declared:, None] - near).min(axis=1)
-        alike = np.abs(distance[:, None] - distance) * self.span < _APART
+        orders = self.orders[self.declared:]
+        beside = np.abs(orders[:, None] - self.orders[:self.declared]).min(axis=1)
+        distance = np.stack([beside, orders], axis=1)
+        apart = np.abs(distance[:, None, :, None] - distance[:, None, :])
+        alike = apart.min(axis=(2, 3)) * self.span < _APART
         found = turning.copy()
         found[self.declared:] = np.any(alike & turning[self.declared:], axis=1)
         return found

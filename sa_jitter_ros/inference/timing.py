@@ -17,7 +17,7 @@ direction, sinusoids, and errors that are not normal.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import math
 from typing import Any
 
@@ -31,10 +31,13 @@ from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
+from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
-from sa_jitter_ros.inference.timing_choice import Choice, Chooser, DECIDED, RIPPLE
+from sa_jitter_ros.inference.timing_choice import (
+    Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
+from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import stats
 
 Array = NDArray[Any]
@@ -42,6 +45,7 @@ Array = NDArray[Any]
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
 _VISIBLE = 0.02  # of a tick: errors of a grid below it are none
 _CERTAIN = 1e-12  # p value of what the pulse times themselves show
+_APART, _FASTEST = 1.5, 1.0  # cycles in a stretch; a trigger cycle: of sidebands
 _PART, _FEWEST_PARTS, _CHANCE = 20, 4, 1e-4  # cycles whose mean power scatters by itself
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
@@ -74,12 +78,23 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
     for number, first, last in _runs(observation, chosen):
         recovery = observation.recoveries[number]
         start, stop = recovery.number[first], recovery.number[last] + 1
-        for part in recovery.stretches:
+        for part, fit in zip(recovery.stretches, recovery.fits):
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
                 continue
-            found.append(_stretch(observation, number, here, clock, unit))
+            found.append(replace(_stretch(observation, number, here, clock, unit),
+                                 sidebands=_sidebands(fit, model)))
     return found
+
+
+def _sidebands(fit: RecordFit, model: DeclaredModel) -> Array:
+    """Return how far sidebands of several lines are from these, in cycles a trigger cycle."""
+    declared, least = fit.orders[:fit.declared], _APART / fit.errors.size
+    apart = np.abs(fit.orders[fit.declared:, None] - declared)
+    turns = np.sort(apart.min(axis=1, initial=math.inf) * model.cycle_length)
+    turns = turns[(turns > least) & (turns < _FASTEST)]
+    groups = np.split(turns, np.flatnonzero(np.diff(turns) > least) + 1)
+    return np.array([group.mean() for group in groups if group.size > 1])
 
 
 def _of_average(observation: Observation, item: Acquisition, unit: float, grid: Array | None,
@@ -204,7 +219,7 @@ def _findings(chooser: Chooser, choice: Choice) -> list[Finding]:
     for name in sorted(choice.best):
         if name == JITTER:
             found.append(_of_jitter(chooser, choice))
-        elif name != RIPPLE:
+        elif name not in NO_EFFECTS:
             found.append(_of_effect(chooser, choice, name))
     if _CLOCK in choice.fit.columns and JITTER not in choice.best:
         beside = _beside_the_clock(chooser, choice)
@@ -224,7 +239,7 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
     else:  # errors that are within the ticks of a clock
         effect, errors = kind.of_timing(np.ones(1), np.zeros((1, 1)), choice.setting)
     rivals = tuple(_EXCESS if other == JITTER else other for other in choice.rivals(name)
-                   if other != RIPPLE)
+                   if other not in NO_EFFECTS)
     if RIPPLE in choice.rivals(name):
         rivals = (*rivals, _SPEED)
     return Finding(name, effect, errors, _p_value(choice, name, chooser),
@@ -266,8 +281,7 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
     odds = math.inf
     if scale > 1.0:  # the same power, but the distribution tells
-        odds = chooser.of_shape(choice.best, fit, scale**2) - chooser.of_shape(
-            choice.best, fit, 1.0)
+        odds = chooser.of_shape(fit, scale**2) - chooser.of_shape(fit, 1.0)
     if odds > DECIDED:
         if scale > 1.0:
             text += '; their distribution is the declared one, as wide'

@@ -168,7 +168,7 @@ def _likeness(chooser: Chooser, choice: Choice, scaled: bool, gain: Array) -> fl
     for item in data.stretches:
         if item.errors.size < _FEWEST:
             continue
-        seen = _moments(_filtered(chooser.left(choice.best, choice.fit, item), gain, data))
+        seen = _moments(_filtered(chooser.left(choice.fit, item), gain, data))
         null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
         for value, draws in zip(seen, null):
             middle = np.median(draws)
@@ -201,7 +201,7 @@ def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None
     """Return the power of whitened errors (part, draw) in parts of a stretch."""
     fit, data = choice.fit, choice.fit.data
     white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
-    errors = chooser.left(choice.best, choice.fit, item) if drawn is None else drawn
+    errors = chooser.left(choice.fit, item) if drawn is None else drawn
     values = _filtered(errors, white, data)
     parts = np.array_split(values, max(1, values.shape[-1] // _FEWEST), axis=-1)
     return [np.asarray(np.mean(part**2, axis=-1)) for part in parts]

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.lattice import placed_on_grid
-from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, Spectrum
+from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
@@ -37,6 +37,9 @@ Array = NDArray[Any]
 
 #: A pattern of the speed that repeats with the revolution: no effect, but marks may look like it.
 RIPPLE = 'ripple'
+#: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.
+SIDEBANDS = 'sidebands'
+NO_EFFECTS = RIPPLE, SIDEBANDS
 _ODDS = 5.0  # against an effect, as a logarithm: one in 150
 #: Logarithm of the odds of two explanations, 20 to 1, from which on one of them is the answer.
 DECIDED = math.log(20.0)
@@ -45,6 +48,7 @@ _BESIDE_CLOCK = 2  # patterns beside that of a clock
 _STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
 _BETTER = 0.01
 _RARE = 1e9
+_NEAR = 0.75  # of what a stretch resolves: power of a sideband
 _ROOM = 0.02  # of a tick that errors may leave it by
 
 
@@ -111,6 +115,13 @@ class Chooser:
         marks = self._ripple()
         if marks is not None:
             self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
+        self.spectra = {name: kind.timing for name, kind in EFFECTS.items()
+                        if isinstance(kind.timing, Spectrum)}
+        lines = np.unique(np.concatenate([item.sidebands for item in stretches]))
+        if lines.size:
+            self.spectra[SIDEBANDS] = Spectrum(
+                SOURCE, self._near(lines), ((-1.0,) * lines.size,), (-12.0,) * lines.size,
+                (9.0,) * lines.size)
         self.fits: dict[frozenset[str], TimingFit] = {}
         model = self.setting.model
         # normal errors stay normal whatever is beside them
@@ -119,10 +130,10 @@ class Chooser:
     @property
     def pool(self) -> Sequence[str]:
         """Return the names of all that may be in a set."""
-        return [JITTER, *(name for name, kind in EFFECTS.items()
-                          if name in self.patterns or (isinstance(kind.timing, Spectrum)
-                          and not (name == 'excess_jitter' and name not in self.declared))),
-                *([RIPPLE] if RIPPLE in self.patterns else [])]
+        possible = self.patterns.keys() | self.spectra.keys()
+        if 'excess_jitter' not in self.declared:  # jitter of another size
+            possible -= {'excess_jitter'}
+        return [JITTER, *(name for name in (*EFFECTS, *NO_EFFECTS) if name in possible)]
 
     def _columns(self, pattern: Pattern) -> Array | None:
         """Return the ordinates (ordinate, 3, column) of a pattern, None where it has none."""
@@ -182,15 +193,15 @@ class Chooser:
                 prior += 0.5 * float(size[0] / pattern.usual(self.setting)) ** 2
         if not math.isfinite(fit.value):
             return -_RARE
-        shape = max(self.of_shape(names, fit, power) for power in self._powers(fit))
+        shape = max(self.of_shape(fit, power) for power in self._powers(fit))
         return fit.value + shape - prior - 0.5 * fit.count * math.log(
             self.data.cycles) - _ODDS * len(names)
 
-    def of_shape(self, names: frozenset[str], fit: TimingFit, power: float) -> float:
+    def of_shape(self, fit: TimingFit, power: float) -> float:
         """Return what the distribution of single errors adds to the likelihood of a fit."""
         if self.shapes is None or any(item.replaces_jitter for item, _ in fit.patterns.values()):
             return 0.0
-        return self.shapes.gain(fit, [self.left(names, fit, item) for item in self.data.stretches],
+        return self.shapes.gain(fit, [self.left(fit, item) for item in self.data.stretches],
                                 power)
 
     def _powers(self, fit: TimingFit) -> Sequence[float]:
@@ -200,16 +211,16 @@ class Chooser:
         power = math.exp(fit.starts[JITTER][0])
         return (power, 1.0) if power > 1.0 else (power,)
 
-    def left(self, names: frozenset[str], fit: TimingFit, stretch: Stretch) -> Array:
+    def left(self, fit: TimingFit, stretch: Stretch) -> Array:
         """Return the errors (pulse,) that patterns and a trend leave, in units."""
-        return errors_left(stretch, self.data.unit, self._known_errors(names, fit, stretch))
+        return errors_left(stretch, self.data.unit, self._known_errors(fit, stretch))
 
-    def _known_errors(self, names: frozenset[str], fit: TimingFit, stretch: Stretch) -> Array:
-        """Return what declared patterns, and those of a set, make of the pulses, in units."""
+    def _known_errors(self, fit: TimingFit, stretch: Stretch) -> Array:
+        """Return what declared patterns, and those of a fit, make of the pulses, in units."""
         total = np.zeros(stretch.errors.size)
         for name in self.patterns.keys() & EFFECTS.keys():
             columns = self.patterns[name][0].columns
-            if name in names:
+            if name in fit.columns:
                 total += fit.pattern(name)[0] @ columns(stretch.setting)
             elif name in self.declared:
                 total += self.declared[name].in_timing(self.setting) @ columns(stretch.setting)
@@ -227,6 +238,15 @@ class Chooser:
             both = self.data.of_wave(MOTION, harmonic / own)
             waves += both[:1] if 2 * harmonic == own else both
         return np.stack(waves, axis=-1)
+
+    def _near(self, lines: Array) -> Callable[[Array, Array], Array]:
+        """Return a density of some power near each of some frequencies, nothing elsewhere."""
+        reach = max(_NEAR / self.data.longest, 0.5 * float(np.diff(self.data.frequency).max()))
+
+        def density(parameters: Array, frequency: Array) -> Array:
+            near = np.abs(frequency[..., None] - lines) < reach
+            return np.asarray(near @ np.exp(parameters))
+        return density
 
     def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,
             extra: Mapping[str, Spectrum] | None = None,
@@ -246,8 +266,7 @@ class Chooser:
                     fixed.append(Fixed(effect.timing.direction, _of(effect.timing, sizes)))
             elif name not in names and name in self.patterns:
                 known = known + self.patterns[name][1] @ sizes
-        spectra = {name: timing for name in sorted(names & EFFECTS.keys())
-                   if isinstance(timing := EFFECTS[name].timing, Spectrum)}
+        spectra = {name: self.spectra[name] for name in sorted(names & self.spectra.keys())}
         patterns = {name: self.patterns[name] for name in sorted(names) if name in self.patterns}
         new = [[(name, np.array(first)) for first in item.starts] for name, item in spectra.items()
                if name not in start]

@@ -20,7 +20,7 @@ the motion of the shaft from leaking.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,8 @@ class Stretch:
     measured minus true times, with the noise `error_std` (s), shrunk by a prior of `prior_std` (s,
     infinite for none); `bends` (cycle,) in s are the factors of u (1 - u) inside the cycles, not
     shrunk, with the noise `bend_std` that a prior of `bend_prior_std` left. Against a reference
-    keyphasor (`referenced`) no motion of the source shows.
+    keyphasor (`referenced`) no motion of the source shows. `sidebands` (k,) are those of several
+    lines, in cycles a trigger cycle from them.
     """
 
     setting: Setting
@@ -61,6 +62,7 @@ class Stretch:
     bend_std: float
     bend_prior_std: float
     referenced: bool = False
+    sidebands: Array = field(default_factory=lambda: np.zeros(0))
 
 
 class TimingData:
