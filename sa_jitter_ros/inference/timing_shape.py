@@ -70,7 +70,7 @@ class Shapes:
         data = fit.data
         inverse = 1.0 / fit.spectrum(fit.parameters)[:, 1, 1].real
         mean = float(np.average(inverse, weights=data.size))
-        rest = math.sqrt(max(1.0 / mean - power, _LEAST**2))
+        rest = max(1.0 / mean - power, _LEAST**2)
         total = 0.0
         for item, values in zip(data.stretches, errors):
             if item.error_std > _CLEAR * data.unit:
@@ -80,7 +80,9 @@ class Shapes:
             told[:-1] &= item.measured[1:]
             beyond = through(values, inverse / mean, data)[told][EDGE:-EDGE]
             normal = _normal(beyond, 1.0 / mean)
-            shaped = self._density(beyond, math.sqrt(power), rest)
+            # the trend that was taken out is known as well as so many errors tell it
+            trend = 2.0 / mean / values.size
+            shaped = self._density(beyond, math.sqrt(power), math.sqrt(rest + trend))
             total += float(np.sum(np.log((1.0 - _STRAY) * shaped / normal + _STRAY)))
         return total
 
