@@ -19,7 +19,7 @@ from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.inference.expectation import _leakage, expect, Lines, RESOLUTION
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.prediction.influence import Influence, Pulses
+from sa_jitter_ros.prediction.influence import Influence, Pulses, random_processes
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import angle_law
@@ -199,3 +199,14 @@ def test_leakage_from_few_places_is_that_of_all(law, size, rng):
         for s, source in enumerate(sources):
             wave = np.exp(2j * np.pi * (source * path + (source - order) * r * (cycle + u)))
             assert found[:, g, s] == pytest.approx(wave.mean(axis=(1, 2)), abs=1e-7)
+
+
+def test_mirror_images_far_away_do_not_leak():
+    """Of order 62 and its image, 558 turns of a cycle apart, hardly anything leaks."""
+    model = replace(MODEL, ratio=4.5, orders=(31.0, 62.0), keyphasor_rate=40_000.0)
+    observation = SimpleNamespace(model=model, orders=np.array(model.orders),
+                                  sources=np.array([31.0, 62.0, 0.5636]))
+    found = _leakage(observation, random_processes(model, ()), np.zeros((1, 41)))[0]
+    images = found[:, 3:5]  # of the two orders
+    assert np.abs(images).max() < 1e-3
+    assert np.abs(found[0, 0]) > 0.9

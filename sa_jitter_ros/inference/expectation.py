@@ -47,7 +47,8 @@ Distribution = AmplitudeDistribution | SampledDistribution
 
 #: Relative uncertainty of an amplitude that comes from resampling.
 RESOLUTION = 5e-4
-_NODES, _MOST_NODES = 32, 800
+_NODES, _IN_PANEL = 32, 64  # of an integral over a cycle, and of each panel of a longer one
+_A_TURN = 4.5  # nodes
 _PLACES = 12  # in a cycle, where errors turn hardly
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
@@ -355,7 +356,12 @@ def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
 
 @lru_cache(maxsize=8)
 def _nodes(count: int) -> tuple[Array, Array]:
-    return unit_nodes(count)
+    """Return at least so many nodes in [0, 1], and their weights."""
+    if count <= _IN_PANEL:
+        return unit_nodes(count)
+    panels = math.ceil(count / _IN_PANEL)
+    u, w = unit_nodes(_IN_PANEL)
+    return ((np.arange(panels)[:, None] + u).ravel() / panels, np.tile(w / panels, panels))
 
 
 def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], errors: Array
@@ -373,7 +379,7 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     e = errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + float(
         np.ptp(np.diff(e), axis=1).max()) * sources.max()
-    u, w = _nodes(int(min(_NODES + 3.5 * turns, _MOST_NODES)))
+    u, w = _nodes(math.ceil(_NODES + _A_TURN * turns))
     # errors turn a wave by little within a cycle: a polynomial through few places is exact
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
     places, gathered = _few_places(u, degree, 2.0 * np.pi * sources.max() * np.abs(e).max())
@@ -401,7 +407,7 @@ def _few_places(u: Array, degree: int, turn: float) -> tuple[Array, Array]:
     count = math.ceil(degree * (_PLACES + 2.0 * turn))
     if count >= u.size:
         return u, np.eye(u.size)
-    places, weights = _nodes(count)
+    places, weights = unit_nodes(count)
     series = legvander(2.0 * places - 1.0, count - 1) * weights[:, None]
     series *= 2.0 * np.arange(count) + 1.0
     return places, np.asarray(series @ legvander(2.0 * u - 1.0, count - 1).T)
