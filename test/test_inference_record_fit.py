@@ -14,7 +14,7 @@ from independent_effects import draw_case
 import numpy as np
 import pytest
 from record_recovery import fitted
-from sa_jitter_ros.inference.record_fit import fit_record
+from sa_jitter_ros.inference.record_fit import _States, fit_record
 
 
 @pytest.mark.machines
@@ -88,3 +88,28 @@ def test_the_declared_size_hardly_matters(rng, size):
     assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
         1.0, abs=4.0 / np.sqrt(2.0 * times.size))
     assert found.jitter_std == pytest.approx(5e-5, rel=4.0 / np.sqrt(2.0 * times.size))
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('seed', [201, 203])
+def test_a_tone_has_the_errors_that_it_states(seed):
+    run = fitted(('interfering_tone',), seed)
+    frequency, amplitude = draw_case(('interfering_tone',), seed).what.tone
+    assert run.fit.tones.size == 1
+    assert run.fit.tone_amplitudes.shape == (len(run.fit.amplitudes), 1)
+    errors = run.fit.amplitude_errors[:, -1]
+    z = (np.abs(run.fit.tone_amplitudes[:, 0]) - amplitude) / errors
+    assert np.all(np.abs(z) < 4.0)
+    duration = run.machine.average * run.machine.acquisitions
+    # of a line that begins and ends, by the least error of its phase on any channel
+    least = np.sqrt(12.0) * (errors / amplitude).min() / (2.0 * np.pi * duration)
+    assert abs(run.fit.tones[0] - frequency) < 4.0 * least
+
+
+def test_sidebands_turn_with_those_of_their_spacing(rng):
+    """Beside three lines 0.37 orders away; alone at 0.37, which turns with the shaft, too."""
+    states = _States.__new__(_States)
+    states.cycle_length, states.times, states.declared = 1.0, np.arange(301.0), 3
+    states.orders = np.array([8.0, 16.0, 24.0, 8.37, 15.63, 0.3701, 24.6, 11.2])
+    turning = np.array([True] * 4 + [False] * 4)
+    assert states._families(turning).tolist() == [True] * 6 + [False] * 2

@@ -18,10 +18,12 @@ from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
-from sa_jitter_ros.effects.timing import Setting
+from sa_jitter_ros.effects.lattice import smooth_on_grid
+from sa_jitter_ros.effects.timing import MOTION, Setting
 from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing
-from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_choice import Chooser
+from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.signal import lfilter
@@ -220,3 +222,81 @@ def test_memory_and_size_come_back_from_what_they_made():
     again, _ = CorrelatedJitter.of_timing(truth.in_timing(setting), np.zeros(2), setting)
     assert again.std == pytest.approx(truth.std)
     assert again.correlation == pytest.approx(truth.correlation)
+
+
+@pytest.mark.parametrize('rho', [0.0, 0.7])
+def test_distribution_of_single_errors_tells_normal_ones_beside_the_declared(rho):
+    """Half as large as the declared ones, they hide in the power but not in the edges."""
+    with_shape, without = [], []
+    for seed in range(6):
+        chooser = Chooser([machine(600 + seed, count=200, excess=0.5, rho=rho)])
+        nothing = chooser.fit(frozenset())
+        name = 'correlated_jitter' if rho else 'excess_jitter'
+        found = chooser.fit(frozenset([name]))
+        without.append(found.value - nothing.value)
+        with_shape.append(without[-1] + chooser.of_shape(found, 1.0)
+                          - chooser.of_shape(nothing, 1.0))
+    assert np.median(with_shape) > np.median(without) + 5.0
+    declared = Chooser([machine(700, count=200)])
+    nothing = declared.fit(frozenset())
+    assert declared.of_shape(nothing, 1.0) > 5.0  # uniform errors are no normal ones
+    assert Chooser([replace(item, setting=replace(
+        item.setting, model=replace(MODEL, jitter_distribution='normal')))
+        for item in declared.data.stretches]).of_shape(nothing, 1.0) == 0.0
+
+
+def test_events_that_fade_are_no_normal_errors_with_a_memory():
+    for seed in range(3):
+        timing = read_timing([machine(seed, shocks=4.0)])
+        events = [check.p_value for check in timing.checks if 'events' in check.text]
+        assert events
+        assert min(events) < 1e-4
+        drawn = read_timing([machine(seed, excess=1.5, rho=0.7)])
+        assert names_of(drawn) == {'correlated_jitter'}
+        (fair,) = [check.p_value for check in drawn.checks if 'events' in check.text]
+        assert fair > 1e-3
+
+
+def test_motion_that_ends_nowhere_is_no_remainder():
+    """A shaft that shakes faster than half the trigger rate shows at an alias."""
+    part = machine(8)
+    wave = 3.0 * UNIT * np.exp(2j * np.pi * 0.83 * part.setting.index)
+    turn = steering(MOTION, np.array([0.83]), np.array([0.83]))[0]
+    left = (turn[1] * wave).real  # of which the recovery follows the rest
+    moved = replace(part, errors=part.errors + left, bends=part.bends + (turn[2] * wave).real[:-1],
+                    setting=replace(part.setting, times=part.setting.times + wave.real,
+                                    true_times=part.setting.true_times + wave.real - left))
+    assert min(check.p_value for check in read_timing([moved]).checks) > 1e-3
+
+
+def test_sidebands_of_one_time_are_no_source_that_moves():
+    part = machine(9)
+    hum = 1.0 * UNIT * np.cos(2.0 * np.pi * 0.11 * part.setting.index)
+    moving = replace(part, errors=part.errors + hum, setting=replace(
+        part.setting, true_times=part.setting.true_times - hum))
+    known = replace(moving, sidebands=np.array([0.11]))
+    assert names_of(read_timing([known])) == set()
+    unknown = read_timing([moving])
+    assert names_of(unknown) or min(check.p_value for check in unknown.checks) < 1e-3
+
+
+def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
+    """The errors of the ticks are no white noise; only sizes that leave them whole remain."""
+    rate, skew = MODEL.keyphasor_rate, 4e-5
+    off = []
+    for seed in range(4):
+        part = machine(800 + seed, count=300, scale=0.0)
+        motion = part.setting.times
+        times = np.ceil(motion * rate) / rate
+        late = times - motion - 0.5 / rate + skew * (motion - motion[0])
+        late += 0.01 / rate * np.random.default_rng(seed).standard_normal(late.size)
+        late -= late.mean()
+        setting = replace(part.setting, times=times, true_times=times - late, clock_rate=rate,
+                          clock_errors=smooth_on_grid(times, rate))
+        timing = read_timing([replace(part, setting=setting, errors=late,
+                                      error_std=0.01 / rate)])
+        assert names_of(timing) == {'clock_skew', 'keyphasor_quantisation'}
+        value, error = value_of(timing, 'clock_skew', 'skew')
+        assert error < 0.1 * skew
+        off.append((value - skew) / error)
+    assert np.max(np.abs(off)) < 3.0

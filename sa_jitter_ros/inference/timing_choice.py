@@ -48,7 +48,6 @@ _BESIDE_CLOCK = 2  # patterns beside that of a clock
 _STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
 _BETTER = 0.01
 _RARE = 1e9
-_NEAR = 0.75  # of what a stretch resolves: power of a sideband
 _ROOM = 0.02  # of a tick that errors may leave it by
 
 
@@ -240,12 +239,12 @@ class Chooser:
         return np.stack(waves, axis=-1)
 
     def _near(self, lines: Array) -> Callable[[Array, Array], Array]:
-        """Return a density of some power near each of some frequencies, nothing elsewhere."""
-        reach = max(_NEAR / self.data.longest, 0.5 * float(np.diff(self.data.frequency).max()))
+        """Return a density that sinusoids of some power and frequencies leave in a stretch."""
+        width = max(1.0 / self.data.longest, 0.5 * float(np.diff(self.data.frequency).max()))
 
         def density(parameters: Array, frequency: Array) -> Array:
-            near = np.abs(frequency[..., None] - lines) < reach
-            return np.asarray(near @ np.exp(parameters))
+            apart = np.pi * (frequency[..., None] - lines) / width
+            return np.asarray(1.0 / (1.0 + apart**2) @ np.exp(parameters))
         return density
 
     def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,
