@@ -462,3 +462,15 @@ def test_every_pulse_is_counted_once(seed):
 def test_denormal_intervals_are_no_overflow():
     tiny = np.arange(8.0) * 5e-324
     validate(np.concatenate((tiny, 1.0 + np.arange(10.0) / 30.0)))
+
+
+def test_the_first_revolutions_of_two_marks_lose_no_pulse_by_jitter():
+    """By chance some revolutions of two marks repeat more narrowly than the jitter is."""
+    rng = np.random.default_rng(1)
+    accepted = 0
+    for _ in range(60):
+        count = 320
+        speed = 1.0 + 2e-3 * np.sin(2.0 * np.pi * np.arange(count) / rng.uniform(50.0, 400.0))
+        times = 0.02 * (np.cumsum(speed) + rng.uniform(-0.01, 0.01, count))
+        accepted += validate(times, pulses_per_revolution=2, missing_pulses='bridge')[3].accepted
+    assert accepted >= 60 * 320 - 8

@@ -11,6 +11,7 @@
 """The angles between the marks of a target, from the intervals of several revolutions."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ _UNEVEN = 0.5  # of levels: intervals of more than 1.6 times others are gaps
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
 _UNLIKE = 2.0  # tolerances by which the changes of speed may differ
 _CLEAN = 0.25  # of all pairs of revolutions are without a stray, at least
+_RANGE = {2: 0.4, 3: 0.75}  # of so many normal variables, in that of four and more
 
 
 @dataclass(frozen=True)
@@ -112,20 +114,26 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     # A displaced pulse of two marks repeats, too, with a change of speed that the others lack.
     slopes = windows.mean(axis=1)
     unlike = np.abs(slopes - (np.median(slopes[near]) if near.any() else 0.0))
-    for tolerance in _REPEATING:
-        fits = np.flatnonzero((apart <= tolerance) & near & (unlike <= _UNLIKE * tolerance))
-        if fits.size:
-            begin = int(fits[0])
-            slope = float(slopes[begin]) / count
-            two = (levels[begin:begin + 2 * count].reshape(2, count)
-                   - slope * np.arange(2 * count).reshape(2, count))
-            widths = two.mean(axis=0)
-            # Of large jitter some repeat by chance, which tell too small a scatter.
-            typical = max(float(np.median(apart[fits])) / 4.0,
-                          min(float(np.quantile(apart[near], _CLEAN)) / 3.0, tolerance))
-            scatter = float(np.std(two[1] - two[0])) + typical
-            return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
-    return None
+    found = [(tolerance, np.flatnonzero((apart <= tolerance) & near & (
+        unlike <= _UNLIKE * tolerance))) for tolerance in _REPEATING]
+    # Of few marks some repeat by chance: most of those without a stray have to.
+    often = [item for item in found if item[1].size > _CLEAN * np.count_nonzero(near)]
+    seldom = [item for item in found if item[1].size]
+    if not seldom:
+        return None
+    tolerance, fits = (often or seldom)[0]
+    begin = int(fits[0])
+    slope = float(slopes[begin]) / count
+    two = (levels[begin:begin + 2 * count].reshape(2, count)
+           - slope * np.arange(2 * count).reshape(2, count))
+    widths = two.mean(axis=0)
+    # Of large jitter some repeat by chance, which tell too small a scatter.
+    usual = _RANGE.get(count, 1.0)
+    typical = max(float(np.median(apart[fits])) / 4.0,
+                  min(float(np.quantile(apart[near], _CLEAN)) / 3.0, tolerance)) / usual
+    # The widths are those of two revolutions, as uncertain as one of these by a root of two.
+    scatter = math.sqrt(1.5) * (float(np.std(two[1] - two[0])) + typical)
+    return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
 
 
 def regular_start(levels: FloatArray, tolerance: float) -> int:
