@@ -238,7 +238,7 @@ def _usable(recordings: Sequence[Recording], names: Sequence[str]
     lost: set[int] = set()
     faults = []
     for name, recording in zip(names, recordings):
-        for channel, reason in channel_faults(recording).items():
+        for channel, reason in channel_faults(recording, most_lost=0.0).items():
             lost |= {channel} if is_lost(reason) else set()
             faults.append(f'{name}: {recording.channel_names[channel]} {reason}'
                           + (' and is left out' if is_lost(reason) else ''))

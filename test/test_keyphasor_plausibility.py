@@ -134,6 +134,19 @@ def test_loop_uses_the_good_channels_and_warns(recording):
         'loose is NaN', 'dead is cons', 'clipped is s']
 
 
+def test_loop_leaves_out_a_channel_with_gaps(recording):
+    samples = recording.read()
+    holes = np.vstack((samples, samples[:1]))
+    holes[-1, 5000:5100] = np.nan
+    gappy = replace(recording, vibration=ArraySource(holes), units=(*recording.units, ''),
+                    channel_names=(*recording.channel_names, 'gappy'))
+    with pytest.warns(DataWarning, match=r'gappy is NaN or infinite in [\d.]+% of its samples and '
+                                         'is left out'):
+        found = loop(gappy, DECLARED)
+    good = loop(recording, DECLARED)
+    assert found.report == {**good.report, 'created': found.created}
+
+
 def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
     write_npz(tmp_path / 'rig.npz', with_bad_channels(recording))
     (tmp_path / 'model.yaml').write_text('jitter_predictor:\n  ros__parameters:\n' + ''.join(

@@ -27,9 +27,11 @@ _FEWEST = 16
 _FIRST_VALUES = 4_000_000  # of a recording, in which its channels are judged
 
 
-def bad_channels(samples: FloatArray) -> dict[int, str]:
+def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[int, str]:
     """
     Return the channels of samples (channel, sample) that hold no vibration, with the reason.
+
+    A share of `most_lost` of their samples may be NaN or infinite.
 
     >>> time = np.arange(1000)
     >>> bad_channels(np.array([np.sin(0.1 * time), 0.0 * time, np.clip(np.sin(time), -0.5, 0.5)]))
@@ -38,9 +40,9 @@ def bad_channels(samples: FloatArray) -> dict[int, str]:
     found: dict[int, str] = {}
     for channel, values in enumerate(samples):
         finite = values[np.isfinite(values)]
-        if finite.size < _MOST_LOST * values.size:
+        if finite.size < (1.0 - most_lost) * values.size:
             share = 1.0 - finite.size / values.size
-            found[channel] = f'is NaN or infinite in {share:.0%} of its samples'
+            found[channel] = f'is NaN or infinite in {100.0 * share:.3g}% of its samples'
         elif finite.size < _FEWEST:
             continue
         elif np.ptp(finite) == 0.0:
@@ -55,11 +57,15 @@ def bad_channels(samples: FloatArray) -> dict[int, str]:
     return found
 
 
-def channel_faults(recording: Recording) -> dict[int, str]:
-    """Return the bad channels of a recording with the reason, from its first samples."""
+def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST) -> dict[int, str]:
+    """
+    Return the bad channels of a recording with the reason, from its first samples.
+
+    `most_lost` is that of `bad_channels`.
+    """
     count = min(recording.samples, max(_FIRST_VALUES // recording.channels, 1))
     try:
-        return bad_channels(next(recording.blocks(count)))
+        return bad_channels(next(recording.blocks(count)), most_lost=most_lost)
     except RecordingError:  # it is told to who reads up to the defect
         return {}
 
