@@ -66,7 +66,7 @@ def test_learns_then_names_the_change(ros_graph):
     assert b.diagnostics()[:2] == (OK, 'learning: 30 of 40 averages of input at 16.6 Hz')
     b.play(machine, 50)
     assert b.change() == {'baseline': {'averages': 80, 'complete': True}, 'changes': []}
-    assert b.diagnostics()[:2] == (OK, 'no change; 80 averages in the baseline')
+    assert b.diagnostics()[:2] == (OK, 'no change in 80 averages')
     machine.gain[1, 2] = 1.08
     b.play(machine, 80)
     found, = b.change()['changes']

@@ -122,7 +122,7 @@ class MachineMonitor:
 
     @property
     def averages(self) -> int:
-        """Return the number of averages in the baseline of all shafts."""
+        """Return the number of averages that all shafts have taken."""
         return sum(item.averages for item in self.monitors.values())
 
     @property

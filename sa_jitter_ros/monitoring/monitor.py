@@ -200,7 +200,8 @@ class ShaftMonitor:
         self._bin = 0
         self._intervals: list[float] = []
         self._end = math.nan
-        self.overlapping = self.uncorrected = self.beyond = 0
+        #: Averages taken, at all speeds, and those left out.
+        self.averages = self.overlapping = self.uncorrected = self.beyond = 0
 
     # --- averages ---
 
@@ -226,6 +227,7 @@ class ShaftMonitor:
         if interval > 0.0:
             self._intervals = [*self._intervals, interval][-_INTERVALS:]
         self._end, self._bin = header.end_time, key
+        self.averages += 1
         group = self._groups.setdefault(key, _Group(average))
         group.add(average)
         if group.count < self.settings.group_averages:
@@ -277,15 +279,12 @@ class ShaftMonitor:
     # --- the baseline ---
 
     @property
-    def averages(self) -> int:
-        """Return the number of averages in the baseline, and in the groups that are not full."""
-        learned = sum(float(place.count.max()) for place in self._test.bins.values())
-        return round(learned * self.settings.group_averages) + sum(
-            group.count for group in self._groups.values())
-
-    @property
     def learned(self) -> int:
-        """Return the number of averages in the baseline at the present speed."""
+        """
+        Return the number of averages in the baseline at the present speed.
+
+        Those with more noise than the others count less.
+        """
         place, group = self._test.bins.get(self._bin), self._groups.get(self._bin)
         count = 0.0 if place is None else float(place.count.max())
         return round(count * self.settings.group_averages) + (group.count if group else 0)
@@ -374,7 +373,7 @@ class ShaftMonitor:
         """Return what `restore` needs: arrays by names. Groups that are not full are left out."""
         return {**self._test.state(), 'products': self._products,
                 'intervals': np.array(self._intervals),
-                'place': np.array([self._speed, self._bin, self._end])}
+                'place': np.array([self._speed, self._bin, self._end, self.averages])}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from a state; raises KeyError and ValueError for one of something else."""
@@ -384,5 +383,5 @@ class ShaftMonitor:
             raise ValueError('other shape')
         self._products = state['products'].copy()
         self._intervals = state['intervals'].tolist()
-        speed, key, end = state['place'].tolist()
-        self._speed, self._bin, self._end = speed, int(key), end
+        speed, key, end, averages = state['place'].tolist()
+        self._speed, self._bin, self._end, self.averages = speed, int(key), end, int(averages)

@@ -189,7 +189,7 @@ class ChangeMonitor(MonitoringNode):
             return (f'learning: {item.learned} of {self._values["learning_averages"]} averages of '
                     f'{shaft} at {item.speed:.4g} Hz', values)
         return (f'{changes} changes' if changes else
-                f'no change; {monitor.averages} averages in the baseline'), values
+                f'no change in {monitor.averages} averages'), values
 
 
 def _some(lines: Sequence[str]) -> str:
