@@ -120,6 +120,31 @@ def test_a_displaced_pulse_among_equal_intervals_is_no_tick_of_a_clock(marks, cl
             assert found.size > 195 * marks
 
 
+@pytest.mark.parametrize('part', [0.49, 0.499, 0.5002])
+def test_two_keyphasors_of_one_name_are_named(rng, part):
+    pulses = 0.03 * np.arange(300.0) + rng.normal(0.0, 1e-6, 300)
+    validator = PulseValidator()
+    every = np.sort(np.append(pulses, pulses[:-1] + part * np.diff(pulses)))
+    for first in range(0, every.size, 7):
+        validator.update(every[first:first + 7])
+    message, = validator.take_messages()
+    longer, shorter = sorted((0.03 * part, 0.03 * (1.0 - part)), reverse=True)
+    assert message.startswith('the pulse intervals are longer and shorter in turns')
+    found = [float(word) for word in message.split() if word.startswith('0.')]
+    assert found == pytest.approx([longer, shorter], rel=3e-4)
+
+
+@pytest.mark.parametrize('clock', [0.0, 5120.0])
+def test_intervals_of_one_mark_are_in_no_turns(rng, clock):
+    for drift in (0.0, 0.02):
+        pulses = drifting(rng, 1500, 1, drift) + rng.normal(0.0, 2e-5, 1500)
+        if clock:
+            pulses = np.ceil(pulses * clock) / clock
+        validator = PulseValidator()
+        validator.update(pulses)
+        assert not validator.take_messages()
+
+
 @pytest.mark.parametrize('marks', [1, 2, 4])
 def test_a_displaced_pulse_in_the_first_revolutions_is_in_no_cycle(rng, marks):
     for trial in range(60):

@@ -36,6 +36,7 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.mark_pattern import mark_pattern, regular_start, repeating
 from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
@@ -126,6 +127,7 @@ class IntervalJudge:
         self._levels: list[float] = []
         self._times: list[float] = []
         self._learnt = 0  # times that the pattern was learnt
+        self._alternation = Alternation()
 
     @property
     def _few_marks(self) -> bool:
@@ -231,6 +233,8 @@ class IntervalJudge:
             self._counter.extend(pulses[:count].tolist(), lock.steps[slots[:count]].tolist())
             self.counts['accepted'] += count
             model.accept(levels[:count], gaps[:count])
+            if lock.steps.size == 1:
+                self._look_at_turns(levels[:count])
             self._recent = [*self._recent, *pulses[:count][-_AGREEING - 1:].tolist()][
                 -_AGREEING - 1:]
             self._note(slots[:count].tolist(), levels[:count].tolist(), pulses[:count].tolist())
@@ -239,6 +243,21 @@ class IntervalJudge:
             self._queue = self._queue[count:]
             self._learn_marks()
         return count
+
+    def _look_at_turns(self, levels: FloatArray) -> None:
+        """Say that intervals of one mark are longer and shorter in turns."""
+        known = self._alternation.size
+        self._alternation.update(levels)
+        size = abs(self._alternation.size)
+        if not size or known or self._rehearses or self._model.has_tick:
+            return
+        usual = math.exp(0.5 * (self._model.level + self._model.before))
+        self.messages.append(
+            f'the pulse intervals are longer and shorter in turns, {usual * math.exp(size):.6g} s '
+            f'and {usual * math.exp(-size):.6g} s: are they pulses of two keyphasors of one name, '
+            'or of two marks (pulses_per_revolution)? A load that repeats every two revolutions '
+            'does the same')
+        del self.messages[:-_MESSAGES]
 
     def _note(self, slots: list[int], levels: list[float], times: list[float]) -> None:
         """Note the intervals behind these slots, and when they end, for the pattern."""
@@ -442,6 +461,7 @@ class IntervalJudge:
 
     def _next(self, slots: list[int], level: float) -> float:
         """Take the first pulse out of the queue as the one at the end of these slots."""
+        self._alternation = Alternation()
         assert self._lock is not None
         pulse = float(self._queue[0])
         self._queue = self._queue[1:]
@@ -483,6 +503,7 @@ class IntervalJudge:
         self._end = _End(self.confirmed, self._model.level, self._model.scatter,
                          self._model.known)
         self._counter.stop()
+        self._alternation = Alternation()
         self._lock = self._candidate = None
         self._tried = self._failed = 0
         self._marks, self._levels, self._times = [], [], []

@@ -113,6 +113,11 @@ class IntervalModel:
         return not self.given and self.scatter > _NO_SHAFT
 
     @property
+    def has_tick(self) -> bool:
+        """Whether the latest intervals are multiples of the tick of a clock."""
+        return bool(self._tick or clock_tick(self._intervals, 0.0))
+
+    @property
     def known(self) -> int:
         """Return the number of intervals from which the scatter is known."""
         return int(self._count)
