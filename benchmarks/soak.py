@@ -34,7 +34,7 @@ from typing import Any
 
 import graph_speed
 from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
-                         transport, TRIGGER_CYCLES)
+                         transport, TRIGGER_CYCLES, usage)
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 import numpy as np
@@ -61,7 +61,7 @@ def resident(process: int) -> float:
 
 
 @contextmanager
-def nodes(correct: bool) -> Iterator[dict[str, subprocess.Popen[str]]]:
+def nodes(correct: bool, shafts: int) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """Start the nodes, the averager on the last core, and end them by SIGINT."""
     cores, running = sorted(os.sched_getaffinity(0)), {}
     try:
@@ -71,7 +71,10 @@ def nodes(correct: bool) -> Iterator[dict[str, subprocess.Popen[str]]]:
             for key, value in parameters.items():
                 arguments += ['-p', f'{key}:={str(value).lower()}']
             if name == 'synchronous_averager':
-                arguments += ['-p', f'correct_jitter:={str(correct).lower()}']
+                arguments += ['-p', f'correct_jitter:={str(correct).lower()}', '-p',
+                              f'shafts:={["shaft", *(f"shaft{k}" for k in range(1, shafts))]}']
+                for k in range(1, shafts):
+                    arguments += ['-p', f'shaft{k}.ratio:={0.37 + 0.231 * k:.3f}']
             core = cores[-1] if name == 'synchronous_averager' else cores[0]
             running[name] = subprocess.Popen(
                 [sys.executable, '-c', code, *arguments], text=True, env=transport(True),
@@ -85,7 +88,7 @@ def nodes(correct: bool) -> Iterator[dict[str, subprocess.Popen[str]]]:
                 raise RuntimeError(f'{name} ended with status {process.returncode}')
 
 
-def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
+def soak(channels: int, seconds: float, *, correct: bool, shafts: int, block_seconds: float,
          report: Callable[[str], None]) -> dict[str, Any]:
     """Run for so long; return latencies, memory and what the averager has counted."""
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
@@ -102,7 +105,7 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
             executor.spin_once(timeout_sec=0.2)
         return bool(until())
 
-    with nodes(correct) as running:
+    with nodes(correct, shafts) as running:
         if not spin(lambda: sink.status, 60.0):
             raise RuntimeError('the averager sent no status within 60 s')
         source = subprocess.Popen(
@@ -117,11 +120,13 @@ def soak(channels: int, seconds: float, *, correct: bool, block_seconds: float,
             report(f'{time.monotonic() - begin:.0f} of {seconds:.0f} s, {len(sink.ends)} averages')
             spin(lambda: source.poll() is not None, PERIOD)
         sent = json.loads(source.communicate()[0])
+        share = usage(running['synchronous_averager'].pid)[0] / (time.monotonic() - begin)
         spin(lambda: False, 3.0)
     context.try_shutdown()
     counts = sink.status[-1][3]
     return {
-        'channels': channels, 'seconds': seconds, 'correct_jitter': correct,
+        'channels': channels, 'seconds': seconds, 'correct_jitter': correct, 'shafts': shafts,
+        'cpu_share': share,
         'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': sent['latest'],
         'end': sink.ends, 'sequence': sink.sequences, 'published': int(counts['averages']),
         'latency': [arrival - sent['start'] - end for arrival, end in zip(
@@ -167,11 +172,14 @@ def section(found: Mapping[str, Any]) -> str:
         f': they were due while nothing came for {silence:.1f} s or more, and a topic keeps the '
         f'newest {RESULT_QOS.depth}, here of {RESULT_QOS.depth * PUBLISHED:g} s')
     jitter = 'with' if found['correct_jitter'] else 'without'
+    shafts, share = found.get('shafts', 1), found.get('cpu_share')
+    load = 'load ' if share is None else f'{100.0 * share:.0f} % of a core, load '
     text = (
         f'{found["seconds"] / 60.0:g} minutes at {found["channels"]} channels of {RATE / 1e3:g} '
-        f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {jitter} `correct_jitter`, load '
-        f'average {found["load"][1]}: {found["published"]:,} averages were published, at '
-        f'least {found["expected"]:,} were due; {absent:,} did not reach the watcher{silences}. '
+        f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {shafts} shaft{"s" * (shafts > 1)}, '
+        f'{jitter} `correct_jitter`, {load}average {found["load"][1]}: '
+        f'{found["published"]:,} averages were published, at least {found["expected"]:,} were '
+        f'due; {absent:,} did not reach the watcher{silences}. '
         f'The latency '
         f'from the last pulse of an average to its arrival is {np.median(latency):.0f} ms in the '
         f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
@@ -220,6 +228,7 @@ def main() -> int:
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--channels', type=int, default=128)
     parser.add_argument('--correct-jitter', action='store_true')
+    parser.add_argument('--shafts', type=int, default=1)
     parser.add_argument('--block-seconds', type=float, default=0.05, help='of a message, at most')
     parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'soak.json')
     parser.add_argument('--page', type=Path, default=ROOT / 'docs' / 'reliability.md')
@@ -228,7 +237,7 @@ def main() -> int:
     options = parser.parse_args()
     if not options.only_write:
         found = soak(options.channels, 60.0 * options.minutes, correct=options.correct_jitter,
-                     block_seconds=options.block_seconds,
+                     shafts=options.shafts, block_seconds=options.block_seconds,
                      report=lambda text: print(text, file=sys.stderr, flush=True))
         options.numbers.parent.mkdir(parents=True, exist_ok=True)
         options.numbers.write_text(json.dumps(found) + '\n')
