@@ -222,6 +222,19 @@ def test_order_that_was_not_there_appears():
     assert line.startswith('order 1 of input, channel 0: +')
 
 
+def test_absent_order_has_a_baseline_without_bias():
+    """An average that is large by chance publishes no larger error, and counts as any other."""
+    machine = Machine(16)
+    machine.gain[0, 0] = 0.0
+    monitor = machine.monitor()
+    machine.run(monitor, 2000)
+    found = monitor.baseline(16.6)
+    assert found.averages[0, 0] == 2000.0
+    error = found.scatter[0, 0] / np.sqrt(2000.0 / 5.0)
+    assert abs(found.mean[0, 0]) < 4.0 * error
+    assert error == pytest.approx(2.0 * 0.01**2 / np.sqrt(2000.0), rel=0.2)
+
+
 # --- what is no change ---------------------------------------------------------------------------
 
 

@@ -173,11 +173,10 @@ class _Group:
         self.known += np.isfinite(rows)
         self.sums += np.nan_to_num(rows)
 
-    def means(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return mean values, their noise variance and doubt; NaN where most are missing."""
+    def means(self) -> FloatArray:
+        """Return mean values, noise, doubt; NaN where most are missing."""
         enough = 2.0 * self.known >= self.count
-        value, noise, doubt = np.where(enough, self.sums / np.maximum(self.known, 1.0), np.nan)
-        return value, noise / np.maximum(self.known[0], 1.0), doubt
+        return np.where(enough, self.sums / np.maximum(self.known, 1.0), np.nan)
 
 
 class ShaftMonitor:
@@ -251,10 +250,16 @@ class ShaftMonitor:
         return groups / (self.settings.false_alarms_per_year * self._share)
 
     def _test_group(self, key: int, group: _Group) -> list[str]:
-        values, noise, doubt = (item.reshape(1, -1) for item in group.means())
-        place = self._test.bins.get(key)
+        means = group.means()
+        values = means[0].reshape(1, -1)
+        place, level = self._test.bins.get(key), values
         if place is not None:
             self._correlate(place, values)
+            known = place.baseline().mean
+            level = np.where(np.isnan(known), values, known)
+        noise, doubt = (item.reshape(1, -1) for item in self._of_squares(
+            level.reshape(self.layout.shape), *means[1:]))
+        noise = noise / np.maximum(group.known[0], 1.0).reshape(1, -1)
         mark = (float(group.first.sequence), group.first.start_time)
         changed, ended = self._test.update(key, values, noise, doubt, mark,
                                            self.scores_per_alarm())
@@ -264,6 +269,20 @@ class ShaftMonitor:
                 self.layout.shape)[item.channel, self._place(item)]]
         return lines + [f'{self._words(place)} is back at its baseline'
                         for place in np.flatnonzero(ended[0]).tolist()]
+
+    def _of_squares(self, level: FloatArray, noise: FloatArray, doubt: FloatArray
+                    ) -> tuple[FloatArray, FloatArray]:
+        """
+        Return variance and doubt of the squares of amplitudes, from those of the amplitudes.
+
+        `level` are the squares in the baseline. Those of the average itself would make an average
+        that is large by chance count less. Those of indicators stay as they are.
+        """
+        count = len(self.layout.orders)
+        own, square = noise[:, :count], np.maximum(level[:, :count], 0.0)
+        return (np.concatenate((4.0 * own * (square + own), noise[:, count:]), axis=1),
+                np.concatenate((2.0 * np.sqrt(square + own) * doubt[:, :count],
+                                doubt[:, count:]), axis=1))
 
     def _place(self, change: Change) -> int:
         names = [self.layout.name(item) for item in range(self.layout.shape[1])]

@@ -69,8 +69,8 @@ class MonitoredAverage:
     The monitored quantities of one average, each array (channel, quantity), NaN where unknown.
 
     `values` are squares of amplitudes without noise, then logarithms of indicators; `noise` are
-    their published variances without, and `doubt` the published errors of the correction for the
-    keyphasor alone.
+    the published variances of amplitudes and logarithms without, and `doubt` the published errors
+    of the correction for the keyphasor alone.
     """
 
     header: AverageHeader
@@ -147,8 +147,8 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
         amplitudes.header, Layout(channels, tuple(table[0, :, 0].tolist()) if channels else (),
                                   names),
         np.concatenate((square, np.log(values)), axis=1),
-        np.concatenate((4.0 * own * np.maximum(square + own, own), variance), axis=1),
-        np.concatenate((2.0 * amplitude * doubt, relative * power), axis=1))
+        np.concatenate((own, variance), axis=1),
+        np.concatenate((doubt, relative * power), axis=1))
     for array in (found.values, found.noise, found.doubt):
         array[~(np.isfinite(array) & corrected)] = np.nan
     return found

@@ -39,7 +39,7 @@ _SURE_SKEWNESS, _LARGEST_SKEWNESS = 2.0, 2.0
 _ROUNDING = 1e-6
 # Share of a new value in the mean of published errors, and where these differ from the baseline's:
 # at once, or in the mean.
-_SHARE, _AT_ONCE, _IN_THE_MEAN = 1.0 / 16.0, 1.5, 1.1
+_SHARE, _AT_ONCE, _IN_THE_MEAN = 1.0 / 16.0, 2.5, 1.1
 _TINY = float(np.finfo(np.float64).tiny)
 
 
