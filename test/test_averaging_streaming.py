@@ -515,7 +515,7 @@ def test_fault_costs_its_cycles_and_nothing_else(fault, lag):
     if fault == 'lost':
         del blocks[30]
     elif fault in ('nan', 'infinite'):
-        blocks[30].samples[1, 300] = np.nan if fault == 'nan' else -np.inf
+        blocks[30].samples[:, 300] = np.nan if fault == 'nan' else -np.inf
     elif fault == 'shape':
         blocks[30] = SampleBlock(blocks[30].samples[:1], blocks[30].start_time, machine.rate,
                                  blocks[30].index)
@@ -763,7 +763,7 @@ def test_every_sample_is_averaged_or_counted():
     for number in range(100):
         block = machine.block(160 * number, 160)
         if number == bad:
-            block.samples[0, 7] = np.nan
+            block.samples[:, 7] = np.nan
         if number not in lost:
             target.add_samples(block)
             received += 160
