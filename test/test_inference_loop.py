@@ -234,6 +234,24 @@ def test_measured_gearbox_needs_the_phases_of_its_pulses(shared_data):
     assert content['error_after']['rms'] < 0.015
 
 
+@pytest.mark.parametrize('name', ['motor_10V_100kHz.npz', 'uia_bearing_rig_1.npz'])
+def test_recording_without_lines_to_compare_says_what_it_cannot_exclude(shared_data, name):
+    recording = read(shared_data / name)
+    motor = name.startswith('motor')
+    model = DeclaredModel(
+        keyphasor_rate=1e5 if motor else 1024.0, trigger_speed=19.6 if motor else 4.19,
+        trigger_cycles=5 if motor else 10, pulses_per_revolution=8 if motor else 1,
+        orders=(12.0, 16.0, 18.0) if motor else (1.0, 2.0, 3.0))
+    content = report(trace([observe(recording, model)], [recording]))
+    assert content['verdict'] == 'none'
+    assert content['error_before']['rms'] is None
+    upper = {item['name']: item['upper_95'] for item in content['limits']}
+    assert upper['clock_skew'] > 0.0  # the timing is known, if badly
+    assert upper['additive_noise'] is None  # there is no line
+    assert {'additive_noise', 'amplitude_modulation'} <= set(content['undecided'])
+    assert 'missing_pulses' not in upper  # which the pulse times show
+
+
 def test_residual_of_what_is_predicted_is_chance(rng):
     shape = (30, 6)
     draws = rng.normal(0.9, 0.02, shape)

@@ -21,6 +21,7 @@ pattern, whose size has either sign, it is the size of which an estimate as smal
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 import math
 from typing import Any
 
@@ -117,6 +118,7 @@ def largest(timing: Timing, name: str) -> Effect | None:
     fit = chooser.fit(names, choice.fit.starts)
     best, start = max(fit.value, choice.fit.value), dict(fit.starts)
 
+    @cache  # fits start where others ended: another one may differ by a little
     def fallen(log_power: float) -> float:
         held = chooser.fit(names, start, held={(name, 0): log_power})
         start.update(held.starts)

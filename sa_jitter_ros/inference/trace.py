@@ -46,6 +46,7 @@ from sa_jitter_ros.inference.residual import ACCURACY, Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
+from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
 Array = NDArray[Any]
@@ -155,14 +156,34 @@ def _unresolved(observation: Observation) -> str:
 
 
 def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str) -> Trace:
-    """Return the trace of a recording whose lines cannot be compared: its pulse times remain."""
+    """
+    Return the trace of a recording whose lines cannot be compared.
+
+    Nothing is found. What of the timing its vibration excludes still has a limit; whatever that
+    leaves, and all that only lines show, is undecided.
+    """
     count = len(observation.acquisitions)
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
     fit, held_out = parted(count)
+    parts = stretches(observation, range(count), Clock(0.0, 0.0)) if observation.recoveries else []
+    timing = read_timing(parts, declared, names=frozenset()) if parts else None
+    told = [name for name, kind in EFFECTS.items() if kind.visible_in_pulse_times]
+    rows = limits(timing, None, [*told, *(item.name for item in declared)])
+
+    def change(others: Sequence[Effect], effect: Effect) -> float:
+        without, with_it = (predict(observation.model, known) for known in (
+            others, [*others, effect]))
+        return float(max(np.abs(getattr(with_it, name) - getattr(without, name)).max()
+                         for name in ('mean_attenuation', 'standard_deviation')))
+
+    open_ = [row.name for row in rows if row.upper is None and row.lower is None]
+    undecided = tuple(row.name for row in rows if row.name in {
+        *open_, *_undecided(change, declared, rows)})
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, (), (), (),
         UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing,
-        None, 'none', float('nan'), None, None, (), (), {}, reason)
+        None, 'none', float('nan'), None, None, rows, undecided,
+        {row.name: _PRIOR for row in rows}, reason)
 
 
 def require_acquisitions(observation: Observation) -> None:
