@@ -21,15 +21,15 @@ _ABSOLUTE = 2.0**32  # s: the range of times since 1970, until 2106
 
 def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
     """
-    Return first and end index of each span of `samples` (channel, sample) that is finite.
+    Return first and end index of each span of `samples` (channel, sample) that a channel has.
 
-    >>> finite_spans(np.array([[0.0, np.nan, 2.0, 3.0]]))
+    >>> finite_spans(np.array([[0.0, np.nan, 2.0, 3.0], [0.0, np.nan, np.nan, 1.0]]))
     [(0, 1), (2, 4)]
     """
     every = np.isfinite(samples)
     if every.all():
         return [(0, samples.shape[1])] if samples.size else []
-    finite = np.concatenate(([False], every.all(axis=0), [False])).astype(np.int8)
+    finite = np.concatenate(([False], every.any(axis=0), [False])).astype(np.int8)
     return [(int(begin), int(end))
             for begin, end in np.flatnonzero(np.diff(finite)).reshape(-1, 2)]
 
@@ -77,7 +77,12 @@ class SampleBlock:
         return self.index + int(self.samples.shape[1])
 
     def finite_parts(self) -> 'tuple[SampleBlock, ...]':
-        """Return the parts without NaN and infinity; the index has a gap between them."""
+        """
+        Return the parts that at least one channel has; the index has a gap between them.
+
+        The samples that other channels lack are NaN.
+        """
+        kept = np.where(np.isfinite(self.samples), self.samples, np.nan)
         return tuple(SampleBlock(
-            self.samples[:, begin:end], self.start_time + begin / self.sample_rate,
-            self.sample_rate, self.index + begin) for begin, end in finite_spans(self.samples))
+            kept[:, begin:end], self.start_time + begin / self.sample_rate,
+            self.sample_rate, self.index + begin) for begin, end in finite_spans(kept))

@@ -451,7 +451,7 @@ class VibrationTimeline:
                                  'channels: their cycles are discarded')
         self._name_channels(np.flatnonzero(~every[:, some].all(axis=1)).tolist(), index)
         kept = np.where(every, samples, np.nan)
-        spans = finite_spans(np.where(some, 0.0, np.nan)[None])
+        spans = finite_spans(samples)
         if not spans or spans[0][0] > 0:
             self._close()
         for begin, end in spans:
