@@ -64,6 +64,7 @@ _REMAINS = 0.005  # p value of what is unexplained
 _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
 _PLAIN = 1e-12  # p value of a pattern that no other error can make
 _SCATTER = 'the scatter of the amplitudes'
+_WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _UNSEEN = 'nothing of it shows in this recording'
 _FEWEST = 4
 _HELD_OUT = 6
@@ -222,10 +223,12 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     moves = dependences(bench, effects, chosen) if chosen else at_first
     left = _unexplained(bench, timing, chosen)
     unexplained = remains(after, moves) or left is not None
-    absorbed = left.text if left is not None else _SCATTER if (
+    worse = unexplained and after.score < before.score
+    absorbed = left.text if left is not None else _WORSE if worse else _SCATTER if (
         after.p_amplitude < _REMAINS) else ''
     if absorbed:
-        chosen, candidates = _beyond_doubt(chosen, candidates, absorbed, left is None)
+        chosen, candidates = _beyond_doubt(chosen, candidates, absorbed,
+                                           left is None and not worse)
         effects = _effects(chosen)
         own = bench.unsteadiness(effects)
         before = bench.score((), unsteadiness=own)
