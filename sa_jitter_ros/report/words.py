@@ -117,7 +117,7 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
             steps.append(f'To tell {item["name"]} from '
                          f'{_listed(item["indistinguishable_from"], "or")}, take '
                          f'{item["deciding_measurement"]}.')
-    if content['undecided']:
+    if content['undecided'] and content['lines']:
         steps.append('This recording cannot exclude '
                      f'{_listed(content["undecided"], "or")}, which may change '
                      f'an amplitude by {percent_text(_LARGEST)} or more. A longer recording '
