@@ -105,12 +105,13 @@ def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, 
 @pytest.mark.machines
 @pytest.mark.parametrize('cycles', [5, 10])
 def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
-    coverage, trials = benchmark('coverage'), 250
+    coverage, trials = benchmark('coverage'), 1200
     raw, _ = coverage.coverage(coverage.Case(cycles, 40.0, 0.8, correct=False), trials, seed=1)
-    for width, wanted in ((1.0, 0.683), (1.96, 0.95)):
-        found = np.mean(np.abs(raw.amplitude['absent']) < width)
-        limit = 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
-        assert found == pytest.approx(wanted, abs=limit)
+    # of few cycles in so large a jitter they are too safe, by up to 10 points (docs/theory.md)
+    for width, wanted, safe in ((1.0, 0.683, 0.1), (1.96, 0.95, 0.03)):
+        off = np.mean(np.abs(raw.amplitude['absent']) < width) - wanted
+        error = 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
+        assert -0.03 - error < off < safe + error
     assert raw.upper['absent'].mean() > 0.92
 
 
