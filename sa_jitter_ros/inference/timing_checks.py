@@ -65,7 +65,8 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     found = [max((check(fit, fit.beside_motion(alias), direction) for alias in _MOTIONS),
                  key=lambda item: item.p_value)
              for direction in directions for check in (_power, _sinusoid)]
-    lasting = [name for name, item in fit.spectra.items() if len(item.upper) > 1]
+    lasting = [name for name, item in fit.spectra.items()
+               if name in EFFECTS and len(item.upper) > 1]
     return (*found, _shape(chooser, choice), *(_events(chooser, choice, name) for name in lasting),
             _steadiness(chooser, choice))
 

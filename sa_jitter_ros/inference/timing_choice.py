@@ -248,10 +248,9 @@ class Chooser:
         return density
 
     def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,
-            extra: Mapping[str, Spectrum] | None = None,
             held: Mapping[tuple[str, int], float] | None = None) -> TimingFit:
-        """Return the fit of a set; `extra` spectra are in question, too."""
-        if not extra and not held and names in self.fits:
+        """Return the fit of a set; `held` maps (name, number) to a parameter that stays."""
+        if not held and names in self.fits:
             return self.fits[names]
         fixed: list[Fixed] = []
         known: Array | float = 0.0
@@ -270,10 +269,10 @@ class Chooser:
         new = [[(name, np.array(first)) for first in item.starts] for name, item in spectra.items()
                if name not in start]
         found = max((TimingFit(
-            self.data, {**spectra, **(extra or {})}, patterns, scaled=JITTER in names, fixed=fixed,
+            self.data, spectra, patterns, scaled=JITTER in names, fixed=fixed,
             known=known, start={**start, **dict(some)}, held=held) for some in product(*new)),
             key=lambda fit: fit.value)
-        if not extra and not held:
+        if not held:
             self.fits[names] = found
         return found
 

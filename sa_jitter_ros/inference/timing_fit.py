@@ -31,7 +31,7 @@ Array = NDArray[Any]
 
 #: What is always there: the motion of the shaft, the declared jitter, the noise of the recovery.
 SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'
-#: Extra components, which no effect has: spectra of free shape in one direction.
+# Frequencies at which the spectrum of the motion is free.
 _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
@@ -49,13 +49,6 @@ def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
     level = np.where(frequency > 0.5, parameters[_KNOTS - 1] - np.exp(parameters[_KNOTS]) * (
         place - knots[-1]), level)
     return np.asarray(np.exp(level) / (2.0 * np.pi * frequency) ** 4)
-
-
-def free_density(knots: int, top: float, lowest: float) -> Callable[[Array, Array], Array]:
-    """Return a density that is free at some frequencies up to `top`."""
-    places = np.log(np.geomspace(lowest, top, knots))
-    return lambda parameters, frequency: np.asarray(
-        np.exp(np.interp(np.log(frequency), places, parameters)))
 
 
 @dataclass(frozen=True)
@@ -197,12 +190,6 @@ class TimingFit:
         noise = parameters[self.place[NOISE]][0] / _NOISE_KNOWN
         slope[self.place[NOISE].start] = noise / _NOISE_KNOWN
         total = 0.5 * (bend @ bend + steep**2 + noise**2)
-        for name, item in self.spectra.items():
-            if len(item.upper) > _KNOTS:  # of free shape
-                step = np.diff(parameters[self.place[name]]) / _SMOOTH
-                slope[self.place[name]] += np.diff(np.eye(len(item.upper)), axis=0).T @ step / (
-                    _SMOOTH)
-                total += 0.5 * step @ step
         return float(total), slope
 
     def _cost(self, parameters: Array) -> tuple[float, Array]:
