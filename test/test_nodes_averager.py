@@ -381,6 +381,9 @@ def test_orders_and_shafts_beyond_nyquist(bench):
     _, text, values = b.diagnostics()
     assert 'turbine: shaft frequency 6660 Hz is not below half the sampling rate' in text
     assert int(values['cycles_dropped']) == int(values['trigger_cycles']) > 20
+    level, text, _ = b.diagnostics()  # as long as the order is asked for
+    assert level == DiagnosticStatus.WARN
+    assert text.startswith('orders of shaft: no amplitude of orders 300: the shaft turns at 33.3')
 
 
 # --- parameters ----------------------------------------------------------------------------------

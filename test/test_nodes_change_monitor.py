@@ -113,9 +113,12 @@ def test_missing_correction_is_said(ros_graph):
     b.play(machine, 3)
     level, text, values = b.diagnostics()
     assert level == WARN
-    assert text.startswith('comparison of input: order_amplitude has no corrected amplitudes')
+    assert text.startswith('comparison of input: without 3 of the latest 10 averages, '
+                           'order_amplitude has no corrected amplitudes')
     assert (values['uncorrected'], values['baseline_averages']) == ('3', '8')
     machine.corrected = True
+    b.play(machine, 9)
+    assert b.diagnostics()[1].startswith('comparison of input: without 1 of the latest 10 ')
     b.play(machine, 1)
     b.diagnostics()
     assert b.diagnostics()[0] == OK

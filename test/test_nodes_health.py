@@ -238,12 +238,46 @@ def test_refused_correction_stays_a_warning(ros_graph, rng):
     b.play(MACHINE, 1.0, change=noise)
     for _ in range(2):
         level, text, values = b.diagnostics()
+        count = values['shaft.corrections_refused']
         assert level == WARN
-        assert text.startswith(f'correction of shaft: refused, {values["shaft.refusal"]}')
+        assert text.startswith(f'correction of shaft: refused for {count} of the latest {count} '
+                               f'averages: {values["shaft.refusal"]}')
     assert b.set_parameter('correct_jitter', False) == (True, '')
     b.play(MACHINE, 1.0, start=2.0)
     b.diagnostics()
     assert b.diagnostics()[0] == OK
+
+
+def test_a_few_refused_corrections_are_a_warning_until_enough_were_accepted(ros_graph, rng):
+    b = AveragerBench(ros_graph, trigger_cycles=10, correct_jitter=True)
+
+    def noise(number, block):
+        return [SampleBlock(rng.standard_normal(block.samples.shape), block.start_time,
+                            block.sample_rate, block.index)]
+
+    b.play(MACHINE, 1.0, change=noise)
+    refused = int(b.diagnostics()[2]['shaft.corrections_refused'])
+    b.play(MACHINE, 1.5, start=1.0)
+    b.diagnostics()
+    level, text, values = b.diagnostics()
+    assert values['shaft.corrections_refused'] == str(refused)
+    assert level == WARN
+    assert text.startswith(f'correction of shaft: refused for {refused} of the latest '
+                           f'{values["averages"]} averages: {values["shaft.refusal"]}')
+    b.play(MACHINE, 3.0, start=2.5)
+    b.diagnostics()
+    level, _, values = b.diagnostics()
+    assert int(values['averages']) > 10 + refused
+    assert level == OK
+
+
+def test_mesh_orders_that_the_waveform_lacks_stay_a_warning(ros_graph):
+    b = AveragerBench(ros_graph, trigger_cycles=10, shaft__mesh_orders=[5000.0])
+    b.play(MACHINE, 1.0)
+    for _ in range(2):
+        level, text, _ = b.diagnostics()
+        assert level == WARN
+        assert text.startswith('condition indicators of shaft: ')
 
 
 def test_prediction_follows_the_speed_of_an_average_not_its_jitter(ros_graph, rng):

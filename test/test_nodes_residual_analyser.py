@@ -358,6 +358,10 @@ def test_averages_without_correction_are_refused(bench):
     values = b.diagnostics()[2]
     assert values['uncorrected'] == '8'
     assert values['averages'] == '0'
+    b.average([replace(item, start_time=item.start_time + 100.0, end_time=item.end_time + 100.0)
+               for item in synthetic(3)])
+    assert b.spin(lambda: b.diagnostics()[2]['averages'] == '3')
+    assert b.diagnostics()[1].startswith('comparison: without 7 of the latest 10 averages, ')
 
 
 def test_averages_with_unresolved_pulses_are_counted(bench):

@@ -319,3 +319,18 @@ class Average:
                 f'{self.trigger_speed:.5g} Hz from {self.start_time:.6g} s to '
                 f'{self.end_time:.6g} s, waveform {self.waveform.shape}, orders '
                 f'{listed(self.orders)}{corrected})')
+
+
+def beyond_nyquist(average: Average, ratio: float, rate: float) -> str:
+    """
+    Return which orders have no amplitude because they are too high, '' if all have one.
+
+    The shaft turns `ratio` times as fast as the tach shaft, vibration is sampled at `rate` Hz.
+    """
+    speed = ratio * average.trigger_speed
+    orders = average.orders[average.orders * speed >= 0.5 * rate]
+    if not orders.size:
+        return ''
+    return (f'no amplitude of orders {listed(orders)}: the shaft turns at '
+            f'{speed:.5g} Hz, and vibration sampled at {rate:g} Hz shows orders below '
+            f'{0.5 * rate / speed:.5g} only; drop these orders, or check ratio and sample_rate')

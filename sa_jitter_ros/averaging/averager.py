@@ -23,12 +23,12 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
+from sa_jitter_ros.averaging.average import Average, beyond_nyquist, KeyphasorParameters
 from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
-from sa_jitter_ros.parameters import listed, number, numbers
+from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
@@ -273,21 +273,11 @@ def average(
             + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
     if discarded:
         warnings.warn(f'{likely}; {discarded}' if likely else discarded, DataWarning, stacklevel=2)
-    beyond = _beyond_nyquist(found, float(ratio), float(sample_rate))
+    beyond = beyond_nyquist(max(found, key=lambda item: item.trigger_speed), float(ratio),
+                            float(sample_rate))
     if beyond:
         warnings.warn(beyond, DataWarning, stacklevel=2)
     return found
-
-
-def _beyond_nyquist(found: Sequence[Average], ratio: float, rate: float) -> str:
-    """Return which orders have no amplitude because they are too high, '' if all have one."""
-    speed = ratio * max(average.trigger_speed for average in found)
-    orders = found[0].orders[found[0].orders * speed >= 0.5 * rate]
-    if not orders.size:
-        return ''
-    return (f'no amplitude of orders {listed(orders)}: the shaft turns at '
-            f'{speed:.5g} Hz, and vibration sampled at {rate:g} Hz shows orders below '
-            f'{0.5 * rate / speed:.5g} only; drop these orders, or check ratio and sample_rate')
 
 
 def _array(vibration: ArrayLike) -> NDArray[np.generic]:

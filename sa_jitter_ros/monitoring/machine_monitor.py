@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sa_jitter_ros.averaging.results import AverageMessage
+from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
@@ -79,8 +80,8 @@ class MachineMonitor:
         self._pairings = {shaft: Pairing() for shaft in shafts}
         self._without = dict.fromkeys(shafts, 0)
         self.use(settings)
-        #: Whether the latest average of each shaft had corrected amplitudes.
-        self.corrected: dict[str, bool] = {}
+        #: How many of the latest averages of each shaft had no corrected amplitudes.
+        self.uncorrected = {shaft: Shortfall() for shaft in shafts}
         #: Whether the file lacks what is known now.
         self.unsaved = False
 
@@ -101,7 +102,7 @@ class MachineMonitor:
         """
         lines: list[str] = []
         for average in self._pairings[shaft].add(kind, message):
-            self.corrected[shaft] = average.is_known
+            self.uncorrected[shaft].add(not average.is_known)
             monitor = self.monitors.get(shaft) or self._begin(shaft, average)
             if monitor is not None:
                 lines += monitor.update(average)

@@ -15,6 +15,7 @@ from rclpy.publisher import Publisher
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.results import ShaftResults
+from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import encode_average
 from std_msgs.msg import Float64MultiArray
@@ -33,6 +34,7 @@ class ShaftOutput:
                          'condition_indicator', 'condition_indicator_error', 'corrected_average',
                          'pulse_error', 'envelope_amplitude', 'envelope_spectrum')}
         self._results = ShaftResults()
+        self._refusals = Shortfall()
         self.published = self.refused = 0
         self.refusal = ''
 
@@ -45,8 +47,7 @@ class ShaftOutput:
         for kind, result in self._results.of(average).items():
             self._publishers[kind].publish(encode_average(kind, result))
         self.published += 1
-        if self._results.problem:
-            self._node.warn(f'{self._name}: {self._results.problem}')
+        self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])
         lacking = np.all(np.isnan(average.waveform), axis=1)
         for channel, (is_constant, is_lacking) in enumerate(zip(constant, lacking)):
@@ -55,9 +56,13 @@ class ShaftOutput:
             self._node.set_missing(f'channel {channel} of vibration', (
                 f'{what}, look at its sensor and cable' if what else ''))
         correction = average.correction
-        refusal = '' if correction is None or correction.accepted else correction.reason
+        if correction is None:  # not asked for
+            self._refusals = Shortfall()
+        else:
+            self._refusals.add(not correction.accepted)
+            if not correction.accepted:
+                self.refused += 1
+                self.refusal = correction.reason
         self._node.set_missing(f'correction of {self._name}',
-                               f'refused, {refusal}' if refusal else '')
-        if refusal:
-            self.refused += 1
-            self.refusal = refusal
+                               f'refused for {self._refusals}: {self.refusal}'
+                               if self._refusals else '')

@@ -163,11 +163,12 @@ class ChangeMonitor(MonitoringNode):
             return
         found = self._monitor.monitors
         self.counts.update(averages_overlapping=sum(item.overlapping for item in found.values()))
-        for shaft, latest in self._monitor.corrected.items():
-            self.set_missing(f'comparison of {shaft}', '' if latest else (
-                'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
-                'averager; if the averager refuses the correction (see its diagnostics), use a '
-                'better keyphasor, or allow_uncorrected: true if it will never be exchanged'))
+        for shaft, lack in self._monitor.uncorrected.items():
+            self.set_missing(f'comparison of {shaft}', (
+                f'without {lack}, order_amplitude has no corrected amplitudes: set '
+                'correct_jitter: true in the averager; if the averager refuses the correction '
+                '(see its diagnostics), use a better keyphasor, or allow_uncorrected: true if it '
+                'will never be exchanged') if lack else '')
 
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return what is learnt and how many quantities have changed."""

@@ -23,6 +23,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
+from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.declaration import declaration_of, predictor_parameters, SHAFTS
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.errors import MessageError, SaJitterError
@@ -75,6 +76,7 @@ class ResidualAnalyser(MonitoringNode):
         self._added: set[str] = set()  # names of the effects that were set in the predictor
         self._verdict = self._activity = ''
         self._batches = self._uncorrected = self._interrupted = 0
+        self._skipped, self._skipped_because = Shortfall(), ''
         self._unresolved = self._untraced = 0
         self._predictor_name = self._values['predictor']
         self._predictor = AsyncParameterClient(self, self._predictor_name)
@@ -107,17 +109,23 @@ class ResidualAnalyser(MonitoringNode):
         self._average_flow.came()
         self._average_flow.allowance = average.end_time - average.start_time
         corrected = bool(np.isfinite(average.attenuation).any())
-        if decoded.header.discarded_cycles:  # the prediction is that of consecutive cycles
+        interrupted = bool(decoded.header.discarded_cycles)
+        if interrupted:
             self._interrupted += 1
-            return
-        if corrected:
+            self._skipped_because = (
+                'discarded trigger cycles between those of an average, and the prediction is that '
+                'of consecutive ones: look at the pulses (see the diagnostics of the averager)')
+        elif corrected:
             self._batch.add(average)
         else:
             self._uncorrected += 1
-        self.set_missing('comparison', '' if corrected else (
-            'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
-            'averager; if the averager refuses the correction (see its diagnostics), use a better '
-            'keyphasor'))
+            self._skipped_because = (
+                'order_amplitude has no corrected amplitudes: set correct_jitter: true in the '
+                'averager; if the averager refuses the correction (see its diagnostics), use a '
+                'better keyphasor')
+        self._skipped.add(interrupted or not corrected)
+        self.set_missing('comparison', f'without {self._skipped}, {self._skipped_because}'
+                         if self._skipped else '')
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)

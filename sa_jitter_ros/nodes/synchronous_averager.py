@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.averaging.average import Average, beyond_nyquist
 from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings,
     streaming_averager)
@@ -136,9 +136,12 @@ class SynchronousAverager(MonitoringNode):
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
         revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
+        _, rate = self._averager.timeline.layout or (0, np.inf)
         for name, average in averages:
             self._average_flow.came()
             self._shafts[name].publish(average)
+            ratio = self._averager.shafts[name].settings.cycle_length / revolutions
+            self.set_missing(f'orders of {name}', beyond_nyquist(average, ratio, rate))
         speed = self._averager.take_speed() * revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))
