@@ -42,9 +42,9 @@ ComplexArray = NDArray[np.complex128]
 # Cycles from which on it is not known how many come.
 _ALL_CYCLES = 1 << 40
 #: Samples times channels that are averaged together.
-TOGETHER = 1 << 18
+TOGETHER = 1 << 20
 # Numbers that are resampled, projected and averaged together, but not fewer positions.
-_CACHED, _FEW = 1 << 16, 1 << 11
+_CACHED, _FEW = 1 << 17, 1 << 11
 # Points of a trigger cycle beside which those around its ends cost little.
 _LONG = 8 * EDGE
 
