@@ -38,7 +38,8 @@ import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
-from sa_jitter_ros.pulses.mark_pattern import mark_pattern, regular_start, repeating
+from sa_jitter_ros.pulses.mark_pattern import (
+    mark_pattern, regular_start, repeating, steady_pattern)
 from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
 from sa_jitter_ros.pulses.target import EvenTarget, Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter
@@ -555,8 +556,7 @@ class IntervalJudge:
 
     def _rehearsed(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock with the angles between the marks, which the pulses (n,) show."""
-        judge = self._rehearsal(replace(lock, believed=np.maximum(lock.believed, _BELIEVED)),
-                                pulses[lock.first:])
+        judge = self._rehearsal(_uneven(lock), pulses[lock.first:])
         marks, levels = np.array(judge._marks, np.int64), np.array(judge._levels)
         pattern = mark_pattern(marks, levels, lock.steps.size)
         if pattern is None:
@@ -579,9 +579,16 @@ class IntervalJudge:
             return None
         begin, pattern = found
         learnt = lock.with_pattern(pattern)
-        return self._from_earliest(replace(
+        learnt = self._from_earliest(replace(
             learnt, first=begin, slot=0,
             interval=math.exp(levels[begin]) / float(learnt.widths[0])), pulses)
+        # All revolutions know angles and scatter better than these two.
+        judge = self._rehearsal(_uneven(learnt), pulses[learnt.first:])
+        every = steady_pattern(np.array(judge._marks, np.int64), np.array(judge._levels), size)
+        if every is None:
+            return learnt
+        known = max(learnt.known, len(judge._levels) - size)
+        return replace(learnt.with_pattern(every), known=known)
 
     def _from_earliest(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock from the earliest of the pulses (n,) on that fits, in reversed time."""
@@ -648,3 +655,8 @@ class IntervalJudge:
             weight=1.0 / min(2 + self._learnt, 8))
         self._learnt += 1
         self._marks, self._levels, self._times = [], [], []
+
+
+def _uneven(lock: Lock) -> Lock:
+    """Return the lock with marks that may be uneven."""
+    return replace(lock, believed=np.maximum(lock.believed, _BELIEVED))

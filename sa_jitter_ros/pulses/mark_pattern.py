@@ -23,6 +23,8 @@ BoolArray = NDArray[np.bool_]
 _FEWEST = 2  # intervals of a mark
 # How much more the means of the marks have to scatter than the intervals of one mark explain.
 _SIGNIFICANT = 4.0
+_FEWEST_FREE = 4  # degrees of freedom of a few revolutions
+_DISPLACED = 64.0  # variances that a displaced pulse explains
 # Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
 _UNEVEN = 0.5  # of levels: intervals of more than 1.6 times others are gaps
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
@@ -85,11 +87,50 @@ def mark_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern
     scatter = 1.48 * float(np.median(np.abs(every)))
     per_mark = every.size / np.count_nonzero(known_marks)
     widths[known_marks] -= widths[known_marks].mean()
-    between = float(np.mean(widths[known_marks]**2))
-    explained = scatter**2 / per_mark
-    if between <= _SIGNIFICANT * explained:
-        return MarkPattern(np.zeros(count), known_marks, scatter)
-    return MarkPattern(widths * (1.0 - explained / between), known_marks, scatter)
+    return MarkPattern(_shrunk(widths, known_marks, scatter**2 / per_mark), known_marks, scatter)
+
+
+def _shrunk(widths: FloatArray, known: BoolArray, variance: float) -> FloatArray:
+    """Return widths (mark,), those not `known` 0, as far as their variance is no explanation."""
+    between = float(np.mean(widths[known]**2))
+    if between <= _SIGNIFICANT * variance:
+        return np.zeros(widths.size)
+    return np.asarray(widths * (1.0 - variance / between))
+
+
+def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern | None:
+    """
+    Return the pattern of a few revolutions of few marks, None if they are too few.
+
+    `marks`, `levels` and `count` are those of `mark_pattern`. The speed changes along a line, and
+    one of the pulses may be displaced: it makes an interval as much longer as the next is shorter.
+
+    >>> late = np.tile([0.1, -0.1], 5) + 1e-3 * np.array([1, 0, -1, 2, 0, -2, 0, 1, -1, 0])
+    >>> displaced = 0.05 * np.eye(10)[3] - 0.05 * np.eye(10)[4]
+    >>> pattern = steady_pattern(np.arange(10) % 2, late + displaced, 2)
+    >>> pattern.widths.round(2).tolist(), round(pattern.scatter, 4)
+    ([0.1, -0.1], 0.0014)
+    """
+    place = np.flatnonzero(np.isfinite(levels))
+    free = place.size - count - 1
+    if free < _FEWEST_FREE or np.bincount(marks[place], minlength=count).min() < _FEWEST:
+        return None
+    levels = levels[place]
+    design = np.column_stack((np.eye(count)[marks[place]], place - place.mean()))
+    pulses = np.eye(place.size, place.size + 1, 1) - np.eye(place.size, place.size + 1)
+    pulses = pulses[:, np.diff(place, prepend=place[0] - 1, append=place[-1] + 1) == 1]
+    fitted = np.linalg.qr(design).Q
+    left, moved = (item - fitted @ (fitted.T @ item) for item in (levels, pulses))
+    told = np.square(moved.T @ left) / np.sum(np.square(moved), axis=0)
+    largest = int(np.argmax(told))
+    if told[largest] > _DISPLACED * (left @ left - told[largest]) / (free - 1):
+        design, free = np.column_stack((design, pulses[:, largest])), free - 1
+    found = np.linalg.lstsq(design, levels, rcond=None)[0]
+    square = float(np.sum(np.square(levels - design @ found))) / free
+    widths = found[:count] - found[:count].mean()
+    known = np.ones(count, np.bool_)
+    variance = square * count / place.size
+    return MarkPattern(_shrunk(widths, known, variance), known, math.sqrt(square + variance))
 
 
 def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
