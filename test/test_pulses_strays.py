@@ -232,9 +232,9 @@ def test_the_tolerance_follows_the_shaft(rng):
     tolerance = []
     for scatter in (1e-4, 1e-3, 1e-2):
         model = IntervalModel(given=0.0, pulses_per_trigger=1, block=8)
-        model.start(np.zeros(1), scatter=0.01, count=3)
+        model.start(0.0, scatter=0.01, count=3)
         for _ in range(100):
-            model.accept(rng.normal(0.0, scatter, model.room))
+            model.accept(rng.normal(0.0, scatter, model.room).tolist())
         tolerance.append(model.tolerance)
     assert tolerance == pytest.approx([2e-3, 6.5e-3, 6.5e-2], rel=0.4)
 

@@ -11,46 +11,46 @@
 """Intervals of a single mark that are longer and shorter in turns: they are those of two."""
 
 from collections import deque
+from collections.abc import Iterable
 import math
-
-import numpy as np
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
+from statistics import fmean
 
 _BLOCK, _FEWEST, _MOST = 16, 12, 64  # intervals in a block, an even number; blocks
 _SURE = 10.0  # standard errors
 _LEAST = 2e-5  # of an interval
-_SIGNS = np.resize([0.5, -0.5], _BLOCK)
 
 
 class Alternation:
     """
     How much longer every other interval is: `update` it with levels, `size` is what they show.
 
-    >>> rng = np.random.default_rng(1)
     >>> alternation = Alternation()
-    >>> alternation.update(np.resize([0.001, -0.001], 400) + rng.normal(0.0, 1e-4, 400))
+    >>> alternation.update([0.001, -0.00099, 0.00101, -0.001] * 100)
     >>> round(abs(alternation.size), 4)
     0.001
     """
 
     def __init__(self) -> None:
-        self._levels: FloatArray = np.empty(0)
+        self._levels: list[float] = []
         self._found: deque[float] = deque(maxlen=_MOST)
         self.size = 0.0  # of the logarithm of an interval, 0 as long as it may be chance
 
-    def update(self, levels: FloatArray) -> None:
-        """Take the logarithms of the next intervals (n,)."""
-        self._levels = np.concatenate((self._levels, levels))
-        while self._levels.size >= _BLOCK + 2:
+    def update(self, levels: Iterable[float]) -> None:
+        """Take the logarithms of the next intervals."""
+        self._levels += levels
+        while len(self._levels) >= _BLOCK + 2:
             part = self._levels[:_BLOCK + 2]
-            bend = part[1:-1] - 0.5 * (part[:-2] + part[2:])
-            self._found.append(float(np.mean(_SIGNS * bend)))
-            self._levels = self._levels[_BLOCK:]
+            bends = (middle - 0.5 * (before + after)
+                     for before, middle, after in zip(part, part[1:], part[2:]))
+            self._found.append(0.5 * fmean(
+                -bend if number % 2 else bend for number, bend in enumerate(bends)))
+            del self._levels[:_BLOCK]
+            self._look()
+
+    def _look(self) -> None:
         count = len(self._found)
         if count < _FEWEST:
             return
-        mean = float(np.mean(self._found))
-        error = float(np.std(self._found, ddof=1)) / math.sqrt(count)
+        mean = fmean(self._found)
+        error = math.sqrt(sum((item - mean)**2 for item in self._found) / (count - 1) / count)
         self.size = mean if abs(mean) > max(_SURE * error, _LEAST) else 0.0

@@ -62,13 +62,6 @@ _FITS = 0.1  # tolerance with which a pulse after a step of time fits
 # logarithm; near a factor of two; and the number of reports that wait.
 _SHORT, _CHANGED, _NEAR, _MESSAGES = 5.0, 0.3, 0.03, 10
 _NEVER = 1 << 62
-_NONE: FloatArray = np.empty(0)
-
-
-def intervals(before: float, pulses: FloatArray) -> FloatArray:
-    """Return the interval in front of each pulse (n,), of which one came `before` (s)."""
-    every = np.concatenate(((before,), pulses))
-    return np.asarray(every[1:] - every[:-1])  # np.diff takes three times as long for few pulses
 
 
 @dataclass(frozen=True)
@@ -118,7 +111,7 @@ class IntervalJudge:
         self._lock: Lock | None = None
         self._candidate: Lock | None = None
         self._end: _End | None = None
-        self._queue: FloatArray = _NONE
+        self._queue: list[float] = []
         self._tried = 0  # pulses of the queue that were tried to match, and failures
         self._failed = 0
         self._recent: list[float] = []  # of the latest pulses, dropped ones too
@@ -138,16 +131,22 @@ class IntervalJudge:
     @property
     def last(self) -> float:
         """Time (s) of the latest pulse that was not dropped."""
-        return float(self._queue[-1]) if self._queue.size else self.confirmed
+        return self._queue[-1] if self._queue else self.confirmed
 
     @property
     def waiting(self) -> int:
         """Return the number of pulses not yet judged."""
-        return self._queue.size
+        return len(self._queue)
 
-    def take(self, pulses: FloatArray) -> None:
-        """Take the next pulses (n,) in s, in order of time, none before the last one."""
-        self._queue = np.concatenate((self._queue, self._apart(pulses)))
+    def take(self, pulses: list[float]) -> None:
+        """Take the next pulses in s, in order of time, none before the last one."""
+        least, last = self._options.minimum_interval, self.last
+        for pulse in pulses:
+            if pulse - last < least or pulse == last:
+                self.counts['doubles'] += 1
+            else:
+                self._queue.append(pulse)
+                last = pulse
         self._run(final=False)
 
     def flush(self) -> None:
@@ -163,33 +162,17 @@ class IntervalJudge:
 
     def drop_later(self, time: float, most: int) -> int:
         """Drop the waiting pulses after a time (s) if they are `most` or fewer; their number."""
-        later = int(np.count_nonzero(self._queue > time))
+        later = sum(pulse > time for pulse in self._queue)
         if not 0 < later <= most:
             return 0
-        self._queue = self._queue[:-later]
-        self._tried = min(self._tried, self._queue.size)
+        del self._queue[-later:]
+        self._tried = min(self._tried, len(self._queue))
         return later
 
     # --- the queue ---
 
-    def _apart(self, pulses: FloatArray) -> FloatArray:
-        """Drop doubles: pulses at the time of the last one, or sooner than `minimum_interval`."""
-        least = self._options.minimum_interval
-        gaps = intervals(self.last, pulses)
-        if np.all((gaps >= least) & (gaps > 0.0)):
-            return pulses
-        kept: list[float] = []
-        last = self.last
-        for pulse in pulses.tolist():
-            if pulse - last < least or pulse == last:
-                self.counts['doubles'] += 1
-            else:
-                kept.append(pulse)
-                last = pulse
-        return np.array(kept)
-
     def _run(self, *, final: bool) -> None:
-        while self._queue.size:
+        while self._queue:
             going_on = (self._match(final) if self._lock is None
                         else self._take_regular(final) or self._decide(final))
             if not going_on:
@@ -200,8 +183,7 @@ class IntervalJudge:
 
     def _drop(self, kind: str, at: int = 0) -> None:
         """Drop a waiting pulse."""
-        self._remember(float(self._queue[at]))
-        self._queue = np.delete(self._queue, at)
+        self._remember(self._queue.pop(at))
         self.counts[kind] += 1
         if kind != 'unlocked':
             self._counter.drop()
@@ -215,37 +197,38 @@ class IntervalJudge:
         """Accept the pulses up to the first doubtful one; return their number."""
         lock, model = self._lock, self._model
         assert lock is not None
-        room = model.room
-        pulses = self._queue[:room + 1]
-        slots = (self._slot + np.arange(pulses.size)) % lock.steps.size
-        gaps = intervals(self.confirmed, pulses)
-        levels = np.log(gaps / lock.widths[slots])
-        off = np.abs(model.deviations(levels))
+        room = min(model.room, self._room_of_marks)
+        pulses, size = self._queue[:room + 1], len(lock.slots)
+        slots = [number % size for number in range(self._slot, self._slot + len(pulses))]
+        gaps = [pulse - before for before, pulse in zip((self.confirmed, *pulses), pulses)]
+        levels = [math.log(gap / lock.slots[slot].width) for gap, slot in zip(gaps, slots)]
+        off = [abs(item) for item in model.deviations(levels)]
         # Teeth beside gaps are uneven; a stray among marks that may be uneven needs a search.
-        regular = off <= (model.tolerance if lock.even else
-                          np.maximum(model.tolerance, lock.believed[slots]))
+        regular = [item <= model.tolerance
+                   or (not lock.even and item <= lock.slots[slot].believed)
+                   for item, slot in zip(off, slots)]
         # A pulse with a small deviation cannot spoil an average. A larger one may be a stray's:
         # then the next interval is too short.
-        followed = np.append(regular[1:], final and pulses.size == self._queue.size)
-        passes = (off <= model.harmless) | (regular & followed)
-        count = min(pulses.size if passes.all() else int(np.argmin(passes)), room,
-                    self._room_of_marks)
+        regular.append(final and len(pulses) == len(self._queue))
+        passes = [item <= model.harmless or (fits and following)
+                  for item, fits, following in zip(off, regular, regular[1:])]
+        count = min(passes.index(False) if False in passes else len(pulses), room)
         if count:
-            self._counter.extend(pulses[:count].tolist(), lock.steps[slots[:count]].tolist())
+            taken, slots, levels = pulses[:count], slots[:count], levels[:count]
+            self._counter.extend(taken, [lock.slots[slot].step for slot in slots])
             self.counts['accepted'] += count
-            model.accept(levels[:count], gaps[:count])
-            if lock.steps.size == 1:
-                self._look_at_turns(levels[:count])
-            self._recent = [*self._recent, *pulses[:count][-_AGREEING - 1:].tolist()][
-                -_AGREEING - 1:]
-            self._note(slots[:count].tolist(), levels[:count].tolist(), pulses[:count].tolist())
-            self._slot = int(slots[count - 1] + 1) % lock.steps.size
-            self.confirmed = float(pulses[count - 1])
-            self._queue = self._queue[count:]
+            model.accept(levels, gaps[:count])
+            if size == 1:
+                self._look_at_turns(levels)
+            self._recent = [*self._recent, *taken[-_AGREEING - 1:]][-_AGREEING - 1:]
+            self._note(slots, levels, taken)
+            self._slot = (slots[-1] + 1) % size
+            self.confirmed = taken[-1]
+            del self._queue[:count]
             self._learn_marks()
         return count
 
-    def _look_at_turns(self, levels: FloatArray) -> None:
+    def _look_at_turns(self, levels: list[float]) -> None:
         """Say that intervals of one mark are longer and shorter in turns."""
         known = self._alternation.size
         self._alternation.update(levels)
@@ -286,21 +269,21 @@ class IntervalJudge:
         if queue[0] - self.confirmed < same:
             self._drop('doubles')
             return True
-        if queue.size > 1 and queue[1] - queue[0] < same:
+        if len(queue) > 1 and queue[1] - queue[0] < same:
             first_is_nearer = expected <= 0.5 * (queue[0] + queue[1]) - self.confirmed
             self._drop('doubles', at=int(first_is_nearer))
             return True
-        if queue.size == 1 and not final:
+        if len(queue) == 1 and not final:
             return False
         if self._is_of_clock():
             return True
         rules = self._rules()
         paths = [Path(0.0, self.confirmed, self._slot, 0, model.level, model.before)]
-        for number, pulse in enumerate(queue[:_MOST_WAITING].tolist()):
+        for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)
-            if (number or queue.size == 1) and self._commit(paths, final):
+            if (number or len(queue) == 1) and self._commit(paths, final):
                 return True
-        if queue.size >= _MOST_WAITING:
+        if len(queue) >= _MOST_WAITING:
             self._lose()
             return True
         if final:
@@ -310,10 +293,9 @@ class IntervalJudge:
     def _is_of_clock(self) -> bool:
         """Whether the ticks of a clock explain the next two intervals, which are regular then."""
         assert self._lock is not None
-        pulses = self._queue[:2]
-        slots = (self._slot + np.arange(pulses.size)) % self._lock.steps.size
-        return self._model.explains(np.diff(pulses, prepend=self.confirmed),
-                                    self._lock.widths[slots], float(pulses[-1]))
+        pulses = np.array([self.confirmed, *self._queue[:2]])
+        slots = (self._slot + np.arange(pulses.size - 1)) % self._lock.steps.size
+        return self._model.explains(np.diff(pulses), self._lock.widths[slots], float(pulses[-1]))
 
     def _commit(self, paths: list[Path], final: bool) -> bool:
         """Decide about the first pulses if the likely paths agree about them."""
@@ -347,14 +329,14 @@ class IntervalJudge:
         lock = self._lock
         assert lock is not None
         slots = (self._slot + np.arange(skipped)) % lock.steps.size
-        gap = float(self._queue[0]) - self.confirmed
+        gap = self._queue[0] - self.confirmed
         level = math.log(gap / float(lock.widths[slots].sum()))
         self._irregular(skipped, level, 0.0, best.levels[-1])
         return True
 
     def _drop_stray(self) -> None:
         assert self._lock is not None
-        gap = float(self._queue[0]) - self.confirmed
+        gap = self._queue[0] - self.confirmed
         expected = math.exp(self._model.expected) * float(self._lock.widths[self._slot])
         self._model.refuse(gap / expected - 1.0)
         self._drop('doubles' if gap < 0.5 * expected else 'early')
@@ -370,7 +352,7 @@ class IntervalJudge:
         """Accept the first waiting pulse, `mark` slots after the last one."""
         slots, steps = self._passed(mark)
         pulse = self._next(slots, level)
-        self._model.accept(np.array([level]))
+        self._model.accept([level])
         self._counter.extend([pulse], [steps])
         self._learn_marks()
 
@@ -382,7 +364,7 @@ class IntervalJudge:
         """
         model, tolerance = self._model, self._tolerance
         slots, steps = self._passed(mark)
-        gap = float(self._queue[0]) - self.confirmed
+        gap = self._queue[0] - self.confirmed
         regular = abs(deviation) <= tolerance
         known = self._is_whole(gap, slots, model.level) and (
             after is None or self._is_whole(gap, slots, after))
@@ -400,7 +382,7 @@ class IntervalJudge:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
             self.counts[kind] += mark - 1
             pulse = self._next(slots, level)
-            model.accept(np.array([level]))
+            model.accept([level])
             if self._options.bridge:
                 self._counter.extend([pulse], [steps])
             else:
@@ -425,6 +407,7 @@ class IntervalJudge:
         if after is not None:
             model.jump(after)
         self._counter.begin(pulse, 0, passed=steps if known else None)
+        self._learn_marks()
 
     def _report_change(self, gap: float, before: float, after: float) -> None:
         """Say that the interval changed across a gap (s) as no shaft changes it."""
@@ -464,8 +447,7 @@ class IntervalJudge:
         """Take the first pulse out of the queue as the one at the end of these slots."""
         self._alternation = Alternation()
         assert self._lock is not None
-        pulse = float(self._queue[0])
-        self._queue = self._queue[1:]
+        pulse = self._queue.pop(0)
         self._remember(pulse)
         self.counts['accepted'] += 1
         self.confirmed = pulse
@@ -514,44 +496,46 @@ class IntervalJudge:
         if self._rehearses:
             return False
         scatter = None if self._end is None else self._end.scatter
+        queue = np.array(self._queue)
         while self._candidate is None:
             size = self._target.next_size(
-                self._queue, self._tried, self._failed, known=scatter is not None)
-            if size > self._queue.size:
-                if not final or self._tried >= self._queue.size:
+                queue, self._tried, self._failed, known=scatter is not None)
+            if size > queue.size:
+                if not final or self._tried >= queue.size:
                     return self._drop_rest(final)
-                size = self._queue.size
+                size = queue.size
             self._tried = size
-            self._candidate = self._target.lock(self._queue[:size], scatter)
+            self._candidate = self._target.lock(queue[:size], scatter)
             self._failed += self._candidate is None
             excess = size - self._target.memory
             if self._candidate is None and excess > 0:
                 self._drop_unlocked(excess)
+                queue = queue[excess:]
         lock = self._candidate
         if lock.steps.size > 1:
             wanted = lock.first + 1 + min(
                 _REVOLUTIONS * lock.steps.size, math.ceil(_LONGEST / lock.interval))
-            if self._queue.size < wanted and not final:
+            if queue.size < wanted and not final:
                 return False
             found = None
             if self._few_marks:
-                found = self._repeating(lock, self._queue[:wanted])
-                if found is None and self._queue.size < 2 * wanted and not final:
+                found = self._repeating(lock, queue[:wanted])
+                if found is None and queue.size < 2 * wanted and not final:
                     return False
-                found = found or self._repeating(lock, self._queue[:2 * wanted])
-            lock = found or self._rehearsed(lock, self._queue[:wanted])
+                found = found or self._repeating(lock, queue[:2 * wanted])
+            lock = found or self._rehearsed(lock, queue[:wanted])
         self._drop_unlocked(lock.first)
         self._begin(lock)
         return True
 
     def _drop_unlocked(self, count: int) -> None:
-        self._queue = self._queue[count:]
+        del self._queue[:count]
         self._tried -= count
         self.counts['unlocked'] += count
 
     def _drop_rest(self, final: bool) -> bool:
         if final:
-            self._drop_unlocked(self._queue.size)
+            self._drop_unlocked(len(self._queue))
         return False
 
     def _rehearsed(self, lock: Lock, pulses: FloatArray) -> Lock:
@@ -603,14 +587,14 @@ class IntervalJudge:
         """Return a judge that judged the pulses (n,) with this lock until it lost it."""
         judge = IntervalJudge(
             self._target, TriggerCounter(teeth=1, teeth_per_trigger=1), self._options)
-        judge._queue, judge._rehearses = pulses, True
+        judge._queue, judge._rehearses = pulses.tolist(), True
         judge._begin(lock)
         judge._run(final=True)
         return judge
 
     def _begin(self, lock: Lock) -> None:
         """Begin a sequence at the first waiting pulse."""
-        first = float(self._queue[0])
+        first = self._queue[0]
         self._lock, self._candidate, self._slot = lock, None, lock.slot
         tooth = int(lock.teeth[lock.slot])
         passed = None
@@ -626,13 +610,13 @@ class IntervalJudge:
             self._report_change(gap, self._end.level, math.log(lock.interval))
         self._counter.begin(first, tooth, passed=passed)
         self.counts['accepted'] += 1
-        self._queue = self._queue[1:]
+        del self._queue[0]
         self._remember(first)
         self.confirmed = first
         self._end = None
         self._tried = self._failed = 0
-        self._model.start(np.array([math.log(lock.interval)]), scatter=scatter, count=count,
-                          intervals=lock.intervals)
+        self._model.start(math.log(lock.interval), scatter=scatter, count=count,
+                          intervals=lock.intervals.tolist())
 
     @property
     def _room_of_marks(self) -> int:

@@ -18,7 +18,11 @@ predicted best by the mean, a run-up by a line. The one with the smallest errors
 scatter of its errors gives the tolerance: narrow for a steady shaft, wide for an unsteady one.
 """
 
+from collections import deque
+from collections.abc import Sequence
+from itertools import pairwise
 import math
+from operator import mul
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +30,12 @@ from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 
 FloatArray = NDArray[np.float64]
 
-_NONE: FloatArray = np.empty(0)
 _REACH = 8  # intervals that predict the next one
-_PLACE = np.arange(_REACH, 0, -1) - 0.5 * (_REACH + 1)  # of the latest interval first
+_PLACE = np.arange(1, _REACH + 1) - 0.5 * (_REACH + 1)  # of the latest interval last
 _LINE = 1.0 / _REACH + _PLACE * 0.5 * (_REACH + 1) / float(np.sum(_PLACE**2))
-_WEIGHTS = ((1.0,), (2.0, -1.0), (1.0 / _REACH,) * _REACH, tuple(_LINE.tolist()))
+_WEIGHTS = ((1.0,), (-1.0, 2.0), (1.0 / _REACH,) * _REACH, tuple(_LINE.tolist()))
+_ALL_WEIGHTS = np.array([(0.0,) * (_REACH - len(item)) + item for item in _WEIGHTS])
+_LARGEST = 700.0  # whose exponential is finite
 # Standard deviations within which an interval is regular: one of 1e9 normal ones is not.
 _WIDTH = 6.0
 _BELIEVED = 3.0  # standard deviations that a given tolerance stands for at least
@@ -44,8 +49,8 @@ _KEPT_SQUARE = 0.3685  # mean square of the smallest three quarters of normal va
 _WINDOW = 64  # intervals that show the tick of a clock
 # Ticks by which an interval may differ from each prediction: a pulse is up to half a tick off, and
 # as much again by half for the jitter of the shaft. Widths of marks are known to a tick.
-_TICKS = tuple(0.75 * float(np.abs(np.diff((0.0, 1.0, *(-item for item in weights), 0.0))).sum())
-               for weights in _WEIGHTS)
+_TICKS = tuple(0.75 * sum(abs(second - first) for first, second in pairwise(
+    (0.0, 1.0, *(-item for item in reversed(weights)), 0.0))) for weights in _WEIGHTS)
 _OF_MARKS = 1.0
 # A shaft scatters more than was learnt if so many of the latest intervals differ by more than the
 # tolerance, but not by more than _NEAR; it is wider then than the largest of these by _WIDER.
@@ -68,9 +73,11 @@ class IntervalModel:
     whatever the size of the pieces in which they come. There are `marks` intervals a revolution.
 
     >>> model = IntervalModel(given=0.0, pulses_per_trigger=1, block=8)
-    >>> model.start(np.log([1.0, 1.01, 0.99, 1.0]), scatter=0.01, count=20)
-    >>> model.deviations(np.log([1.0, 1.1])).round(2).tolist(), round(model.tolerance, 3)
-    ([0.0, 0.1], 0.066)
+    >>> model.start(0.0, scatter=0.01, count=20)
+    >>> [round(off, 2) for off in model.deviations([0.0, math.log(1.1)])]
+    [0.0, 0.1]
+    >>> round(model.tolerance, 3)
+    0.066
     """
 
     def __init__(self, *, given: float, pulses_per_trigger: int, block: int, marks: int = 1
@@ -81,22 +88,22 @@ class IntervalModel:
         self._harmless, self._same = (
             min(share * pulses_per_trigger, 0.1) for share in (_HARMLESS, _SAME))
         self._cycle = pulses_per_trigger
-        self.start(np.zeros(1), scatter=_PRIOR, count=1)
+        self._before = np.arange(block) + np.arange(_REACH)[:, None]  # levels that predict others
+        self.start(0.0, scatter=_PRIOR, count=1)
 
-    def start(self, levels: FloatArray, *, scatter: float, count: int,
-              intervals: FloatArray = _NONE) -> None:
+    def start(self, level: float, *, scatter: float, count: int, intervals: Sequence[float] = ()
+              ) -> None:
         """
-        Begin with these levels (n,); `count` intervals had this scatter, relative to 1.
+        Begin with this level; `count` intervals had this scatter, relative to 1.
 
         `intervals` (k,) in s show the tick of a clock.
         """
-        missing = max(_REACH - levels.size, 0)
-        self._levels = np.concatenate((np.full(missing, levels[0]), levels[-_REACH:]))
+        self._levels = [level] * _REACH
         self._variance = np.full(len(_WEIGHTS), scatter**2)
         self._count = float(count)
         self._chosen = 0
         self._settling = _REACH
-        self._intervals = intervals[-self._window:]
+        self._intervals = deque(intervals, maxlen=self._window)
         self._tick = self._latest = 0.0  # relative to the interval; and when it was seen (s)
         self._number = 0  # of intervals
         self._refused: list[tuple[int, float]] = []
@@ -105,7 +112,7 @@ class IntervalModel:
     @property
     def room(self) -> int:
         """Return the number of intervals until the scatter is computed anew."""
-        return self.block + _REACH - self._levels.size
+        return self.block + _REACH - len(self._levels)
 
     @property
     def irregular(self) -> bool:
@@ -115,7 +122,7 @@ class IntervalModel:
     @property
     def has_tick(self) -> bool:
         """Whether the latest intervals are multiples of the tick of a clock."""
-        return bool(self._tick or clock_tick(self._intervals, 0.0))
+        return bool(self._tick or clock_tick(np.array(self._intervals), 0.0))
 
     @property
     def known(self) -> int:
@@ -125,37 +132,37 @@ class IntervalModel:
     @property
     def level(self) -> float:
         """Level of the last interval."""
-        return float(self._levels[-1])
+        return self._levels[-1]
 
     @property
     def before(self) -> float:
         """Level of the interval before the last one."""
-        return float(self._levels[-2])
+        return self._levels[-2]
 
     @property
     def expected(self) -> float:
         """Return the expected level of the next interval."""
-        return float(self._predicted(self._chosen, np.append(self._levels, 0.0), 1)[0])
+        return _predicted(self._chosen, self._levels, len(self._levels))
 
-    def deviations(self, levels: FloatArray) -> FloatArray:
-        """Return by how much each of the next levels (n,) is off, relative to its interval."""
-        every = np.concatenate((self._levels, levels))
-        found: FloatArray = np.expm1(levels - self._predicted(self._chosen, every, levels.size))
-        if self._settling or self.given:  # which prediction is the best one is not known yet
-            for kind in range(len(_WEIGHTS)):
-                other = np.expm1(levels - self._predicted(kind, every, levels.size))
-                nearer = np.abs(other) < np.abs(found)
-                if not self.given:
-                    nearer[self._settling:] = False
-                found = np.where(nearer, other, found)
+    def deviations(self, levels: list[float]) -> list[float]:
+        """Return by how much each of the next levels is off, relative to its interval."""
+        every, known = self._levels + levels, len(self._levels)
+        found = []
+        for number, level in enumerate(levels):
+            kinds: Sequence[int] = (self._chosen,)
+            if self.given or number < self._settling:  # which prediction is best is not known yet
+                kinds = range(len(_WEIGHTS))
+            found.append(min((math.expm1(min(
+                level - _predicted(kind, every, known + number), _LARGEST)) for kind in kinds),
+                key=abs))
         return found
 
-    def accept(self, levels: FloatArray, intervals: FloatArray = _NONE) -> None:
-        """Take the next regular levels (n,), n at most `room`, and their intervals (n,) in s."""
-        self._number += levels.size
-        self._levels = np.concatenate((self._levels, levels))
-        self._intervals = np.concatenate((self._intervals, intervals))[-self._window:]
-        self._settling = max(self._settling - levels.size, 0)
+    def accept(self, levels: list[float], intervals: Sequence[float] = ()) -> None:
+        """Take the next regular levels, at most `room`, and their intervals in s."""
+        self._number += len(levels)
+        self._levels += levels
+        self._intervals.extend(intervals)
+        self._settling = max(self._settling - len(levels), 0)
         if not self.room:
             self._learn()
 
@@ -174,7 +181,7 @@ class IntervalModel:
 
     def jump(self, level: float) -> None:
         """Take a level that was not expected: the next ones may follow it."""
-        self.accept(np.array([level]))
+        self.accept([level])
         self._settling = _REACH
 
     def explains(self, intervals: FloatArray, widths: FloatArray, latest: float) -> bool:
@@ -188,11 +195,11 @@ class IntervalModel:
         length = math.exp(self.expected)
         if np.any(np.abs(intervals / widths / length - 1.0) > 2.0 * LONGEST_TICK):
             return False
-        tick = clock_tick(np.concatenate((self._intervals, intervals)), latest) / length
+        tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
         if tick <= self._tick:
             return False
         # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
-        lone = not clock_tick(self._intervals, latest)
+        lone = not clock_tick(np.array(self._intervals), latest)
         opposite = _is_displacement(intervals / widths / length - 1.0)
         if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
             return False
@@ -200,27 +207,17 @@ class IntervalModel:
         self._set_tolerance()
         return self.tolerance > before
 
-    def _predicted(self, kind: int, every: FloatArray, count: int) -> FloatArray:
-        """Return what is expected of the last `count` levels, from those before each."""
-        end = every.size - 1
-        total = np.zeros(count)
-        # Sums of slices are equal for any cutting of the stream, unlike a convolution.
-        for back, weight in enumerate(_WEIGHTS[kind]):
-            total += weight * every[end - count - back:end - back]
-        return total
-
     def _learn(self) -> None:
-        every, weight = self._levels, self.block / min(self._count + self.block, _MEMORY)
-        levels = every[-self.block:]
-        for kind in range(len(_WEIGHTS)):
-            off = np.expm1(levels - self._predicted(kind, every, self.block))
-            square = _robust_square(np.minimum(np.square(off), self.tolerance**2))
-            self._variance[kind] += weight * (square - self._variance[kind])
+        every, weight = np.array(self._levels), self.block / min(
+            self._count + self.block, _MEMORY)
+        off = np.expm1(every[_REACH:] - _ALL_WEIGHTS @ every[self._before])
+        square = _robust_square(np.minimum(off * off, self.tolerance**2))
+        self._variance += weight * (square - self._variance)
         self._count = min(self._count + self.block, _MEMORY)
         self._chosen = int(np.argmin(self._variance))
-        self._levels = every[-_REACH:].copy()
+        del self._levels[:-_REACH]
         if self._tick:  # the smallest so far; others may show that it is a fraction of that
-            tick = clock_tick(self._intervals, self._latest) / math.exp(self.expected)
+            tick = clock_tick(np.array(self._intervals), self._latest) / math.exp(self.expected)
             self._tick = min(self._tick, tick or self._tick)
         self._set_tolerance()
 
@@ -246,11 +243,20 @@ def _is_displacement(deviations: FloatArray) -> bool:
     return bool(abs(deviations.sum()) < _OPPOSITE * np.abs(deviations).max())
 
 
-def _robust_square(squares: FloatArray) -> float:
-    """Return the mean square (n,) without the largest quarter, which strays may have caused."""
-    kept = np.sort(squares)[:squares.size - squares.size // 4]
+def _predicted(kind: int, levels: list[float], place: int) -> float:
+    """Return what is expected of the level at this place, from those before it."""
+    weights = _WEIGHTS[kind]
+    return float(sum(map(mul, weights, levels[place - len(weights):place])))
+
+
+def _robust_square(squares: FloatArray) -> FloatArray:
+    """Return the mean square (..., n) without the largest quarter: strays may have caused it."""
+    count = squares.shape[-1]
+    squares = np.sort(squares)
+    kept = count - count // 4
     # Where most deviations are 0, as those of a slow clock, the largest ones tell the scatter.
-    return max(float(kept.mean()) / _KEPT_SQUARE, float(squares.mean()) / 4.0)
+    return np.asarray(np.maximum(squares[..., :kept].sum(axis=-1) / (kept * _KEPT_SQUARE),
+                                 squares.sum(axis=-1) / (4.0 * count)))
 
 
 def chain_scatter(levels: FloatArray) -> float:
@@ -262,5 +268,5 @@ def chain_scatter(levels: FloatArray) -> float:
         kinds.append(np.abs(np.diff(levels, 2)))
     squares = [np.square(kind) for kind in kinds]
     return math.sqrt(min(
-        min(_robust_square(square), float(square.mean())) if square.size > 4
+        min(float(_robust_square(square)), float(square.mean())) if square.size > 4
         else float(square.mean()) for square in squares))

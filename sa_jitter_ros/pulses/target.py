@@ -17,7 +17,8 @@ tells which tooth caused each of them.
 """
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +41,14 @@ _DOUBLE = 0.5
 # The gap must still be distinguished from one that is a tooth wider or narrower.
 _BESIDE_GAP = 0.45
 _ACROSS_GAP = 0.9  # teeth
+
+
+class Slot(NamedTuple):
+    """What a `Lock` says of one tooth."""
+
+    step: int
+    width: float
+    believed: float
 
 
 @dataclass(frozen=True)
@@ -65,10 +74,15 @@ class Lock:
     known: int
     intervals: FloatArray
 
-    @property
+    @cached_property
     def even(self) -> bool:
         """Whether no tooth is missing, so that there is no index."""
         return bool(np.all(self.steps == 1))
+
+    @cached_property
+    def slots(self) -> list[Slot]:
+        """Return the teeth one by one."""
+        return list(map(Slot, self.steps.tolist(), self.widths.tolist(), self.believed.tolist()))
 
     def with_pattern(self, pattern: MarkPattern | None, *, weight: float = 1.0) -> 'Lock':
         """Return the lock with what was learnt of its marks."""

@@ -194,8 +194,9 @@ class TriggerCounter:
         marks = np.full(targets.size, -1)
         if self._numbering is not None:
             marks = targets % self._teeth + self._numbering * self._teeth
-        # Missing teeth are interpolated between their neighbours.
-        return TriggerPulses(
-            np.interp(targets, numbers, self._times), starts, restarts,
-            targets // self._per_trigger, numbers[np.searchsorted(numbers, targets)] == targets,
-            doubtful[:-1], marks)
+        at = numbers.searchsorted(targets)
+        times, measured = np.array(self._times)[at], numbers[at] == targets
+        if not measured.all():  # missing teeth are interpolated between their neighbours
+            times = np.interp(targets, numbers, self._times)
+        return TriggerPulses(times, starts, restarts, targets // self._per_trigger, measured,
+                             doubtful[:-1], marks)

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.interval_judge import IntervalJudge, intervals, JudgeOptions
+from sa_jitter_ros.pulses.interval_judge import IntervalJudge, JudgeOptions
 from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
@@ -214,9 +214,9 @@ class PulseValidator:
         while pulses.size:
             ahead = 0
             if not self._held:
-                back = intervals(self._judge.last, pulses) < 0.0
-                ahead = min(int(np.argmax(back)) if back.any() else pulses.size, _PIECE)
-                self._judge.take(pulses[:ahead])
+                back = pulses < np.concatenate(((self._judge.last,), pulses[:-1]))
+                ahead = min(int(back.argmax()) if back.any() else pulses.size, _PIECE)
+                self._judge.take(pulses[:ahead].tolist())
             if ahead < min(pulses.size, _PIECE):
                 self._take(float(pulses[ahead]))
                 ahead += 1
@@ -250,7 +250,7 @@ class PulseValidator:
         if pulse < judge.last:
             self._out_of_order += 1
         else:
-            judge.take(np.array([pulse]))
+            judge.take([pulse])
 
     def _continues_held(self, pulse: float) -> bool:
         """Whether a pulse continues the waiting pulses rather than the sequence before."""
@@ -270,7 +270,7 @@ class PulseValidator:
             self._judge.forget()
             self._sink.restart()
             held, self._held = self._held, []
-            self._judge.take(np.array(held))
+            self._judge.take(held)
 
 
 def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
