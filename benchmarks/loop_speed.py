@@ -15,6 +15,7 @@ Speed of prediction, recovery and the loop off line.
 """
 
 import argparse
+from collections.abc import Callable
 from functools import partial
 import json
 import os
@@ -28,7 +29,8 @@ import time
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
+from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh
@@ -85,13 +87,18 @@ def trigger_cycles(count: int, channels: int, samples: int = 512) -> tuple[Any, 
             width / np.sqrt(12.0))
 
 
+def recovered(count: int, channels: int) -> Callable[[], PulseErrorRecovery]:
+    """Return the recovery of the pulse errors of an average, ready to be called."""
+    cycles, periods, jitter = trigger_cycles(count, channels)
+    return lambda: recover_pulse_errors(GridCycles(cycles), periods=periods, cycle_length=RATIO,
+                                        declared_standard_deviation=jitter)
+
+
 def recovery(count: int, rounds: int) -> dict[str, float]:
     """Milliseconds for one recovery of the pulse errors of an average."""
     calls = {}
     for channels in (1, 8, 64):
-        cycles, periods, jitter = trigger_cycles(count, channels)
-        call = partial(recover_pulse_errors, cycles, periods=periods, cycle_length=RATIO,
-                       declared_standard_deviation=jitter)
+        call = recovered(count, channels)
         assert call().accepted
         calls[f'{count} trigger cycles x {channels} channels'] = call
     return {name: 1e3 * timing.median
@@ -112,12 +119,10 @@ def recovery_by_threads(count: int, rounds: int) -> dict[str, float]:
 
 def clock(count: int, rounds: int) -> float:
     """Return the median milliseconds on the clock for one recovery of 8 channels."""
-    cycles, periods, jitter = trigger_cycles(count, 8)
-    elapsed = []
+    call, elapsed = recovered(count, 8), []
     for _ in range(rounds + 1):
         start = time.perf_counter()
-        recover_pulse_errors(cycles, periods=periods, cycle_length=RATIO,
-                             declared_standard_deviation=jitter)
+        call()
         elapsed.append(1e3 * (time.perf_counter() - start))
     return median(elapsed[1:])
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.average import AverageSettings
+from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError
@@ -260,3 +261,34 @@ def test_an_order_that_the_correction_makes_smaller_is_corrected_too(rng):
     assert np.count_nonzero(raw > corrected) > 0
     assert np.all(raw != corrected)
     assert np.mean((corrected - true) ** 2) < 0.5 * np.mean((raw - true) ** 2)
+
+
+def test_shafts_that_are_due_together_are_corrected_as_each_alone(monkeypatch):
+    machine, made = gearbox(2.0, noise=0.3), []
+    shafts = {'shaft': {'cycle_length': 2.0}, 'tach': {'orders': (38.0,)},
+              'linear': {'interpolation': 'linear'}, 'short': {'trigger_cycles': 15}}
+    settings = {name: AverageSettings(**{
+        'trigger_cycles': CYCLES, 'orders': ORDERS, 'correct_jitter': True,
+        'keyphasor_rate': CLOCK, **item}) for name, item in shafts.items()}
+    monkeypatch.setattr(
+        'sa_jitter_ros.averaging.correction.cycle_grid', lambda cycles, **options: (
+            made.append(len(cycles)), cycle_grid(cycles, **options))[1])
+
+    def averages(names):
+        averager = StreamingAverager(
+            {name: settings[name] for name in names}, validator=PulseValidator(),
+            timeline=VibrationTimeline(buffer_seconds=10.0))
+        averager.add_pulses(machine.pulses(0.0, 4.2).times)
+        return averager.add_samples(SampleBlock(
+            machine.vibration(0, round(4.2 * RATE)), 0.0, RATE, 0))
+
+    together = averages(shafts)
+    assert sorted(made) == [15] * 5 + [CYCLES] * 4  # two methods, two averages each
+    for name in shafts:
+        found = [average for shaft, average in together if shaft == name]
+        for one, (_, alone) in zip(found, averages([name]), strict=True):
+            assert one.correction.accepted
+            np.testing.assert_allclose(one.correction.waveform, alone.correction.waveform,
+                                       rtol=1e-9, atol=1e-11)
+            np.testing.assert_allclose(one.correction.pulse_errors,
+                                       alone.correction.pulse_errors, rtol=1e-7, atol=1e-13)

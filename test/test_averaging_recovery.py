@@ -15,6 +15,7 @@ import pytest
 from sa_jitter_ros.averaging.pulse_error_fit import (
     _CHANCES, _SIZES, estimated_size, Tridiagonal)
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.signal import lfilter
 
@@ -51,7 +52,7 @@ def simulate(rng, errors, lines, *, samples=512, ratio=RATIO, noise=0.0, ripple=
 
 def recover(cycles, pulses, *, declared, ratio=RATIO, **options):
     """Recover with what an averager knows."""
-    return recover_pulse_errors(cycles, periods=np.diff(pulses), cycle_length=ratio,
+    return recover_pulse_errors(GridCycles(cycles), periods=np.diff(pulses), cycle_length=ratio,
                                 declared_standard_deviation=declared, **options)
 
 

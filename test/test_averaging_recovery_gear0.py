@@ -13,6 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
+from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.pulses.resampling import interpolate
 
 POINTS = 1024
@@ -52,8 +53,8 @@ def test_corrected_amplitudes_are_those_of_the_reference(gearbox, clock, count):
     ratios = []
     for first in range(0, len(reference) - count, count):
         pulses = sampled[first:first + count + 1]
-        found = recover_pulse_errors(resample(gearbox, pulses), periods=np.diff(pulses),
-                                     cycle_length=1.0,
+        found = recover_pulse_errors(GridCycles(resample(gearbox, pulses)),
+                                     periods=np.diff(pulses), cycle_length=1.0,
                                      declared_standard_deviation=1.0 / clock / np.sqrt(12.0))
         assert found.accepted
         assert np.std(found.errors - (pulses - reference[first:first + count + 1])) < 8e-6
@@ -69,7 +70,7 @@ def test_a_channel_of_noise_changes_nothing(gearbox, rng):
     reference = gearbox[2][:101]
     pulses = np.ceil(reference * 5120.0) / 5120.0
     noise = rng.standard_normal((100, POINTS, 2))
-    found = recover_pulse_errors(noise, periods=np.diff(pulses), cycle_length=1.0,
+    found = recover_pulse_errors(GridCycles(noise), periods=np.diff(pulses), cycle_length=1.0,
                                  declared_standard_deviation=1.0 / 5120.0 / np.sqrt(12.0))
     assert not found.accepted
     assert not found.errors.any()

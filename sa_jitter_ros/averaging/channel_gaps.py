@@ -64,8 +64,9 @@ class ChannelGaps:
 
 def telling(grid: FloatArray, cycles: Sequence[CycleSamples]) -> BoolArray:
     """Return which channels of `grid` (cycle, sample, channel) tell of the pulse errors."""
-    size = np.abs(grid).max(axis=(0, 1))
-    found = np.ptp(grid, axis=(0, 1)) > _CONSTANT * size
+    flat = grid.reshape(-1, grid.shape[2])
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    found = high - low > _CONSTANT * np.maximum(np.abs(low), np.abs(high))
     found[[channel for cycle in cycles for of_one in cycle.lacking for channel in of_one]] = False
     return np.asarray(found)
 

@@ -29,10 +29,12 @@ from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+Grid = tuple[FloatArray, GridCycles, NDArray[np.bool_]]
 
 _ROUNDS = 2  # of the search for displaced pulses
 _REPETITIONS = 4  # of the recovery where cycles were discarded
@@ -51,14 +53,49 @@ _TINY = 1e-150  # whose square is not 0
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(6), (1.0, 0.0)))
 
 
+class LatestGrid:
+    """Grids of the latest trigger cycles that were corrected: several shafts may have the same."""
+
+    def __init__(self) -> None:
+        self._method, self._cycles = '', list[CycleSamples]()
+        self._found: Grid | None = None
+
+    def forget(self) -> None:
+        """Free the memory."""
+        self._cycles, self._found = [], None
+
+    def of(self, cycles: list[CycleSamples], method: str) -> Grid:
+        """
+        Return the grid (cycle, sample, channel) of `cycles`, which are resampled by `method`.
+
+        The second result has those channels only which tell of the pulse errors, as the third
+        (channel,) says; if none does, all.
+        """
+        if self._found is None or not self._has(cycles, method):
+            grid = cycle_grid(cycles, method=method)
+            told = telling(grid, cycles)
+            if not told.any():
+                told[:] = True
+            self._method, self._cycles = method, cycles
+            self._found = grid, GridCycles(grid if told.all() else grid[..., told]), told
+        return self._found
+
+    def _has(self, cycles: list[CycleSamples], method: str) -> bool:
+        return method == self._method and len(cycles) == len(self._cycles) and all(
+            one.samples is other.samples and np.array_equal(one.edges, other.edges)
+            for one, other in zip(cycles, self._cycles))
+
+
 class CorrectingAverager:
     """
     A `ShaftAverager` that adds to its averages what needs their cycles once more.
 
     That is the `Correction` if `correct_jitter` is set, and the `Envelope` with bearing orders.
+    `grids` it shares with other shafts.
     """
 
-    def __init__(self, settings: AverageSettings) -> None:
+    def __init__(self, settings: AverageSettings, grids: LatestGrid) -> None:
+        self._grids = grids
         self._shaft = ShaftAverager(settings)
         self._cycles: list[CycleSamples] = []
         self._gaps = ChannelGaps()
@@ -127,7 +164,7 @@ class CorrectingAverager:
                                 trigger_cycles=self.settings.trigger_cycles)
 
     def _corrected(self, average: Average, cycles: list[CycleSamples]) -> Average:
-        correction = correct_average(average, cycles, self.settings)
+        correction = correct_average(average, cycles, self.settings, self._grids)
         errors = average.amplitude_errors
         if correction.accepted:
             # The vibration and the declaration together know the jitter better than a few cycles.
@@ -151,8 +188,8 @@ def _clean(average: Average, cycles: ComplexArray, settings: AverageSettings) ->
                            settings.cycle_length * average.cycle_numbers)
 
 
-def correct_average(raw: Average, cycles: Sequence[CycleSamples],
-                    settings: AverageSettings) -> Correction:
+def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
+                    grids: LatestGrid) -> Correction:
     """
     Recover the pulse errors of a block average and average its cycles again without them.
 
@@ -164,7 +201,7 @@ def correct_average(raw: Average, cycles: Sequence[CycleSamples],
     if raw.discarded_cycles and not np.isfinite(raw.waveform).all():
         return _uncorrected(raw, 'cycles were discarded, and what is left has no whole '
                                  'fundamental cycle that tells what they were: average more')
-    recovery, refitted = _refitted(raw, cycles, settings)
+    recovery, refitted = _refitted(raw, cycles, settings, grids)
     periods = raw.periods
     largest, reach = np.abs(recovery.expected).max(), _REACH * periods.min()
     reason = recovery.reason if largest <= reach else (
@@ -252,14 +289,14 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
             np.where(known, np.fmax(np.abs(whole), np.abs(amplitudes)), np.nan))
 
 
-def _refitted(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
-              ) -> tuple[PulseErrorRecovery, int]:
+def _refitted(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
+              grids: LatestGrid) -> tuple[PulseErrorRecovery, int]:
     """
     Recover the pulse errors, where needed again without the pulses that no jitter explains.
 
     The second result is the number of these.
     """
-    recovery, grid = _recovered(raw, cycles, settings)
+    recovery, grid = _recovered(raw, cycles, settings, grids)
     begins = np.flatnonzero(raw.used)
     moved = np.zeros(raw.pulses.size)
     for _ in range(_ROUNDS):
@@ -275,7 +312,8 @@ def _refitted(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSet
         if np.any(np.diff(raw.pulses - moved) <= 0.0):
             return recovery, 0
         again = replace(raw, pulses=raw.pulses - moved)
-        recovery, grid = _recovered(again, _between(raw, cycles, again.pulses), settings)
+        recovery, grid = _recovered(
+            again, _between(raw, cycles, again.pulses), settings, grids)
     if not moved.any():
         return recovery, 0
     shift = moved - moved.mean()
@@ -288,22 +326,18 @@ def _declared(cycles: Sequence[CycleSamples], settings: AverageSettings) -> floa
     return 1.0 / (math.sqrt(12.0) * (settings.keyphasor_rate or cycles[0].rate))
 
 
-def _recovered(raw: Average, cycles: Sequence[CycleSamples], settings: AverageSettings
-               ) -> tuple[PulseErrorRecovery, FloatArray]:
+def _recovered(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
+               grids: LatestGrid) -> tuple[PulseErrorRecovery, FloatArray]:
     """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
-    grid = cycle_grid(cycles, method=settings.interpolation)
+    grid, seen, told = grids.of(cycles, settings.interpolation)
     recover = partial(
         recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
         additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
-    told = telling(grid, cycles)
-    if not told.any():
-        told[:] = True
-    seen = grid[..., told]
     if raw.discarded_cycles:
-        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[told]), seen, recover,
-                                     settings.cycle_length)
+        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[told]), seen.cycles,
+                                     recover, settings.cycle_length)
     else:
         found = recover(seen, periods=raw.periods)
     return _of_all_channels(found, told), grid
@@ -348,7 +382,7 @@ def _recovered_over_gaps(raw: Average, grid: FloatArray,
     to_cycles = cycle_length / float(np.mean(raw.periods))
     for _ in range(_REPETITIONS):
         whole[lost] = _expected_cycles(raw, lost, grid.shape[1], cycle_length, errors * to_cycles)
-        recovery = recover(whole, periods=periods)
+        recovery = recover(GridCycles(whole), periods=periods)
         if not recovery.accepted:
             break
         errors[beside] = 2.0 * recovery.errors[beside] - errors[beside]

@@ -32,7 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
-from sa_jitter_ros.averaging.synchronous_orders import LineSearch, significant_orders
+from sa_jitter_ros.averaging.synchronous_orders import (GridCycles, LineSearch,
+                                                        significant_orders)
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 # The width of a uniform distribution in its standard deviations.
@@ -101,14 +102,14 @@ class PulseErrorRecovery:
     ripple: FloatArray
 
 
-def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_length: float,
+def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
                          orders: Sequence[float] = (), additional_orders: Sequence[float] = (),
                          most_orders: int = 12, with_ripple: bool = False) -> PulseErrorRecovery:
     """
     Recover the pulse errors of one average from its vibration.
 
-    `cycles` (cycle, sample, channel) are its trigger cycles, sample i at the fraction u = i /
+    `grid` are its trigger cycles (cycle, sample, channel), sample i at the fraction u = i /
     samples of the time between two measured pulses (linear law), and `periods` (cycle,) these
     times (s). `cycle_length` is r, `first_angle` the angle of the first pulse, both in fundamental
     cycles. `declared_standard_deviation` (s) is that of the declared pulse error. `orders` are the
@@ -126,17 +127,18 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
     >>> pulses = np.arange(41) / 20.0 + errors
     >>> times = pulses[:-1, None] + np.diff(pulses)[:, None] * np.arange(100) / 100.0
     >>> cycles = np.cos(2.0 * np.pi * 5.0 * 20.0 * times) + rng.normal(0.0, 0.01, times.shape)
-    >>> recovery = recover_pulse_errors(cycles[:, :, None], periods=np.diff(pulses),
-    ...                                 cycle_length=1.0, declared_standard_deviation=5e-4)
+    >>> recovery = recover_pulse_errors(
+    ...     GridCycles(cycles[:, :, None]), periods=np.diff(pulses), cycle_length=1.0,
+    ...     declared_standard_deviation=5e-4)
     >>> recovery.accepted, recovery.orders.tolist()
     (True, [5.0])
     >>> bool(abs(recovery.errors - (errors - errors.mean())).max() < 2e-5)
     True
     """
-    cycles, periods = _validated(cycles, periods, cycle_length, declared_standard_deviation)
+    periods = _validated(grid.cycles, periods, cycle_length, declared_standard_deviation)
     declared = declared_standard_deviation * cycle_length / float(np.mean(periods))
     attempt = partial(
-        _staged_fit, cycles, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
+        _staged_fit, grid, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
         additional_orders=additional_orders, most_orders=most_orders, declared=declared,
         with_ripple=with_ripple)
     fit, gain, reason = attempt(expected=declared)
@@ -145,7 +147,7 @@ def recover_pulse_errors(cycles: FloatArray, *, periods: FloatArray, cycle_lengt
         if other[0] is not None and other[0].evidence > fit.evidence + _UNLIKELY:
             fit, gain, reason = other
     if fit is None:
-        count, _, channels = cycles.shape
+        count, _, channels = grid.cycles.shape
         return PulseErrorRecovery(
             np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.zeros(count + 1),
             np.zeros((2, count + 1)), np.zeros(count + 1, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
@@ -180,8 +182,8 @@ def _may_be_aside(fit: PulseErrorFit, declared: float) -> bool:
 
 
 def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, declared: float
-               ) -> tuple[FloatArray, FloatArray]:
-    cycles, periods = np.asarray(cycles, np.float64), np.asarray(periods, np.float64)
+               ) -> FloatArray:
+    periods = np.asarray(periods, np.float64)
     if cycles.ndim != 3 or len(cycles) < 2 or not cycles.size or periods.shape != cycles.shape[:1]:
         raise SignalError(f'cycles of shape {cycles.shape} with periods of shape {periods.shape}: '
                           'give (cycle, sample, channel) of at least 2 cycles, a period for each')
@@ -191,7 +193,7 @@ def _validated(cycles: FloatArray, periods: FloatArray, cycle_length: float, dec
     for name, value in (('cycle_length', cycle_length), ('declared_standard_deviation', declared)):
         if not (np.isfinite(value) and value > 0.0):
             raise ParameterError(f'{name} is {value}: give a positive number')
-    return cycles, periods
+    return periods
 
 
 def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declared: float,
@@ -215,7 +217,7 @@ def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declar
     return ''
 
 
-def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
+def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
                 declared: float, expected: float, with_ripple: bool
                 ) -> tuple[PulseErrorFit | None, float, str]:
@@ -228,15 +230,15 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
     Returns the fit, the power of the orders without the errors over that with them, and why
     nothing can be fitted.
     """
-    samples = np.ascontiguousarray(cycles.transpose(1, 0, 2))
+    samples, count = grid.samples, len(grid.cycles)
     given = np.unique([g for g in orders if 0.0 < g * cycle_length <= 0.5 * len(samples)])
-    search = None if len(orders) else LineSearch.of(samples, cycle_length, additional_orders)
+    search = None if len(orders) else LineSearch.of(grid, cycle_length, additional_orders)
     most = most_orders + sum(g != round(g) for g in set(additional_orders))
-    rounding = _ROUNDING * np.sqrt(np.mean(samples**2, axis=(0, 1)))
+    rounding = _ROUNDING * grid.size
     known = given if search is None else search.orders
     width = _UNIFORM_WIDTH * expected  # of the interval that an error is still expected in
     spread = 1.5 * width  # the largest difference between neighbours
-    errors, used, clear = np.zeros(len(cycles) + 1), np.empty(0), np.empty(0)
+    errors, used, clear = np.zeros(count + 1), np.empty(0), np.empty(0)
     problem = None
     for _ in range(_STAGES):
         reach = _MOST_TURNS / width
@@ -246,7 +248,7 @@ def _staged_fit(cycles: FloatArray, *, cycle_length: float, first_angle: float,
             candidates, clearest = search.strongest(errors, most, below=reach)
             clear = np.union1d(clear, clearest)
             if clearest.size:
-                candidates = candidates[search.plausible(errors, candidates, cycles=len(cycles))]
+                candidates = candidates[search.plausible(errors, candidates, cycles=count)]
         # at most half as many unknowns as a cycle has samples
         room = np.cumsum([2 * nodes_for(g * spread) for g in candidates]) <= len(samples) // 2
         candidates = np.sort(candidates[room])

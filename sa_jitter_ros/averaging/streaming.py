@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, AverageSettings
-from sa_jitter_ros.averaging.correction import CorrectingAverager
+from sa_jitter_ros.averaging.correction import CorrectingAverager, LatestGrid
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.error_ramp import ErrorRamp
 from sa_jitter_ros.averaging.recovered_marks import RecoveredMarks
@@ -123,7 +123,9 @@ class StreamingAverager:
         self.timeline, self.validator = timeline, validator
         self.counts = StreamCounts()
         self._pulse_counts = PulseCounts()  # of earlier validators
-        self.shafts = {name: CorrectingAverager(settings) for name, settings in shafts.items()}
+        self._grids = LatestGrid()
+        self.shafts = {name: CorrectingAverager(settings, self._grids)
+                       for name, settings in shafts.items()}
         self._law = angle_law(next(iter(shafts.values())).angle_law)
         self._triggers = TriggerQueue()  # of which the next cycle begins at _next
         self._next = 0
@@ -448,6 +450,7 @@ class StreamingAverager:
                 self._due.append((name, average))
                 self._recovered.learn(average)
                 self._look_at_errors(name, average)
+        self._grids.forget()
         if failed:
             self.counts.cycles_dropped += 1
             self._messages.append(f'{failed}: trigger cycle discarded')

@@ -22,6 +22,7 @@ as coherent from cycle to cycle as the order, and passes the test more often tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import pi
 
 import numpy as np
@@ -51,10 +52,50 @@ _CLEAR = 100.0  # times the power of the orders around
 _TOGETHER, _APART = 2, 0.02
 
 
+class GridCycles:
+    """
+    Trigger cycles at equal steps of angle, `cycles`, as (cycle, sample, channel).
+
+    What is computed of them depends on no shaft, so that several shafts share it.
+    """
+
+    def __init__(self, cycles: FloatArray) -> None:
+        self.cycles = np.asarray(cycles, np.float64)
+
+    @cached_property
+    def samples(self) -> FloatArray:
+        """Return the cycles as (sample, cycle, channel), in one piece."""
+        return np.ascontiguousarray(self.cycles.transpose(1, 0, 2))
+
+    @cached_property
+    def size(self) -> FloatArray:
+        """Return the root of the mean square of each channel (channel,)."""
+        flat = self.cycles.reshape(-1, self.cycles.shape[2])
+        return np.asarray(np.sqrt(np.einsum('nc,nc->c', flat, flat) / len(flat)))
+
+    @cached_property
+    def first(self) -> int:
+        """Return the number of the first cycle in `spectra`."""
+        return max(len(self.cycles) - _SEARCHED_CYCLES, 0) // 2
+
+    @cached_property
+    def spectra(self) -> ComplexArray:
+        """Return the spectra, with a Hann window, of some cycles as (line, cycle, channel)."""
+        part = self.cycles[self.first:self.first + _SEARCHED_CYCLES]
+        count, points, channels = part.shape
+        mean = part.reshape(-1, channels).mean(axis=0)
+        window = np.sin(pi * np.arange(points) / points) ** 2
+        spectra = np.empty((points // 2 + 1, count, channels), np.complex128)
+        # A taper over the cycles keeps strong orders from showing at their neighbours.
+        for number, share in enumerate(_taper(count)):
+            spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
+        return spectra
+
+
 @dataclass(frozen=True)
 class LineSearch:
     """
-    Hann-windowed spectra (line, cycle, channel) of some consecutive cycles from `first` on.
+    Spectra (line, cycle, channel) of some consecutive cycles from `first` on (`GridCycles`).
 
     `orders` are the integer and the additional ones below 0.4 of the sampling rate.
     """
@@ -65,25 +106,17 @@ class LineSearch:
     first: int
 
     @classmethod
-    def of(cls, samples: FloatArray, cycle_length: float, additional_orders: Sequence[float] = ()
+    def of(cls, grid: GridCycles, cycle_length: float, additional_orders: Sequence[float] = ()
            ) -> 'LineSearch':
         """
-        Prepare the search in `samples` (sample, cycle, channel) of trigger cycles.
+        Prepare the search in trigger cycles.
 
         `additional_orders` are searched besides the integer ones.
         """
-        points, count, _ = samples.shape
-        first = max(count - _SEARCHED_CYCLES, 0) // 2
-        part = samples[:, first:first + _SEARCHED_CYCLES]
-        mean, window = part.mean(axis=(0, 1)), np.sin(pi * np.arange(points) / points) ** 2
-        spectra = np.empty((points // 2 + 1, *part.shape[1:]), np.complex128)
-        # A taper over the cycles keeps strong orders from showing at their neighbours.
-        for cycle, share in enumerate(_taper(part.shape[1])):
-            spectra[:, cycle] = rfft((part[:, cycle] - mean) * (share * window)[:, None], axis=0)
-        top = 0.4 * points / cycle_length
+        top = 0.4 * grid.cycles.shape[1] / cycle_length
         others = [g for g in additional_orders if 0.0 < g <= top]
         orders = np.union1d(np.arange(1.0, int(top) + 1.0), others)
-        return cls(spectra, orders, cycle_length, first)
+        return cls(grid.spectra, orders, cycle_length, grid.first)
 
     def strongest(self, errors: FloatArray, most: int, *, below: float
                   ) -> tuple[FloatArray, FloatArray]:
