@@ -221,7 +221,8 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                     recording, model,
                     sources=observations[0].sources.tolist() if observations else ()))
             except SaJitterError as error:
-                raise type(error)(f'{name}: {_mistake(recording) or error}') from error
+                reason = _mistake(recording) or str(error).removeprefix(f'{name}: ')
+                raise type(error)(f'{name}: {reason}') from error
             show(f'{len(observations[-1].acquisitions)} acquisitions of {model.trigger_cycles} '
                  'trigger cycles')
         traces[shaft] = trace(observations, opened, declared=declaration.effects,

@@ -26,6 +26,7 @@ from sa_jitter_ros.inference.timing_choice import Chooser
 from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy import stats
 from scipy.signal import lfilter
 
 PERIOD, SHAFT_MARKS = 0.02, 4
@@ -143,6 +144,15 @@ def test_checks_are_calibrated_on_the_declared_machine():
                          for seed in range(12) for i in (0, 4)])
     assert np.mean(p_values < 0.05) < 0.2
     assert p_values.min() > 1e-4
+
+
+@pytest.mark.parametrize('excess', [0.0, 2.0])
+def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
+    steady = [read_timing([machine(300 + seed, count=1600, excess=excess)]).checks[-1].p_value
+              for seed in range(6)]
+    # uniform errors of the same size would scatter less, and make these look unsteady
+    assert stats.combine_pvalues(steady).pvalue > 1e-3
+    assert min(steady) > 0.05 / 6 / 5
 
 
 @pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])

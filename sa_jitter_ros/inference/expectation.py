@@ -53,8 +53,8 @@ _PLACES = 12  # in a cycle, where errors turn hardly
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
-# Speeds closer than this are the same.
-_SPEED_STEP = 1e-3
+# Speeds closer than this are the same: no amplitude changes by more than 1e-3.
+_SPEED_STEP = 2e-3
 _SHARPEST = 2.0
 _NEAR = 3.0  # lines of a trigger cycle: sources further away hardly leak by random errors
 
@@ -424,23 +424,19 @@ def _scatter(observation: Observation, processes: Sequence[AngleErrorProcess]) -
     r, count = model.cycle_length, model.trigger_cycles
     if not kept_apart(r, sources):
         sources = np.concatenate((sources, -sources))
-    turns = r * (sources - observation.orders[:, None])
+    turns = r * (sources[:, None] - observation.orders)
+    u, w = unit_nodes(_NODES // 2)  # few turns within the cycle
+    waves = np.exp(2j * np.pi * turns[..., None] * u) * w  # (source, order, u)
+    each = sources[:, None, None]
+    first = joint_characteristic(processes, [sources[:, None]], [u], [0])
+    both = first[:, :, None] * first.conj()[:, None]
     found = np.zeros(turns.shape)
-    u, w = _nodes(_NODES)
-    lags = min(correlation_length(processes) + 1, count)
-    for s, source in enumerate(sources):
-        near = np.flatnonzero((np.abs(turns[:, s]) < _NEAR) & (observation.orders != source))
-        if not near.size:
-            continue
-        first = joint_characteristic(processes, [np.array([source])], [u], [0])
-        wave = np.exp(2j * np.pi * np.outer(turns[near, s], u)) * w  # (order, u)
-        for lag in range(lags):
-            joint = joint_characteristic(processes, [np.array([[source]]), np.array([[-source]])],
-                                         [u[:, None], u], [0, lag])
-            joint = joint - np.multiply.outer(first, first.conj())
-            both = np.einsum('ou,uv,ov->o', wave, joint, wave.conj())
-            both = both * np.exp(-2j * np.pi * turns[near, s] * lag)
-            found[near, s] += (1.0 if lag == 0 else 2.0) * (count - lag) / count**2 * both.real
+    for lag in range(min(correlation_length(processes) + 1, count)):
+        joint = joint_characteristic(processes, [each, -each], [u[:, None], u], [0, lag]) - both
+        pair = np.sum((waves @ joint) * waves.conj(), axis=-1) * np.exp(-2j * np.pi * turns * lag)
+        found += (1.0 if lag == 0 else 2.0) * (count - lag) / count**2 * pair.real
+    found[(np.abs(turns) >= _NEAR) | (sources[:, None] == observation.orders)] = 0.0
+    found = found.T
     return np.maximum(found, 0.0)
 
 

@@ -29,6 +29,7 @@ it leaves, over angle (orders) and over time (tones): the sharper peak decides w
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,8 +181,8 @@ def _low_passed(samples: Array, rate: float, top: float) -> tuple[Array, float]:
     padded = next_fast_len(count + 200, real=True)
     spectrum = np.fft.rfft(samples - samples.mean(axis=0), padded, axis=0)
     spectrum[int(_EDGE * top / rate * padded):] = 0.0
-    size = min(round(padded * _SAMPLES * top / rate), padded)
-    size += size % 2
+    size = next_fast_len(min(round(padded * _SAMPLES * top / rate), padded), real=True)
+    size = min(size, padded)
     found = np.fft.irfft(spectrum[:size // 2 + 1], size, axis=0)
     return found[:int(count * size / padded)] * (size / padded), rate * size / padded
 
@@ -205,7 +206,8 @@ class _States:
         self.tones = np.zeros(0)
         self.highest = top
         self.jitter_std = jitter_std
-        points = max(_FEWEST_POINTS, int(np.ceil(_POINTS * top * cycle_length)))
+        points = next_fast_len(
+            max(_FEWEST_POINTS, math.ceil(_POINTS * top * cycle_length)), real=True)
         self.u = u = (np.arange(points) + 0.5) / points
         # of the states of a cycle, and of the error of its last pulse
         self.shapes = np.stack([1.0 - u, u * (1.0 - u), u * (1.0 - u) * (2.0 * u - 1.0),
@@ -224,6 +226,12 @@ class _States:
         return self.amplitudes.shape[1] - self.declared
 
     @property
+    def transformed(self) -> int:
+        """Return how many of the first cycles have a fast Fourier transform: nearly all."""
+        return next(count for count in range(self.times.size - 1, 0, -1)
+                    if next_fast_len(count, real=True) == count)
+
+    @property
     def span(self) -> float:
         """Return the fundamental cycles in the stretch."""
         return self.cycle_length * (self.times.size - 1)
@@ -238,8 +246,8 @@ class _States:
                       - self.states[:-1, 1:-1] @ self.shapes[1:-2])
         position = np.clip((self.place - self.start_time) * self.sample_rate, 0.0,
                            len(self.samples) - 1.0)
-        self.vibration = interpolate(self.samples, position.ravel()).reshape(*self.place.shape, -1)
-        self.vibration *= self.whole[:, None, None]
+        found = interpolate(self.samples, position.ravel()).reshape(*self.place.shape, -1)
+        self.vibration = np.moveaxis(found, 2, 0) * self.whole[:, None]
 
     def _make_tables(self) -> None:
         """Make the lines: of orders, a phase for each cycle times a wave that all cycles share."""
@@ -272,24 +280,33 @@ class _States:
             total += amplitude.real * tone.real - amplitude.imag * tone.imag
         return np.asarray(total)
 
-    def _sums(self, values: Array) -> ComplexArray:
-        """Return the sums (cycle, line) over the points of `values` (cycle, point) by lines."""
-        found = self.turn * (values @ self.wave.real.T + 1j * (values @ self.wave.imag.T))
+    def _sums(self, values: Array, shapes: Array | None = None) -> ComplexArray:
+        """
+        Return the sums (cycle, line) over the points of `values` (cycle, point) by lines.
+
+        With `shapes` (shape, point), which multiply the values, they are (cycle, shape, line).
+        """
+        some = np.ones((1, self.u.size)) if shapes is None else shapes
+        wave = (some[:, None] * self.wave).reshape(-1, self.u.size)
+        found = (values @ wave.real.T + 1j * (values @ wave.imag.T)).reshape(
+            len(values), len(some), -1)
+        found *= self.turn[:, None]
         if self.tones.size:
-            found = np.hstack([found, np.einsum('kp,tkp->kt', values, self.in_time)])
-        return np.asarray(found)
+            found = np.concatenate([found, np.stack(
+                [(values * tone) @ some.T for tone in self.in_time], axis=2)], axis=2)
+        return np.asarray(found if shapes is not None else found[:, 0])
 
     def _residual(self) -> Array:
         gain = 1.0 + self.states[:-1, -1:]
-        return np.stack([self.vibration[:, :, c] - gain * self._signal(row)
-                         for c, row in enumerate(self.amplitudes)], axis=2)
+        return np.stack([seen - gain * self._signal(row)
+                         for seen, row in zip(self.vibration, self.amplitudes)])
 
     def fit_amplitudes(self) -> None:
         """Fit the amplitudes of all lines with the states as they are."""
         self._make_tables()
         gain = 1.0 + self.states[:-1, -1:]
         right = np.stack([self._sums(row / gain).conj().sum(axis=0)
-                          for row in np.moveaxis(self.vibration, 2, 0)], axis=1)
+                          for row in self.vibration], axis=1)
         ridge = _RIDGE * self.normal[0, 0] * np.eye(len(self.normal))
         found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
         n = len(right)
@@ -302,12 +319,12 @@ class _States:
         self._make_tables()
         residual = self._residual()
         points = self.whole.sum() * self.u.size
-        self.weight = points / np.sum(residual**2, axis=(0, 1))
+        self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
         of_orders = np.arange(self.amplitudes.shape[1]) < self.orders.size
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
         rate = np.stack([self.slope[:, None] * self._signal(turns * row)
-                         for row in self.amplitudes], axis=2)
-        moving = np.stack([self._signal(of_orders * row) for row in self.amplitudes], axis=2)
+                         for row in self.amplitudes])
+        moving = np.stack([self._signal(of_orders * row) for row in self.amplitudes])
         solution = self._solve(residual, (rate, moving), weak)
         change, amplitudes = solution
         self.change = change[:, 0]
@@ -326,11 +343,11 @@ class _States:
                ) -> tuple[Array, ComplexArray]:
         """Return the changes of states (pulse, state) and amplitudes (channel, line)."""
         pulses, width = self.states.shape
-        count, channels = width * pulses, residual.shape[2]
+        count, channels = width * pulses, len(residual)
         by = [*[0] * (width - 1), 1, 0]  # which derivative a state goes with
-        square = {(i, j): (derivative[i] * derivative[j]) @ self.weight
+        square = {(i, j): np.einsum('c,ckp,ckp->kp', self.weight, derivative[i], derivative[j])
                   for i, j in ((0, 0), (0, 1), (1, 1))}
-        right = [(item * residual) @ self.weight for item in derivative]
+        right = [np.einsum('c,ckp,ckp->kp', self.weight, item, residual) for item in derivative]
         band, down = np.zeros((width + 1, count)), np.zeros(count)
         first = width * np.arange(pulses - 1)
         for i, shape in enumerate(self.shapes):
@@ -370,11 +387,13 @@ class _States:
         below = np.zeros((channels, 2 * lines))
         first = width * np.arange(pulses - 1)
         for c, weight in enumerate(self.weight):
-            for i, shape in enumerate(self.shapes):
-                found = weight * self._sums(derivative[by[i]][:, :, c] * shape)
-                border[first + i, c, :lines] += found.real
-                border[first + i, c, lines:] -= found.imag
-            total = weight * self._sums(residual[:, :, c]).sum(axis=0)
+            for which, item in enumerate(derivative):
+                states = [i for i, own in enumerate(by) if own == which]
+                found = weight * self._sums(item[c], self.shapes[states])
+                for i, row in zip(states, np.moveaxis(found, 1, 0)):
+                    border[first + i, c, :lines] += row.real
+                    border[first + i, c, lines:] -= row.imag
+            total = weight * self._sums(residual[c]).sum(axis=0)
             below[c] = np.append(total.real, -total.imag)
             corner[c, :, c] = weight * self.normal
         flat = corner.reshape(below.size, -1)
@@ -450,20 +469,21 @@ class _States:
 
         A clock that is fast or slow, or a wrong ratio, makes it.
         """
-        flat = self.vibration.reshape(-1, self.vibration.shape[2])
-        spectrum = np.abs(np.fft.rfft(flat * np.hanning(len(flat))[:, None], axis=0)) ** 2
+        span = self.cycle_length * self.transformed
+        flat = self.vibration[:, :self.transformed].reshape(len(self.vibration), -1)
+        spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
         power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
-        step = _SLOPE_STEP / self.orders.max() / self.span
+        step = _SLOPE_STEP / self.orders.max() / span
         most = min(_SLOPES, int(_MOST_SLOPE / step))
         number = np.arange(-most, most + 1)
         slope = step * number
         score = np.sum([np.log(1e-3 * power.max() + np.interp(
-            g * (1.0 + slope) * self.span, np.arange(power.size), power)) for g in self.orders],
+            g * (1.0 + slope) * span, np.arange(power.size), power)) for g in self.orders],
             axis=0)
         best = slope[np.argmax(score - 1e-3 * np.abs(number))]
-        ratio = sum(item * np.log(2.0) / _medians(item, max(_WIDE, int(self.span / 2)))
+        ratio = sum(item * np.log(2.0) / _medians(item, max(_WIDE, int(span / 2)))
                     for item in spectrum.T)
-        places = np.rint(self.orders * (1.0 + best) * self.span).astype(int)
+        places = np.rint(self.orders * (1.0 + best) * span).astype(int)
         chance = gamma.sf(ratio[places], spectrum.shape[1])
         if (score.max() - score[most] > _SLOPE_GAIN * self.declared
                 and abs(best) > 1.5 * step
@@ -476,14 +496,15 @@ class _States:
     def new_lines(self) -> tuple[list[float], list[float]]:
         """Return orders, and tones in Hz, that stand out of the residual."""
         self._make_tables()
-        residual = self._residual()
-        flat = np.ascontiguousarray(residual.reshape(-1, residual.shape[2]))
-        time = self.place.ravel()
+        span = self.cycle_length * self.transformed
+        residual = self._residual()[:, :self.transformed]
+        flat = np.ascontiguousarray(residual.reshape(len(residual), -1).T)
+        time = self.place[:self.transformed].ravel()
         duration = float(time[-1] - time[0])
         at = np.interp(np.linspace(time[0], time[-1], time.size), time, np.arange(time.size))
         even = interpolate(flat, np.clip(at, 0.0, time.size - 1.0))
-        least = _ACCURACY * np.sqrt(np.mean(self.vibration**2, axis=(0, 1)))
-        over_angle, over_time = (_spectrum(item, self.span, least) for item in (flat, even))
+        least = _ACCURACY * np.sqrt(np.mean(self.vibration**2, axis=(1, 2)))
+        over_angle, over_time = (_spectrum(item, span, least) for item in (flat, even))
         limit = gamma.isf(_FALSE / len(over_angle[0]), flat.shape[1]) * _MARGIN
         found: list[tuple[float, float, bool]] = []
         for tone, (ratio, power), (_, other) in ((False, over_angle, over_time),
@@ -491,12 +512,12 @@ class _States:
             middle = ratio[1:-1]
             peaks = 1 + np.flatnonzero((middle > ratio[:-2]) & (middle >= ratio[2:])
                                        & (middle > limit))
-            order = peaks / self.span
-            for peak in peaks[(order > 3.0 / self.span) & (order < self.highest)]:
+            order = peaks / span
+            for peak in peaks[(order > 3.0 / span) & (order < self.highest)]:
                 near = other[max(peak - 8, 0):peak + 9].max()
                 if power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER):
                     place = _between(np.log(ratio[peak - 1:peak + 2])) + peak
-                    found.append((power[peak], place / (duration if tone else self.span), tone))
+                    found.append((power[peak], place / (duration if tone else span), tone))
         found.sort(reverse=True)
         orders: list[float] = []
         tones: list[float] = []
@@ -532,8 +553,8 @@ class _States:
         count = self.orders.size
         top, bottom = np.zeros(self.amplitudes.shape[1]), np.zeros(self.amplitudes.shape[1])
         for c, (weight, row) in enumerate(zip(self.weight, self.amplitudes)):
-            moved = np.append(self._sums(angle * residual[:, :, c])[:, :count].sum(axis=0),
-                              self._sums(time * residual[:, :, c])[:, count:].sum(axis=0))
+            moved = np.append(self._sums(angle * residual[c])[:, :count].sum(axis=0),
+                              self._sums(time * residual[c])[:, count:].sum(axis=0))
             top += weight * np.real(2j * np.pi * row * moved)
             bottom += weight * 2.0 * np.pi**2 * np.abs(row) ** 2
         whole = self.whole[:, None]
@@ -635,7 +656,7 @@ class _States:
             beside = np.exp(2j * np.pi * (self.orders[i] * angle - tone[:, None] * middle))
             for c, row in enumerate(self.amplitudes):
                 alone[i] = row[i]
-                each = self._sums(residual[:, :, c] + self._signal(alone))[:, i].conj()
+                each = self._sums(residual[c] + self._signal(alone))[:, i].conj()
                 turned += self.weight[c] * float(np.abs(each.sum()) ** 2)
                 timed += self.weight[c] * np.abs(beside @ each) ** 2
             found[i] = turned > _SHARPER * timed.max()
@@ -649,7 +670,7 @@ def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
     The floor of a channel is at least the power of a line of the amplitude `least` (channel,).
     """
     window = np.hanning(len(values) + 1)[:-1, None]
-    power = np.abs(np.fft.rfft(values * window, axis=0)) ** 2
+    power = np.abs(np.fft.rfft((values * window).T)).T ** 2
     ratio = np.zeros(len(power))
     for channel, limit in zip(power.T, (0.5 * least * window.sum()) ** 2):
         floor = np.full(len(power), limit)

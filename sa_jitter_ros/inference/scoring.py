@@ -84,14 +84,16 @@ class Bench:
         names = {item.name for item in effects}
         return [*(item for item in self.declared if item.name not in names), *effects]
 
-    def change(self, others: Sequence[Effect], effect: Effect) -> float:
+    def change(self, others: Sequence[Effect], effect: Effect,
+               chosen: Sequence[int] | None = None) -> float:
         """
         Return the largest change of a line that an effect makes beside others.
 
-        It is that of the mean attenuation, or of the standard deviation of one average.
+        It is that of the mean attenuation, or of the standard deviation of one average, of the
+        acquisitions that fit parameters, or of the `chosen` ones.
         """
-        without, with_it = (self.expect(known, self.fit) for known in (
-            [*others], [*others, effect]))
+        without, with_it = (self.expect(known, self.fit if chosen is None else chosen)
+                            for known in ([*others], [*others, effect]))
         changes = [np.abs(with_it.attenuation - without.attenuation).mean(axis=0)]
         for name in ('attenuation_variance', 'amplitude_variance'):
             changes.append(np.abs(np.sqrt(getattr(with_it, name).mean(axis=0))

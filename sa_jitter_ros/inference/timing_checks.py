@@ -14,6 +14,7 @@ Checks of what a fit of the timing leaves, in ways that no effect has a part in.
 Each has a p value from draws of the fitted model. None names a culprit.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -124,10 +125,8 @@ def _shape(chooser: Chooser, choice: Choice) -> Check:
     may have the declared distribution, too.
     """
     fit, data = choice.fit, chooser.data
-    larger = JITTER in fit.starts and fit.starts[JITTER][0] > 0.0
     white = 1.0 / np.sqrt(fit.spectrum(fit.parameters)[:, 1, 1].real)
-    p_value = max(_likeness(chooser, choice, scaled, white) for scaled in (
-        (False, True) if larger else (False,)))
+    p_value = _likeness(chooser, choice, white)
     names = [*fit.spectra, *([JITTER] if JITTER in fit.place else [])]
     power = sum(float(np.average(fit.contribution(name)[:, 1, 1].real, weights=data.size))
                 for name in names)
@@ -147,7 +146,7 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
     even = np.linspace(0.0, 0.5, _EVEN)
     response = np.interp(data.frequency, even, _minimum_phase(
         np.interp(even, data.frequency, np.log(made + _TINY))))
-    return Check(_likeness(chooser, choice, True, response.conj() / total), fit.moves(name),
+    return Check(_likeness(chooser, choice, response.conj() / total), fit.moves(name),
                  data.unit * math.sqrt(float(np.average(made, weights=data.size))),
                  f'skewness and kurtosis of the events behind {name}')
 
@@ -162,40 +161,46 @@ def _minimum_phase(log_power: Array) -> Array:
     return np.asarray(np.exp(0.5 * np.fft.rfft(folded)))
 
 
-def _likeness(chooser: Chooser, choice: Choice, scaled: bool, gain: Array) -> float:
+def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
     """Return the p value of skewness and kurtosis of errors through a filter."""
     data = chooser.data
-    p_values = []
+    p_values: list[list[float]] = [[] for _ in _kinds(choice)]
     for item in data.stretches:
         if item.errors.size < _FEWEST:
             continue
         seen = _moments(_filtered(chooser.left(choice.fit, item), gain, data))
-        null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
-        for value, draws in zip(seen, null):
-            middle = np.median(draws)
-            p_values.append(_chance(abs(float(value - middle)), np.abs(draws - middle)))
-    return min(1.0, len(p_values) * min(p_values)) if p_values else 1.0
+        for found, scaled in zip(p_values, _kinds(choice)):
+            null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
+            for value, draws in zip(seen, null):
+                middle = np.median(draws)
+                found.append(_chance(abs(float(value - middle)), np.abs(draws - middle)))
+    return max(min(1.0, len(found) * min(found)) if found else 1.0 for found in p_values)
 
 
 def _steadiness(chooser: Chooser, choice: Choice) -> Check:
     """Test whether the pulse errors are as large in all parts of the recording."""
     data = choice.fit.data
-    seen, drawn = [], []
-    for item in data.stretches:
-        if item.errors.size >= _FEWEST:
-            seen += _powers(chooser, choice, item, None)
-            drawn += _powers(chooser, choice, item, _drawn(choice, item, True))
+    items = [item for item in data.stretches if item.errors.size >= _FEWEST]
+    seen = [power for item in items for power in _powers(chooser, choice, item, None)]
     if len(seen) < 2:
         return Check(1.0, PULSES, 0.0, 'the size of the pulse errors')
-    logs, null = np.log(np.array(seen)), np.log(np.array(drawn))
-    usual = np.median(null)
-    spread, size = float(np.var(logs)), float(np.ptp(np.exp(logs - usual)))
+    logs, p_value = np.log(np.array(seen)), 0.0
+    for scaled in _kinds(choice):
+        null = np.log(np.array([power for item in items for power in _powers(
+            chooser, choice, item, _drawn(choice, item, scaled))]))
+        p_value = max(p_value, _chance(float(np.var(logs)), np.var(null, axis=0)))
     power = float(np.average(choice.fit.spectrum(choice.fit.parameters)[:, 1, 1].real,
                              weights=data.size))
-    return Check(_chance(spread, np.var(null, axis=0)), PULSES,
-                 data.unit * math.sqrt(size * power),
+    size = float(np.ptp(np.exp(logs - np.median(null))))
+    return Check(p_value, PULSES, data.unit * math.sqrt(size * power),
                  f'the power of the pulse errors is {float(np.exp(logs.max() - logs.min())):.2g} '
                  'times larger in some parts of the recording than in others')
+
+
+def _kinds(choice: Choice) -> Sequence[bool]:
+    """Return whether declared errors may have been scaled: what is more may be normal errors."""
+    starts = choice.fit.starts
+    return (False, True) if JITTER in starts and starts[JITTER][0] > 0.0 else (False,)
 
 
 def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None) -> list[Array]:

@@ -21,6 +21,7 @@ acquisitions and scored on the others. The result may be that no effect explains
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 import math
 from typing import Any
 
@@ -253,7 +254,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
-        rows, _undecided(bench.change, effects, rows), _probabilities(timing, candidates))
+        rows, _undecided(partial(bench.change, chosen=_few(bench)), effects, rows),
+        _probabilities(timing, candidates))
 
 
 def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:
@@ -320,6 +322,13 @@ def _absorbs(finding: Finding) -> bool:
     return effect is not None and (effect.random or (
         isinstance(effect.timing, Pattern) and not effect.timing.show_in_times
         and finding.p_value > _PLAIN))
+
+
+def _few(bench: Bench) -> list[int]:
+    """Return the slowest, the median and the fastest of the acquisitions that fit parameters."""
+    items = bench.observation.acquisitions
+    slower = sorted(bench.fit, key=lambda a: float(np.ptp(items[a].times)), reverse=True)
+    return sorted({slower[0], slower[len(slower) // 2], slower[-1]})
 
 
 def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
