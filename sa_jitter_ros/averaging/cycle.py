@@ -381,7 +381,7 @@ class WaveformPoints:
     There are `points` in a fundamental cycle and r (`cycles`) of these in a trigger cycle. The
     points are numbered from angle 0 on: `first` (cycle + 1,) are the first ones at or after the
     begin of each cycle and of the one behind, and `behind` (cycle + 1,) their distances from it in
-    steps.
+    steps. No cycle has more than `most` points.
 
     The amplitudes of the cycles follow from these points and `EDGE` more on either side, which
     continue the angle law of the cycle: an amplitude is the integral of the band-limited function
@@ -393,13 +393,16 @@ class WaveformPoints:
     cycles: float
     first: IntArray
     behind: FloatArray
+    most: int
 
     @classmethod
     def of(cls, points: int, cycles: float, first_cycle: int, count: int) -> 'WaveformPoints':
         """Return those of `count` cycles, of which the first is `first_cycle` since angle 0."""
         whole, rest = multiples(exact_cycles(cycles) * points, first_cycle, count)
         inside = rest > 0.0
-        return cls(points, cycles, whole + inside, np.where(inside, 1.0 - rest, 0.0))
+        first = whole + inside
+        return cls(points, cycles, first, np.where(inside, 1.0 - rest, 0.0),
+                   int(np.diff(first).max()))
 
     @property
     def number(self) -> IntArray:
@@ -417,25 +420,34 @@ class WaveformPoints:
         In cycles with fewer points than others they go on behind the last one. There are `around`
         points more in front and behind.
         """
-        steps = np.arange(-around, self.number.max() + around)
+        steps = np.arange(-around, self.most + around)
         return np.asarray((self.behind[:-1, None] + steps) / (self.points * self.cycles))
 
-    def amplitudes(self, values: FloatArray, orders: tuple[float, ...]) -> ComplexArray:
-        """Return them (cycle, channel, order), from values at `fractions(EDGE)`."""
-        number, most = self.number, values.shape[1] - 2 * EDGE
-        projection = CycleProjection(most, most / self.points, orders)
-        projection.add(0, values[:, EDGE:EDGE + most])
-        total = projection.sums()
-        step = -2j * np.pi / self.points * np.array(orders)
+    def sums(self, values: FloatArray, orders: tuple[float, ...]
+             ) -> tuple[ComplexArray, FloatArray, FloatArray]:
+        """
+        Return what `amplitudes` needs of the values at `fractions(EDGE)`.
+
+        That are sums (cycle, channel, order) of `most` points from the first one on, and the
+        values (cycle, point, channel) around both ends of each cycle.
+        """
+        projection = CycleProjection(self.most, self.most / self.points, orders)
+        projection.add(0, values[:, EDGE:EDGE + self.most])
+        window = self.number[:, None] + np.arange(2 * EDGE)
+        return (projection.sums(), values[:, :2 * EDGE].copy(),
+                values[np.arange(len(values))[:, None], window])
+
+    def amplitudes(self, sums: ComplexArray, begin: FloatArray, end: FloatArray,
+                   orders: tuple[float, ...]) -> ComplexArray:
+        """Return (cycle, channel, order) from the `sums` of all cycles."""
+        number, step = self.number, -2j * np.pi / self.points * np.array(orders)
         # The last point of a cycle with fewer points belongs to the next one.
-        beyond = values[:, EDGE + most - 1] * (number < most)[:, None]
-        total -= beyond[:, :, None] * np.exp(step * (most - 1))
+        beyond = end[:, EDGE] * (number < self.most)[:, None]
+        total = sums - beyond[:, :, None] * np.exp(step * (self.most - 1))
         share = _edge_shares(self.points, orders, self.behind)
-        window = number[:, None] + np.arange(2 * EDGE)
-        last = values[np.arange(len(values))[:, None], window]
-        total += np.moveaxis(share[1:] @ last, 1, 2) * np.exp(np.multiply.outer(number, step))[
+        total += np.swapaxes(share[1:] @ end, 1, 2) * np.exp(np.multiply.outer(number, step))[
             :, None]
-        total -= np.moveaxis(share[:-1] @ values[:, :2 * EDGE], 1, 2)
+        total -= np.swapaxes(share[:-1] @ begin, 1, 2)
         whole, rest = np.divmod(self.first[:-1], self.points)
         turned = _turned(whole, rest / self.points, orders)
         return np.asarray(total * (2.0 / (self.points * self.cycles) * turned)[:, None])

@@ -317,19 +317,20 @@ class ShaftAverager:
         """As `_resample`, with points at other angles of every cycle, some cycles at a time."""
         channels, begin = cycles.samples.shape[1], points.first - points.first[0]
         every = np.empty((int(begin[-1]), channels))
-        piece = max(_CACHED // (channels * int(points.number[0])), 1)
-        amplitudes = []
+        piece = max(_CACHED // (channels * points.most), 1)
+        sums = []
         for first in range(0, cycles.count, piece):
             end = min(first + piece, cycles.count)
             part = points.part(first, end)
             values = cycles.part(first, end).at(
                 self._law, part.fractions(EDGE), method=self.settings.interpolation).reshape(
                     end - first, -1, channels)
-            amplitudes.append(part.amplitudes(values, self.settings.orders))
+            sums.append(part.sums(values, self.settings.orders))
             for k, wave in enumerate(values[:, EDGE:], first):
                 every[begin[k]:begin[k + 1]] = wave[:begin[k + 1] - begin[k]]
         self._add_points(points, every)
-        return np.concatenate(amplitudes)
+        total, begins, ends = (np.concatenate(parts) for parts in zip(*sums))
+        return points.amplitudes(total, begins, ends, self.settings.orders)
 
     def _remember(self, amplitudes: ComplexArray) -> None:
         """Append the amplitudes of cycles to those of the window, in memory never reused."""
