@@ -188,7 +188,7 @@ def indicator_table(channels: int) -> Iterator[str]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--trials', type=int, default=600, help='averages of a row; 0: no table')
+    parser.add_argument('--trials', type=int, default=900, help='averages of a row; 0: no table')
     parser.add_argument('--indicators', type=int, default=1500, help='channels; 0: no table')
     options = parser.parse_args()
     if options.trials:

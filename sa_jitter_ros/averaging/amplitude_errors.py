@@ -61,6 +61,12 @@ _LOWEST_LIMIT = 0.5
 _ROUNDING = 1e-9
 # No limit is more than so many times the amplitude: jitter that leaves less leaves no information.
 _LEAST_LEFT = 0.02
+# Uniform errors of a pulse by quadrature; jitter that leaves less than a share leaves an order
+# whose amplitude is not known.
+_NODES, _WEIGHTS = (item * scale for item, scale in zip(legendre.leggauss(4), (1.0, 0.5)))
+_LEAST_SHARE = 0.3
+# Jitter that cannot leak more than so much of the noise into a cycle does not matter.
+_NO_LEAK = 0.01
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
 # Noise of a weak order beside leakage that jitter explains: least share of its scatter, and rounds
 # of its estimate.
@@ -269,11 +275,15 @@ class Repeatability:
                         + widened(np.sqrt(shortened / count), guessed_from) ** 2
                         + scatter.leaked**2)
         across = np.hypot(widened(np.sqrt(across / count), freedom), scatter.leaked)
-        if variance > 0.0 and shows.any() and not shows.all() and count > 2:
-            own, turned = _weak_noise(scatter, orders, shows, variance, cycle_length)
-            beside = np.hypot(own, scatter.leaked)
-            along = np.where(shows, along, np.minimum(along, beside))
-            across = np.where(shows, across, np.minimum(across, np.hypot(beside, turned)))
+        if count > 2 and np.any(
+                variance * np.sum(turn**2, where=shows) > _NO_LEAK * scatter.noise):
+            beside = np.hypot(
+                _own_noise(scatter, orders, shows, variance, cycle_length), scatter.leaked)
+            short = np.where(shows, widened(np.sqrt(shortened / count), guessed_from), 0.0)
+            along = np.minimum(along, np.hypot(beside, short))
+            turned = widened(turn * math.sqrt(variance / count), guessed_from / _GUESSED)
+            across = np.where(shows & (count >= _MANY), across,
+                              np.minimum(across, np.hypot(beside, turned)))
         return cls(orders, along, across, float(np.sqrt(variance)))
 
     def errors(self, amplitudes: ComplexArray, least_jitter: float = 0.0) -> AmplitudeErrors:
@@ -317,34 +327,23 @@ def corrected_errors(cycles: ComplexArray, clean: ComplexArray, orders: FloatArr
     return AmplitudeErrors.of(amplitudes, along, np.hypot(noise, size * common), largest=largest)
 
 
-def _weak_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], variance: float,
-                cycle_length: float) -> tuple[FloatArray, FloatArray]:
+def _own_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], variance: float,
+               cycle_length: float) -> FloatArray:
     """
-    Return the standard errors (channel, order) of means that noise and jitter of others give.
+    Return the standard errors (channel, order) of means that noise and leaking orders give.
 
     Jitter of a pulse makes an order that `shows` leak into all others, with opposite signs in the
     two cycles beside it: the scatter of the cycles shows much of it, their mean little. What the
-    spectrum of the scatter has beyond it is noise (maximum likelihood). The second result is what
-    jitter, of this `variance`, turns the orders themselves.
+    spectrum of the scatter has beyond it is noise (maximum likelihood), along the radius of an
+    order that shows, whose own jitter is across, else in both directions.
     """
     count = len(scatter.radial)
-    power = 0.5 * (_spectrum(scatter.radial) + _spectrum(scatter.tangential))
-    omega = 2.0 * pi * np.arange(1, len(power) + 1) / count
-    expected, mean = np.zeros(power.shape), np.zeros(power.shape[1:])
-    sources = np.where(shows, scatter.mean, 0.0)
-    signed = np.concatenate((orders, -orders))
-    size = 2.0 * pi * signed * np.concatenate((sources, np.conj(sources)), axis=1)
-    begin, end = _leak(signed[:, None] - orders, cycle_length)
-    turns = np.mod(cycle_length * (signed[:, None] - orders), 1.0)
-    for turn in np.unique(np.round(turns, 6)):
-        same = np.isclose(np.mod(turns - turn + 0.5, 1.0), 0.5, atol=1e-6, rtol=0.0)
-        first, last = (size @ np.where(same, item, 0.0) for item in (begin, end))
-        for sign in (1.0, -1.0):
-            wave = np.exp(1j * (sign * omega - 2.0 * pi * turn))[:, None, None]
-            expected += 0.25 * variance * np.abs(first + last * wave) ** 2
-        both = first + last * np.exp(-2j * pi * turn)
-        mean += 0.5 * variance / count**2 * (
-            np.abs(first) ** 2 + np.abs(last) ** 2 + (count - 1.0) * np.abs(both) ** 2)
+    power = _spectrum(scatter.radial)
+    power = np.where(shows, power, 0.5 * (power + _spectrum(scatter.tangential)))
+    alone, shared = _leaking(np.where(shows, scatter.mean, 0.0), orders, variance, cycle_length)
+    omega = 2.0 * pi * np.arange(1, len(power) + 1)[:, None, None] / count
+    expected = 0.5 * alone + shared * np.cos(omega)  # of a real part
+    mean = 0.5 / count**2 * (count * alone + 2.0 * (count - 1.0) * shared)
     noise = np.maximum(power.mean(axis=0), _TINY)
     least = _LEAST_NOISE * noise
     for _ in range(_ROUNDS):
@@ -352,26 +351,40 @@ def _weak_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], 
             noise + expected) ** 2
         noise = np.maximum(np.sum(weight * (power - expected), axis=0)
                            / np.maximum(weight.sum(axis=0), _TINY), least)
-    freedom = 4.0 * np.sum((noise / (noise + expected)) ** 2, axis=0)
-    own = np.hypot(widened(np.sqrt(noise / count), freedom), np.sqrt(mean))
-    return own, 2.0 * pi * orders * np.abs(scatter.mean) * math.sqrt(variance / count)
+    freedom = np.where(shows, 2.0, 4.0) * np.sum((noise / (noise + expected)) ** 2, axis=0)
+    return np.hypot(widened(np.sqrt(noise / count), freedom), np.sqrt(np.maximum(mean, 0.0)))
 
 
-def _leak(apart: FloatArray, cycle_length: float
-          ) -> tuple[ComplexArray, ComplexArray]:
+def _leaking(sources: ComplexArray, orders: FloatArray, variance: float, cycle_length: float
+             ) -> tuple[FloatArray, FloatArray]:
     """
-    Return what the errors at both ends of a cycle give to an order that is `apart` from another.
+    Return what jitter of the pulses makes `sources` (channel, order) leak into the other orders.
 
-    These are the integrals of (1 - u) and of u times exp(j 2 pi r apart u) over the cycle; zero
-    for an order itself.
+    The results are the variance (channel, order) of what leaks into a cycle, and its covariance
+    with what leaks into the next one. Pulse errors are uniform with this `variance`, and may be
+    large.
     """
-    angle = 2.0 * pi * cycle_length * apart
-    near = np.abs(angle) < 1e-9
-    angle = np.where(near, 1.0, angle)
-    turned = np.exp(1j * angle)
-    whole = (turned - 1.0) / (1j * angle)
-    rising = (turned - whole) / (1j * angle)
-    return (np.where(near, 0.0, whole - rising), np.where(near, 0.0, rising))
+    error = np.sqrt(3.0 * variance) * _NODES
+    begin, end = error[:, None], error
+    strong = np.flatnonzero(sources.any(axis=0))
+    signed = np.concatenate((orders[strong], -orders[strong]))[:, None, None, None]
+    # The integral of exp(j 2 pi (signed begin + angle u)) over the cycle.
+    angle = cycle_length * (signed - orders[:, None, None]) + signed * (end - begin)
+    share = np.exp(1j * pi * (angle + 2.0 * signed * begin)) * np.sinc(angle)
+    own = np.arange(strong.size), strong
+    left = np.abs(share[own] @ _WEIGHTS @ _WEIGHTS)
+    share[own] = 0.0
+    share -= (share @ _WEIGHTS @ _WEIGHTS)[..., None, None]
+    size = sources[:, strong] / np.maximum(left, _LEAST_SHARE)
+    size = np.concatenate((size, np.conj(size)), axis=1)
+    # Sources whose phases turn alike from cycle to cycle leak together.
+    turns, alike = np.unique(np.mod(np.round(cycle_length * signed.ravel(), 6), 1.0),
+                             return_inverse=True)
+    groups = np.where(alike == np.arange(turns.size)[:, None, None], size, 0.0)
+    leaked = np.tensordot(groups, share, axes=1)  # (group, channel, order, begin, end)
+    turn = np.exp(2j * pi * (cycle_length * orders - turns[:, None]))[:, None]
+    shared = np.conj(_WEIGHTS @ leaked) * (leaked @ _WEIGHTS) @ _WEIGHTS * turn
+    return (np.abs(leaked) ** 2 @ _WEIGHTS @ _WEIGHTS).sum(axis=0), shared.real.sum(axis=0)
 
 
 def _total_variance(scatter: Scatter, turn: FloatArray, shows: NDArray[np.bool_]) -> float:
