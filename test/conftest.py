@@ -24,8 +24,9 @@ import scipy.linalg  # noqa: F401 (its BLAS must be loaded to be set)
 
 pytest_plugins = ['sa_jitter_ros.nodes.testing']
 
-os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='sa_jitter_ros_log_')
-atexit.register(shutil.rmtree, os.environ['ROS_LOG_DIR'], ignore_errors=True)
+# Logs, and baselines of monitors.
+os.environ['ROS_HOME'] = os.environ['ROS_LOG_DIR'] = tempfile.mkdtemp(prefix='sa_jitter_ros_')
+atexit.register(shutil.rmtree, os.environ['ROS_HOME'], ignore_errors=True)
 
 use_one_thread()
 settings.register_profile('repeatable', deadline=None, derandomize=True)

@@ -12,6 +12,7 @@
 
 from contextlib import contextmanager
 import json
+from pathlib import Path
 
 from bench import NodeBench, SteadyClock
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -21,7 +22,7 @@ import pytest
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.nodes import health, messages
-from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
+from sa_jitter_ros.nodes.change_monitor import baseline_path, ChangeMonitor
 from sa_jitter_ros.nodes.testing import Graph
 from std_msgs.msg import Float64MultiArray, String
 
@@ -35,7 +36,7 @@ class MonitorBench(NodeBench):
 
     def __init__(self, graph, *, shafts=('input',), **parameters):
         parameters = {'learning_averages': 40, 'group_averages': 4, 'hardware_id': 'pump 3',
-                      'shafts': list(shafts), **parameters}
+                      'shafts': list(shafts), 'baseline_file': 'none', **parameters}
         super().__init__(
             graph, ChangeMonitor,
             inputs={f'{shaft}/{kind}': Float64MultiArray for shaft in shafts for kind in KINDS},
@@ -248,6 +249,36 @@ def test_baseline_of_another_machine_is_refused_and_kept(learned):
         level, text, _ = b.diagnostics()
         assert (level, 'orders 2, 20, 39' in text) == (ERROR, True)
     assert path.read_bytes() == before
+
+
+def test_baseline_survives_a_restart_without_any_setting(tmp_path, monkeypatch):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    machine = DrawnMachine(13)
+    path = tmp_path / 'sa_jitter_ros' / 'pump%203%2FA.change_monitor.npz'
+    usual = {'hardware_id': 'pump 3/A', 'baseline_file': ''}
+    with running(**usual) as b:
+        b.play(machine, 60)
+        assert b.diagnostics()[2]['baseline_file'] == str(path)
+    assert path.exists()
+    with running(**usual) as b:
+        assert b.change()['baseline'] == {'averages': 60, 'complete': True}
+    for other in ({'hardware_id': 'pump 4'}, {'baseline_file': 'none'}):
+        with running(**{**usual, **other}) as b:
+            assert b.change()['baseline'] == {'averages': 0, 'complete': False}
+            b.play(machine, 60)
+    assert {item.name for item in path.parent.iterdir()} == {
+        path.name, 'pump%204.change_monitor.npz'}
+
+
+@pytest.mark.parametrize(('machine', 'node', 'name'), [
+    ('', '/change_monitor', 'change_monitor.npz'),
+    ('mill', '/hall_2/change_monitor', 'mill.hall_2.change_monitor.npz')])
+def test_file_has_the_names_of_machine_and_node(monkeypatch, machine, node, name):
+    monkeypatch.delenv('ROS_HOME', raising=False)
+    monkeypatch.setenv('HOME', '/home/somebody')
+    assert baseline_path('', machine, node) == Path('/home/somebody/.ros/sa_jitter_ros') / name
+    assert baseline_path('~/a.npz', machine, node) == Path('/home/somebody/a.npz')
+    assert baseline_path('none', machine, node) is None
 
 
 def test_file_that_cannot_be_written_is_a_warning(ros_graph, tmp_path):

@@ -140,7 +140,8 @@ NODES = {
     'predictor': (JitterPredictor, {'follow_shaft_speed': True}, {'shaft_speed': SPEED}),
     'analyser': (ResidualAnalyser, {'acquisitions': 2}, {
         'shaft/order_amplitude': ARRAY, 'shaft/pulse_error': ARRAY, 'prediction': ARRAY}),
-    'monitor': (ChangeMonitor, {'learning_averages': 8, 'group_averages': 1}, {
+    'monitor': (ChangeMonitor, {'learning_averages': 8, 'group_averages': 1,
+                                'baseline_file': 'none'}, {
         'shaft/order_amplitude': ARRAY, 'shaft/condition_indicator': ARRAY,
         'shaft/condition_indicator_error': ARRAY}),
     'view': (LiveView, {'port': 0}, {

@@ -79,9 +79,9 @@ def read_baseline(path: Path, machine: str, settings: Settings, share: float = 1
     Raises RecordingError, in one line, for a file that is damaged or that of another machine, or
     of other settings of the learning. The file is never changed.
     """
-    if not path.exists():
-        return {}
     try:
+        if not path.exists():
+            return {}
         about, arrays = _read(path)
     except OSError as error:
         raise RecordingError(f'{path}: {error.strerror or error}') from error

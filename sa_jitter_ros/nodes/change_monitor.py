@@ -13,9 +13,11 @@
 from collections.abc import Sequence
 from functools import partial
 import json
+import os
 from pathlib import Path
 import time
 from typing import Any
+from urllib.parse import quote
 
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
@@ -31,9 +33,11 @@ PARAMETERS = (
     Parameter('severe_change', 0.25, 'relative change that is an error, if it is at least that '
               'large by two standard errors; smaller ones are warnings', above=0.0,
               maximum=1e6),
-    Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: it is lost when '
-              'the node ends', read_only=True),
+    Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: '
+              'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: it is '
+              'lost when the node ends', read_only=True),
 )
+_NOT_KEPT = 'none'
 _SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens
 _SHOWN = 3  # changes in the message of the status
 
@@ -54,10 +58,11 @@ class ChangeMonitor(MonitoringNode):
         settings = Settings.of(values)
         self._monitor: MachineMonitor | None = None
         self._saved, self._was_complete = time.monotonic(), False
-        file = values['baseline_file']
+        machine = values[HARDWARE_ID.name]
+        self._path = baseline_path(
+            values['baseline_file'], machine, self.get_fully_qualified_name())
         try:
-            self._monitor = MachineMonitor(values[HARDWARE_ID.name], shafts, settings,
-                                           Path(file).expanduser() if file else None)
+            self._monitor = MachineMonitor(machine, shafts, settings, self._path)
         except RecordingError as error:
             self._fail('baseline', str(error))
         self._change = self.create_output(String, 'change', LATCHED_QOS)
@@ -73,8 +78,8 @@ class ChangeMonitor(MonitoringNode):
         if self._monitor is not None:
             self._was_complete = self._monitor.is_complete
             self._show()
-            known = f'baseline of {self._monitor.averages} averages in {file}' if file else (
-                'the baseline is lost when the node ends, set baseline_file to keep it')
+            known = (f'baseline of {self._monitor.averages} averages in {self._path}'
+                     if self._path else 'the baseline is lost when the node ends')
             self.get_logger().info(f'started: monitors {", ".join(shafts)}; {known}')
 
     def destroy_node(self) -> None:
@@ -109,7 +114,7 @@ class ChangeMonitor(MonitoringNode):
         try:
             lines = self._monitor.take(shaft, kind, decoded)
         except ParameterError as error:
-            self._fail(f'baseline of {shaft}', str(error))
+            self._fail(f'baseline of {shaft}', f'{self._path or "baseline"}: {error}')
             return
         if kind == KINDS[0]:
             self._fail(f'baseline of {shaft}', '')
@@ -174,7 +179,7 @@ class ChangeMonitor(MonitoringNode):
         """Return what is learnt and how many quantities have changed."""
         monitor = self._monitor
         if monitor is None:
-            return 'nothing is monitored', {'baseline_file': self._values['baseline_file']}
+            return 'nothing is monitored', {'baseline_file': str(self._path)}
         found = monitor.monitors
         changes = len(monitor.changes())
         values = {
@@ -182,7 +187,7 @@ class ChangeMonitor(MonitoringNode):
             'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
             'uncorrected': str(sum(item.uncorrected for item in found.values())),
             'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
-            'baseline_file': self._values['baseline_file'] or 'none, lost when the node ends'}
+            'baseline_file': str(self._path or f'{_NOT_KEPT}, lost when the node ends')}
         if not found:
             return 'no average received yet', values
         if not monitor.is_complete:
@@ -191,6 +196,22 @@ class ChangeMonitor(MonitoringNode):
                     f'{shaft} at {item.speed:.4g} Hz', values)
         return (f'{changes} changes' if changes else
                 f'no change in {monitor.averages} averages'), values
+
+
+def baseline_path(file: str, machine: str, node: str) -> Path | None:
+    """
+    Return the path of the parameter `baseline_file`, None for `none`.
+
+    Empty is a file of the `machine`, if it has a name, and of the full name of the `node`, where
+    ROS 2 keeps its logs.
+    """
+    if file == _NOT_KEPT:
+        return None
+    if not file:
+        name = '.'.join(filter(None, (machine, *node.split('/'))))
+        file = os.path.join(os.environ.get('ROS_HOME') or '~/.ros', 'sa_jitter_ros',
+                            f'{quote(name, safe="")}.npz')
+    return Path(os.path.expanduser(file))
 
 
 def _some(lines: Sequence[str]) -> str:
