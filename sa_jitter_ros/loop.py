@@ -239,7 +239,10 @@ def _usable(recordings: Sequence[Recording], names: Sequence[str]
     lost: set[int] = set()
     faults = []
     for name, recording in zip(names, recordings):
-        for channel, reason in channel_faults(recording, most_lost=0.0).items():
+        found = channel_faults(recording, most_lost=0.0)
+        if sum(map(is_lost, found.values())) == recording.channels:  # then gaps cost cycles
+            found = channel_faults(recording)
+        for channel, reason in found.items():
             lost |= {channel} if is_lost(reason) else set()
             faults.append(f'{name}: {recording.channel_names[channel]} {reason}'
                           + (' and is left out' if is_lost(reason) else ''))

@@ -86,6 +86,29 @@ def test_written_report_is_the_report(found, tmp_path):
         tmp_path / 'a' / 'b').iterdir()}
 
 
+@pytest.mark.parametrize('second', [False, True])
+def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording, found, second):
+    samples = recording.read().copy()
+    if second:  # two channels, of which none is whole
+        samples = np.concatenate([samples, 0.5 * samples])
+        samples[1, 30_000] = np.inf
+    samples[0, 9_000:9_432] = np.nan
+    loop_found = close_loop(Recording(ArraySource(samples), RATE,
+                                      pulse_times=recording.pulse_times),
+                            {**KEYWORDS, 'trigger_cycles': 10})
+    assert [effect['name'] for effect in loop_found.report['missing_effects']] == ['excess_jitter']
+    std = loop_found.report['missing_effects'][0]['parameters']['std']
+    whole = found.report['missing_effects'][0]['parameters']['std']
+    assert abs(std['value'] - whole['value']) < std['standard_error']  # nearly the same pulses
+    remark, = (text for text in loop_found.report['remarks'] if 'NaN' in text)
+    touched = 5 if second else 4
+    assert remark == ('1.2% of the samples are NaN or infinite: no acquisition contains any of '
+                      f'the {touched} trigger cycles that they touch')
+    observation = loop_found.traces['shaft'].observation
+    assert len(observation.channel_names) == len(samples)
+    assert len(observation.acquisitions) >= 15
+
+
 @pytest.mark.parametrize('name', ['pulse_times', 'reference_pulse_times'])
 def test_pulses_without_any_jitter_have_a_report(name, tmp_path):
     """Their errors are all 0, and their intervals equal to rounding."""

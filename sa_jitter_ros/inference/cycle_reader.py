@@ -26,7 +26,8 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _WHOLE = 1e-9  # deviation from a whole number of cycles that is rounding
-_MARGIN = 40  # samples on either side of a cycle, for interpolation and corrected pulses
+#: Samples on either side of a cycle, for interpolation and corrected pulses.
+MARGIN = 40
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class CycleReader:
         return [
             CycleSamples.cut(
                 self.samples, start_time=self.start_time, rate=self.rate, pulses=pulses,
-                first=first, margin=_MARGIN, ripple=0.0 if ripple is None else float(ripple[k]))
+                first=first, margin=MARGIN, ripple=0.0 if ripple is None else float(ripple[k]))
             for k, first in enumerate(range(law.before, len(pulses) - 1 - law.after))]
 
     def average(self, cycles: Sequence[CycleSamples], model: DeclaredModel, orders: FloatArray,

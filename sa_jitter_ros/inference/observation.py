@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import attenuation, noise_floor, without_leakage
 from sa_jitter_ros.errors import ModelError, RecordingError
-from sa_jitter_ros.inference.cycle_reader import CycleReader
+from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
@@ -40,6 +40,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
 from sa_jitter_ros.recordings.recording import Recording
 
+BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
@@ -172,10 +173,8 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     pulses, declared_speed = record_pulses(recording, model), model.trigger_speed
     speed = model.trigger_revolutions / mean_period(pulses.times, pulses.missing)
     model = replace(model, sample_rate=recording.sample_rate, orders=once, trigger_speed=speed)
-    samples = np.ascontiguousarray(recording.read().T)
-    if not np.all(np.isfinite(samples)):
-        raise RecordingError('the vibration has NaN or infinity: cut the recording at its gaps')
-    samples -= samples.mean(axis=0)
+    samples, gaps = _read(recording)
+    pulses = pulses.broken_at(gaps, recording.start_time, recording.sample_rate, MARGIN)
     reader = CycleReader(samples, recording.start_time, recording.sample_rate, interpolation)
     starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
     if not starts:
@@ -240,13 +239,22 @@ def together(observations: Sequence[Observation]) -> Observation:
 def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]
                     ) -> FloatArray:
     """Return the pulse errors (acquisition, N_t + 1) that some channels show."""
-    samples = np.ascontiguousarray(recording.read().T[:, list(channels)])
-    recovery = recover_record(samples - samples.mean(axis=0), recording.start_time,
-                              recording.sample_rate, observation.pulses, observation.model,
-                              known=observation.recoveries[0].undeclared)
+    samples, _ = _read(recording)
+    recovery = recover_record(
+        samples[:, list(channels)], recording.start_time, recording.sample_rate,
+        observation.pulses, observation.model, known=observation.recoveries[0].undeclared)
     errors = np.array([recovery.errors[item.first:item.first + item.times.size]
                        for item in observation.acquisitions])
     return np.asarray(errors - errors.mean(axis=1, keepdims=True))
+
+
+def _read(recording: Recording) -> tuple[FloatArray, BoolArray]:
+    """Return the samples (sample, channel), their mean 0, and which are none: 0, too."""
+    samples = np.ascontiguousarray(recording.read().T)
+    gaps = np.asarray(~np.isfinite(samples).all(axis=1))
+    samples -= samples[~gaps].mean(axis=0) if not gaps.all() else 0.0
+    samples[gaps] = 0.0
+    return samples, gaps
 
 
 def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLaw) -> list[int]:

@@ -11,7 +11,7 @@
 """The trigger pulses of a recording, numbered over gaps, and those of a reference keyphasor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,30 @@ class RecordPulses:
     def number(self) -> IntArray:
         """Return the number of trigger cycles from the first pulse to each pulse (n,)."""
         return numbered(self.missing)
+
+    def broken_at(self, gaps: BoolArray, start_time: float, rate: float, reach: int
+                  ) -> 'RecordPulses':
+        """
+        Return the pulses with a new run behind every trigger cycle that a gap touches.
+
+        `gaps` (sample,) tells which samples are none, of those that begin at `start_time` (s);
+        cycles read as many samples as `reach` beyond their pulses.
+        """
+        place = ((self.times - start_time) * rate).clip(-reach, gaps.size + reach)
+        before = np.append(0, np.cumsum(gaps))
+        first, last = (edge.astype(np.int64).clip(0, gaps.size) for edge in (
+            place[:-1] - reach, place[1:] + reach + 1))
+        broken = before[last] > before[first]
+        if not broken.any():
+            return self
+        number, bridged = self.number, self.bridged.copy()
+        for k in np.flatnonzero(broken & (self.missing > 0)).tolist():
+            bridged[number[k] + 1:number[k + 1]] = np.nan
+        remark = (f'{100.0 * np.mean(gaps):.2g}% of the samples are NaN or infinite: no '
+                  f'acquisition contains any of the {np.count_nonzero(broken)} trigger cycles '
+                  'that they touch')
+        return replace(self, starts_run=self.starts_run | np.append(False, broken),
+                       bridged=bridged, remarks=(*self.remarks, remark))
 
 
 def numbered(missing: IntArray) -> IntArray:
