@@ -66,6 +66,7 @@ _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many the
 _PLAIN = 1e-12  # p value of a pattern that no other error can make
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
+_MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
 _UNSEEN = 'nothing of it shows in this recording'
 _FEWEST = 4
 _HELD_OUT = 6
@@ -224,12 +225,11 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     moves = dependences(bench, effects, chosen) if chosen else at_first
     left = _unexplained(bench, timing, chosen)
     unexplained = remains(after, moves) or left is not None
-    worse = unexplained and after.score < before.score
-    absorbed = left.text if left is not None else _WORSE if worse else _SCATTER if (
-        after.p_amplitude < _REMAINS) else ''
-    if absorbed:
-        chosen, candidates = _beyond_doubt(chosen, candidates, absorbed,
-                                           left is None and not worse)
+    of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
+        unexplained) else ''
+    of_lines = _SCATTER if left is None and after.p_amplitude < _REMAINS else ''
+    if of_timing or of_lines:
+        chosen, candidates = _beyond_doubt(chosen, candidates, of_timing, of_lines)
         effects = _effects(chosen)
         own = bench.unsteadiness(effects)
         before = bench.score((), unsteadiness=own)
@@ -305,15 +305,23 @@ def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
     return more, tried, evidence
 
 
-def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], left: str,
-                  of_lines: bool) -> tuple[list[Finding], list[Candidate]]:
+def _little_is_gained(chosen: Sequence[Finding], before: Residual, after: Residual) -> str:
+    """Return why effects explain little of the held-out acquisitions, '' if they do much."""
+    if after.score < before.score:
+        return _WORSE
+    on_the_mean = any(not effect.scatters for effect in _effects(chosen))
+    return _MOST_LEFT if on_the_mean and after.rms > 0.5 * before.rms else ''
+
+
+def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], of_timing: str,
+                  of_lines: str) -> tuple[list[Finding], list[Candidate]]:
     """Return the effects that do not merely absorb a part of what is left, and the candidates."""
     kept = [finding for finding in chosen if finding.effect is not None and not (
-        finding.effect.scatters if of_lines else _absorbs(finding))]
+        (of_lines and finding.effect.scatters) or (of_timing and _absorbs(finding)))]
     names = {finding.name for finding in kept}
     return kept, [item if item.rejected_because or item.name in names else replace(
-        item, rejected_because=f'it absorbs a part of what no effect explains: {left}')
-        for item in candidates]
+        item, rejected_because='it absorbs a part of what no effect explains: '
+        + (of_timing or of_lines)) for item in candidates]
 
 
 def _absorbs(finding: Finding) -> bool:
