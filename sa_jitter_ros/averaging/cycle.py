@@ -27,12 +27,11 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
-from sa_jitter_ros.pulses.resampling import (
-    impulse_response, interpolate_between, margin)
+from sa_jitter_ros.pulses.resampling import impulse_response, interpolate_between, margin
 from scipy.fft import next_fast_len
-from scipy.interpolate import CubicSpline
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -47,6 +46,7 @@ _AHEAD = 1 << 12
 EDGE = 8
 _BESIDE = 32  # samples on either side of a cycle that may lie in its averages
 _EDGE_POWERS = 10  # of the polynomials through the shares: exact to 1e-8
+_EDGE_NODES = 96  # of the quadrature of the kernel, which has 8 turns: exact to rounding
 _LARGE = 1 << 61  # of what integers of 64 bits hold
 
 
@@ -304,7 +304,7 @@ class CycleProjection:
         if not first:
             self._begins = values[:, 0].copy()
         if width == self._points:
-            flat = np.moveaxis(values, 1, 2).reshape(count * channels, points)
+            flat = np.swapaxes(values, 1, 2).reshape(count * channels, points)
             parts = flat @ np.concatenate((self._fine.real, self._fine.imag)).T
             self._rest = (parts[:, :lines] + 1j * parts[:, lines:]).reshape(
                 count, channels, lines)
@@ -318,7 +318,7 @@ class CycleProjection:
         if rows * width < points:
             last = self._coarse[:, row + rows]
             total = self._fine[:, :points - rows * width] @ values[:, rows * width:]
-            self._rest = np.moveaxis((last[:lines] + 1j * last[lines:])[:, None] * total, 1, 2)
+            self._rest = np.swapaxes((last[:lines] + 1j * last[lines:])[:, None] * total, 1, 2)
 
     def sums(self) -> ComplexArray:
         """Sum over the points (cycle, channel, order), with angle 0 at the begin of each cycle."""
@@ -327,7 +327,7 @@ class CycleProjection:
             lines, width = self._fine.shape
             parts = self._parts[:, :lines] + 1j * self._parts[:, lines:]
             parts = parts.reshape(len(parts), lines, width, -1)
-            total = total + np.moveaxis(np.matmul(self._fine[:, None], parts)[:, :, 0], 1, 2)
+            total = total + np.swapaxes(np.matmul(self._fine[:, None], parts)[:, :, 0], 1, 2)
         return np.asarray(total)
 
     def amplitudes(self, end: FloatArray, first_cycle: int = 0) -> ComplexArray:
@@ -470,13 +470,20 @@ def _edge_polynomials(points: int, orders: tuple[float, ...]) -> ComplexArray:
     """Return `_edge_shares` as polynomials (power, order, point) of 2 behind - 1."""
     nodes = np.cos(np.pi * (np.arange(_EDGE_POWERS) + 0.5) / _EDGE_POWERS)
     steps = np.arange(-EDGE, EDGE)  # from the first point behind the pulse
-    place, kernel = impulse_response(256)
     turn = 2.0 * np.pi / points * np.array(orders)
-    integral = CubicSpline(place, kernel[:, None] * np.exp(
-        -1j * np.multiply.outer(place, turn))).antiderivative()
-    before = integral(-steps - (nodes[:, None] + 1.0) / 2.0) / integral(EDGE)
+    x, weight = leggauss(_EDGE_NODES)
+
+    def integral(end: FloatArray) -> ComplexArray:
+        """Integrate the kernel times exp(-j turn place) from -EDGE to `end` (..., order)."""
+        length = end[..., None] + EDGE
+        place = length * (0.5 * (x + 1.0)) - EDGE
+        kernel = 0.5 * length * weight * impulse_response(place)
+        return np.asarray(np.einsum('...i,...io->...o', kernel, np.exp(
+            -1j * np.multiply.outer(place, turn))))
+
+    before = integral(-steps - (nodes[:, None] + 1.0) / 2.0) / integral(np.array(EDGE))
     before[:, :EDGE] -= 1.0
-    shares = np.moveaxis(before, 1, 2) * np.exp(-1j * np.multiply.outer(turn, steps))
+    shares = np.swapaxes(before, 1, 2) * np.exp(-1j * np.multiply.outer(turn, steps))
     flat = shares.reshape(_EDGE_POWERS, -1)
     return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), flat)).reshape(
         shares.shape)

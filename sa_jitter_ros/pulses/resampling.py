@@ -127,11 +127,9 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
     return np.asarray(np.cos(phase) @ _kernel(method, x, half) * step)
 
 
-def impulse_response(steps: int) -> tuple[FloatArray, FloatArray]:
-    """Return places and values of the band-limited kernel, at so many `steps` of a sample."""
-    half = _HALF_WIDTH['band_limited']
-    x = np.linspace(-half, half, 2 * half * steps + 1)
-    return x, _kernel('band_limited', x, half)
+def impulse_response(places: FloatArray) -> FloatArray:
+    """Return the band-limited kernel at `places`, in samples from its centre."""
+    return _kernel('band_limited', places, _HALF_WIDTH['band_limited'])
 
 
 def periodic(period: FloatArray, points: int) -> FloatArray:
