@@ -228,14 +228,16 @@ def test_a_channel_that_shows_nothing_is_named(ros_graph, value, words):
     assert text == f'channel 1 of vibration: {words}, look at its sensor and cable'
 
 
+def noise_of(rng):
+    """Return a change of what is played: noise in place of the vibration."""
+    return lambda number, block: [SampleBlock(
+        rng.standard_normal(block.samples.shape), block.start_time, block.sample_rate,
+        block.index)]
+
+
 def test_refused_correction_stays_a_warning(ros_graph, rng):
     b = AveragerBench(ros_graph, trigger_cycles=10, correct_jitter=True)
-
-    def noise(number, block):
-        return [SampleBlock(rng.standard_normal(block.samples.shape), block.start_time,
-                            block.sample_rate, block.index)]
-
-    b.play(MACHINE, 1.0, change=noise)
+    b.play(MACHINE, 1.0, change=noise_of(rng))
     for _ in range(2):
         level, text, values = b.diagnostics()
         count = values['shaft.corrections_refused']
@@ -250,12 +252,7 @@ def test_refused_correction_stays_a_warning(ros_graph, rng):
 
 def test_a_few_refused_corrections_are_a_warning_until_enough_were_accepted(ros_graph, rng):
     b = AveragerBench(ros_graph, trigger_cycles=10, correct_jitter=True)
-
-    def noise(number, block):
-        return [SampleBlock(rng.standard_normal(block.samples.shape), block.start_time,
-                            block.sample_rate, block.index)]
-
-    b.play(MACHINE, 1.0, change=noise)
+    b.play(MACHINE, 1.0, change=noise_of(rng))
     refused = int(b.diagnostics()[2]['shaft.corrections_refused'])
     b.play(MACHINE, 1.5, start=1.0)
     b.diagnostics()

@@ -20,16 +20,12 @@ import argparse
 from collections.abc import Sequence
 import os
 from pathlib import Path
-import signal
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, failure, Parser, read_options, require_writable,
-    show)
-from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
+    add_fleet_options, add_recording_options, Parser, read_options, show)
+from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import SaJitterError
-from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
 from sa_jitter_ros.offline.settings import MachineFile
 from sa_jitter_ros.offline.tables import RECORDINGS, write_tables
@@ -92,21 +88,8 @@ def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
     return rows
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Average recordings; return 0, or 2 after one line if none could be averaged."""
-    options = make_parser().parse_args(args)
-    progress = Progress('average', quiet=options.quiet)
-    use_one_thread()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        require_writable(options.output)
-        rows = run(options, progress)
-    except (SaJitterError, OSError) as error:
-        progress.say(failure(error, options.output))
-        return 2
-    except KeyboardInterrupt:
-        progress.say('stopped; what was finished stays, the same command goes on from there')
-        return 130
+def tell(options: argparse.Namespace, rows: list[Row]) -> int:
+    """Say how many recordings were averaged; return 2 if none could be."""
     averaged = [row for row in rows if row.averages]
     if not averaged:
         return 2
@@ -116,6 +99,12 @@ def main(args: Sequence[str] | None = None) -> int:
                 + (f'; {failed} could not be averaged, or not wholly: see {RECORDINGS}'
                    if failed else ''),
                 f'written: {options.output}')
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Average recordings; return 0, or 2 after one line if none could be averaged."""
+    options = make_parser().parse_args(args)
+    return run_to_end(run, tell, options, Progress('average', quiet=options.quiet))
 
 
 if __name__ == '__main__':

@@ -13,10 +13,13 @@
 import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
+import signal
 from typing import Any, Protocol, TypeVar
 
+from sa_jitter_ros.commands.command_line import failure, require_writable
 from sa_jitter_ros.commands.progress import Progress
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.files import remove_unfinished
 from sa_jitter_ros.offline.fleet import find_recordings, Found, run_jobs
 from sa_jitter_ros.offline.processes import Failure
@@ -69,6 +72,28 @@ def recordings_of(options: argparse.Namespace) -> tuple[Found, ...]:
         raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
                              'folder: give one with .npz, .mat, .wav, .csv or rosbag2')
     return found
+
+
+def run_to_end(run: Callable[[argparse.Namespace, Progress], list[Row]],
+               tell: Callable[[argparse.Namespace, list[Row]], int],
+               options: argparse.Namespace, progress: Progress) -> int:
+    """
+    Run what makes rows, and `tell` what they are; return the exit status.
+
+    It is 2 after one line for what cannot be used or written, 130 for SIGINT and SIGTERM.
+    """
+    use_one_thread()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        require_writable(options.output)
+        rows = run(options, progress)
+    except (SaJitterError, OSError) as error:
+        progress.say(failure(error, options.output))
+        return 2
+    except KeyboardInterrupt:
+        progress.say('stopped; what was finished stays, the same command goes on from there')
+        return 130
+    return tell(options, rows)
 
 
 def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: list[Row], *,

@@ -14,16 +14,13 @@ import argparse
 from collections import Counter
 import os
 from pathlib import Path
-import signal
 import sys
 
-from sa_jitter_ros.commands.command_line import failure, read_options, require_writable, show
-from sa_jitter_ros.commands.fleet_run import recordings_of, work_through
+from sa_jitter_ros.commands.command_line import read_options, show
+from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.declaration import Declaration, read_declaration
-from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.loop import close_loop, Loop
-from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.files import write_rows
 from sa_jitter_ros.offline.fleet import is_folder
 from sa_jitter_ros.offline.loop_recording import loop_file, LoopJob, LoopRow, on_target
@@ -73,17 +70,11 @@ def run_fleet(options: argparse.Namespace, progress: Progress) -> list[LoopRow]:
 
 def show_fleet(options: argparse.Namespace, progress: Progress) -> int:
     """Close the loop on each recording; return the exit status."""
-    use_one_thread()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        require_writable(options.output)
-        rows = run_fleet(options, progress)
-    except (SaJitterError, OSError) as error:
-        progress.say(failure(error, options.output))
-        return 2
-    except KeyboardInterrupt:
-        progress.say('stopped; what was finished stays, the same command goes on from there')
-        return 130
+    return run_to_end(run_fleet, _tell, options, progress)
+
+
+def _tell(options: argparse.Namespace, rows: list[LoopRow]) -> int:
+    """Say what was found; return 2 if no recording could be used."""
     closed = [row for row in rows if row.verdict]
     if not closed:
         return 2
