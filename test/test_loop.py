@@ -21,7 +21,7 @@ import pytest
 from sa_jitter_ros import json_values, loop
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.effects import make_effect
-from sa_jitter_ros.errors import ModelError, ParameterError, RecordingError
+from sa_jitter_ros.errors import DataWarning, ModelError, ParameterError, RecordingError
 from sa_jitter_ros.loop import close_loop
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -84,6 +84,19 @@ def test_written_report_is_the_report(found, tmp_path):
     assert content == found.report
     assert {'report.html', 'residual.png'} <= {item.name for item in (
         tmp_path / 'a' / 'b').iterdir()}
+
+
+def test_channel_of_nearly_nothing_is_left_out(recording, found):
+    samples = np.concatenate([recording.read(), 1e-200 * recording.read()])
+    with pytest.warns(DataWarning, match='channel 1 is constant and is left out'):
+        both = close_loop(Recording(ArraySource(samples), RATE,
+                                    pulse_times=recording.pulse_times), KEYWORDS)
+    assert both.report['missing_effects'] == found.report['missing_effects']
+    with pytest.warns(DataWarning, match='channel 0 is constant'):
+        alone = close_loop(Recording(ArraySource(samples[1:]), RATE,
+                                     pulse_times=recording.pulse_times), KEYWORDS)
+    assert alone.verdict == 'none'
+    assert alone.report['error_before']['rms'] is None
 
 
 @pytest.mark.parametrize('second', [False, True])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelSelection
+from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from sa_jitter_ros.recordings.recording import Recording
 
 FloatArray = NDArray[np.float64]
@@ -45,7 +46,7 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
             found[channel] = f'is NaN or infinite in {100.0 * share:.3g}% of its samples'
         elif finite.size < _FEWEST:
             continue
-        elif np.ptp(finite) == 0.0:
+        elif np.ptp(finite) < LEAST_RANGE:
             found[channel] = 'is constant'
         else:
             low, high = finite.min(), finite.max()

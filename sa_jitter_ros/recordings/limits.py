@@ -34,6 +34,8 @@ FloatArray = NDArray[np.float64]
 MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
 _MAX_TIME = 1e15  # s, as 30 million years
 _MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
+#: A range of samples whose fourth powers are above 1e-308; a smaller one is none.
+LEAST_RANGE = 1e-75
 IN_MEMORY_BYTES = 64 << 20  # larger arrays of a file are mapped
 _MAX_INFLATION = 200  # unpacked over packed size; of measured signals it is below 10
 _BLOCK = 1 << 17
