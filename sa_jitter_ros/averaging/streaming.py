@@ -241,29 +241,24 @@ class StreamingAverager:
         times = triggers.times
         if not times.size:
             return
-        items = np.empty(times.size, TRIGGER)
-        epochs = self._epochs(triggers)
-        items['time'], items['epoch'], items['starts_run'] = times, epochs, triggers.starts_run
-        items['starts_run'][0] |= epochs[0] != self._pulse_epoch
-        items['starts_run'][1:] |= epochs[1:] != epochs[:-1]
-        items['mark'] = triggers.mark
-        items['skipped'] = 0
-        if items['starts_run'].any():
+        items, epochs = np.zeros(times.size, TRIGGER), self._epochs(triggers)
+        changed = epochs != np.concatenate(((self._pulse_epoch,), epochs[:-1]))
+        starts = triggers.starts_run | changed
+        items['time'], items['epoch'], items['mark'] = times, epochs, triggers.mark
+        items['starts_run'] = starts
+        if starts.any():
             # Behind a gap of unknown length the count begins at 0 again.
-            skipped = np.diff(triggers.count, prepend=self._last_count)
-            skipped[(np.diff(epochs, prepend=self._pulse_epoch) != 0) | triggers.restarted] = 0
-            items['skipped'] = np.maximum(skipped, 0)
+            skipped = triggers.count - np.concatenate(((self._last_count,), triggers.count[:-1]))
+            items['skipped'] = np.where(changed | triggers.restarted, 0, np.maximum(skipped, 0))
         self._last_count = int(triggers.count[-1])
         self._pulse_epoch = int(epochs[-1])
-        steps = items['elapsed']
-        steps[1:] = times[1:] - times[:-1]
+        elapsed = items['elapsed']
         if len(self._triggers):
-            last = self._triggers.items[-1]
-            steps[0] = last['elapsed'] + max(times[0] - self._last_time, 0.0)
+            last = float(self._triggers.items['elapsed'][-1])
+            elapsed[0] = last + max(float(times[0]) - self._last_time, 0.0)
         else:
-            steps[0], items['starts_run'][0], items['skipped'][0] = 0.0, True, 0
-        np.maximum(steps[1:], 0.0, out=steps[1:])
-        np.cumsum(steps, out=steps)
+            items['starts_run'][0], items['skipped'][0] = True, 0
+        elapsed[1:] = elapsed[0] + np.maximum(times[1:] - times[:-1], 0.0).cumsum()
         self._last_time = float(times[-1])
         self._triggers.append(items)
 
@@ -360,22 +355,24 @@ class StreamingAverager:
 
     def _together(self, segment: Segment, times: FloatArray) -> int:
         """Return how many of the cycles between `times`, at least one, can be taken together."""
-        rate, samples = segment.clock.rate, segment.samples
-        room = min(item.room for item in self.shafts.values())
-        times = times[:room + 1]
-        positions = (times - segment.clock.time) * rate + (segment.clock.index - segment.index)
+        clock, samples = segment.clock, segment.samples
+        offset = clock.index - segment.index
+        times = times[:min(item.room for item in self.shafts.values()) + 1] - clock.time
+
+        def cycles_to(position: float) -> int:
+            return int(times.searchsorted((position - offset) / clock.rate, 'right')) - 1
+
         last = len(samples) - (1.0 - 1e-6 if segment.closed else 1.0)
-        reach = min(last, positions[0] + 4 * TOGETHER / samples.shape[1])
-        count = int(np.searchsorted(positions, reach, 'right')) - 1
-        if count > 1 and not segment.closed:
-            longest = float((times[1:count + 1] - times[:count]).max())
-            reach = min(reach, last - self._margin(longest, rate))
-            count = int(np.searchsorted(positions, reach, 'right')) - 1
+        reach = min(last, times[0] * clock.rate + offset + 4 * TOGETHER / samples.shape[1])
+        count = cycles_to(reach)
         if count > 1:
-            short = (times[1:count + 1] - times[:count]
-                     <= max(item.shortest(rate) for item in self.shafts.values()))
+            periods = times[1:count + 1] - times[:count]
+            if not segment.closed:
+                margin = self._margin(float(periods.max()), clock.rate)
+                count = cycles_to(min(reach, last - margin))
+            short = periods <= max(item.shortest(clock.rate) for item in self.shafts.values())
             if short.any():  # a cycle that a shaft refuses is taken alone
-                count = int(np.argmax(short))
+                count = min(count, int(short.argmax()))
         return max(count, 1)
 
     def _margin(self, period: float, rate: float) -> int:
