@@ -174,6 +174,31 @@ def test_a_displaced_pulse_is_known_from_the_jitter_of_the_first_revolutions():
     assert lost <= 60
 
 
+@pytest.mark.parametrize('again', [False, True])
+def test_a_displaced_pulse_beside_a_gap_is_no_pattern_of_two_marks(again):
+    """Nor does it tell the scatter, at the start and behind a loss of the match."""
+    used = lost = 0
+    for trial in range(200):
+        rng = np.random.default_rng([trial, 43])
+        pulses = 1.0 + 0.02 * (np.arange(80.0) + rng.uniform(-0.0039, 0.0039, 80))
+        first = 40 if again else 0  # a loss of the match there
+        displaced = first + rng.integers(4, 10)
+        gap = displaced + rng.choice([-3, 3])
+        pulses[displaced] += rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 0.1) * 0.02
+        missing = [*range(gap, gap + 2 * int(np.sign(gap - displaced)),
+                          int(np.sign(gap - displaced)))]
+        if again:
+            missing += range(30, 40)
+            pulses[30:] += 0.011
+        given = np.delete(pulses, missing)
+        validator = PulseValidator(pulses_per_revolution=2, pulses_per_trigger=1)
+        found = np.append(validator.update(given).times, validator.flush().times)
+        used += pulses[displaced] in found
+        lost += given.size - 1 - np.isin(given, found).sum()
+    assert used <= 1
+    assert lost < 200
+
+
 @pytest.mark.parametrize('clock', [0.0, 4000.0])
 @pytest.mark.parametrize('step', [1e-3, -1e-3])
 def test_a_step_of_the_time_among_equal_intervals_is_in_no_cycle(step, clock):

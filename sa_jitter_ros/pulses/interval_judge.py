@@ -51,6 +51,7 @@ _RAMP = 0.25  # largest change of an interval that is a change of speed
 _AGREEING = 5  # equal intervals that show another pulse rate
 _AGREE, _FASTER = 0.03, 0.75
 _SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
+_KNOWN_WELL = 16  # intervals that tell the scatter better than the first ones behind a gap
 _REVOLUTIONS, _LONGEST = 5, 3.0  # and seconds in which the marks are learnt
 _FEW_MARKS = 12
 _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
@@ -354,7 +355,6 @@ class IntervalJudge:
         pulse = self._next(slots, level)
         self._model.accept([level])
         self._counter.extend([pulse], [steps])
-        self._learn_marks()
 
     def _irregular(self, mark: int, level: float, deviation: float, after: float | None) -> None:
         """
@@ -376,7 +376,6 @@ class IntervalJudge:
                 pulse = self._next(slots, level)
                 model.jump(level)
                 self._counter.extend([pulse], [steps])
-                self._learn_marks()
                 return
         if mark > 1 and regular and known:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
@@ -387,7 +386,6 @@ class IntervalJudge:
                 self._counter.extend([pulse], [steps])
             else:
                 self._counter.begin(pulse, 0, passed=steps)
-            self._learn_marks()
             return
         self.counts['late'] += 1
         if mark == 1:
@@ -407,7 +405,6 @@ class IntervalJudge:
         if after is not None:
             model.jump(after)
         self._counter.begin(pulse, 0, passed=steps if known else None)
-        self._learn_marks()
 
     def _report_change(self, gap: float, before: float, after: float) -> None:
         """Say that the interval changed across a gap (s) as no shaft changes it."""
@@ -457,6 +454,7 @@ class IntervalJudge:
             self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
                        [pulse] * len(slots))
         self._slot = (slots[-1] + 1) % self._lock.steps.size
+        self._learn_marks()
         return pulse
 
     def _slots_in(self, gap: float, level: float) -> int:
@@ -483,8 +481,10 @@ class IntervalJudge:
 
     def _lose(self) -> None:
         """Discard the trigger cycle and match the target again from the waiting pulses on."""
-        self._end = _End(self.confirmed, self._model.level, self._model.scatter,
-                         self._model.known)
+        known = self._model.known
+        if self._model.taken < _KNOWN_WELL:  # what is lost so soon may have other intervals
+            known //= 2
+        self._end = _End(self.confirmed, self._model.level, self._model.scatter, known)
         self._counter.stop()
         self._alternation = Alternation()
         self._lock = self._candidate = None
@@ -519,10 +519,10 @@ class IntervalJudge:
                 return False
             found = None
             if self._few_marks:
-                found = self._repeating(lock, queue[:wanted])
+                found = self._repeating(lock, queue[:wanted], doubtful=False)
                 if found is None and queue.size < 2 * wanted and not final:
                     return False
-                found = found or self._repeating(lock, queue[:2 * wanted])
+                found = found or self._repeating(lock, queue[:2 * wanted], doubtful=True)
             lock = found or self._rehearsed(lock, queue[:wanted])
         self._drop_unlocked(lock.first)
         self._begin(lock)
@@ -554,8 +554,12 @@ class IntervalJudge:
             learnt, first=int(np.searchsorted(pulses, time)), slot=int(marks[begin]),
             interval=math.exp(levels[begin])), pulses)
 
-    def _repeating(self, lock: Lock, pulses: FloatArray) -> Lock | None:
-        """Return the lock on pulses (n,) of few even marks that repeat for two revolutions."""
+    def _repeating(self, lock: Lock, pulses: FloatArray, *, doubtful: bool) -> Lock | None:
+        """
+        Return the lock on pulses (n,) of few even marks that repeat for two revolutions.
+
+        It is `doubtful` if too few others tell whether one of these pulses is displaced.
+        """
         size = lock.steps.size
         levels = np.log(np.diff(pulses))
         found = repeating(levels, size)
@@ -570,9 +574,8 @@ class IntervalJudge:
         judge = self._rehearsal(_uneven(learnt), pulses[learnt.first:])
         every = steady_pattern(np.array(judge._marks, np.int64), np.array(judge._levels), size)
         if every is None:
-            return learnt
-        known = max(learnt.known, len(judge._levels) - size)
-        return replace(learnt.with_pattern(every), known=known)
+            return learnt if doubtful else None
+        return replace(learnt.with_pattern(every), known=len(judge._levels) - size)
 
     def _from_earliest(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock from the earliest of the pulses (n,) on that fits, in reversed time."""
@@ -605,7 +608,8 @@ class IntervalJudge:
             number = round(teeth[0]) if math.isfinite(teeth[0]) else 0
             if number and max(abs(item - number) for item in teeth) <= _NEAR_WHOLE:
                 passed = number
-            if scatter < _SAME_SCATTER * self._end.scatter:  # which is known better
+            known_better = self._end.known >= max(_KNOWN_WELL, count)
+            if known_better or scatter < _SAME_SCATTER * self._end.scatter:
                 scatter, count = self._end.scatter, max(count, self._end.known)
             self._report_change(gap, self._end.level, math.log(lock.interval))
         self._counter.begin(first, tooth, passed=passed)

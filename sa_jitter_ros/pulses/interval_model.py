@@ -130,6 +130,11 @@ class IntervalModel:
         return int(self._count)
 
     @property
+    def taken(self) -> int:
+        """Return the number of regular intervals since the beginning."""
+        return self._number
+
+    @property
     def level(self) -> float:
         """Level of the last interval."""
         return self._levels[-1]

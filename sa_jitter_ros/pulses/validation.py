@@ -86,7 +86,8 @@ class PulseValidator:
     A trigger pulse is returned as soon as it ends a trigger cycle, the first one of a run together
     with the second; a doubtful one waits for the next pulses. At the start, the pulses of a second
     wait, at least 4 and at most 12, and those of four revolutions of a target with several marks,
-    at most 3 s; no pulse is lost by this. `flush` returns those that wait at the end.
+    at most 3 s, or twice as many where a gap or a stray hides the angles of a few marks; no pulse
+    is lost by this. `flush` returns those that wait at the end.
 
     :param pulses_per_revolution: of the tach shaft; with missing teeth, those counted.
     :param pulses_per_trigger: pulses in a trigger cycle, None for all of a revolution.
