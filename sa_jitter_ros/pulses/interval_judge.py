@@ -199,14 +199,15 @@ class IntervalJudge:
         lock, model = self._lock, self._model
         assert lock is not None
         room = min(model.room, self._room_of_marks)
-        pulses, size = self._queue[:room + 1], len(lock.slots)
+        pulses, (steps, widths, believed) = self._queue[:room + 1], lock.lists
+        size = len(steps)
         slots = [number % size for number in range(self._slot, self._slot + len(pulses))]
         gaps = [pulse - before for before, pulse in zip((self.confirmed, *pulses), pulses)]
-        levels = [math.log(gap / lock.slots[slot].width) for gap, slot in zip(gaps, slots)]
+        levels = [math.log(gap / widths[slot]) for gap, slot in zip(gaps, slots)]
         off = [abs(item) for item in model.deviations(levels)]
         # Teeth beside gaps are uneven; a stray among marks that may be uneven needs a search.
-        regular = [item <= model.tolerance
-                   or (not lock.even and item <= lock.slots[slot].believed)
+        tolerance, uneven = model.tolerance, not lock.even
+        regular = [item <= tolerance or (uneven and item <= believed[slot])
                    for item, slot in zip(off, slots)]
         # A pulse with a small deviation cannot spoil an average. A larger one may be a stray's:
         # then the next interval is too short.
@@ -216,7 +217,7 @@ class IntervalJudge:
         count = min(passes.index(False) if False in passes else len(pulses), room)
         if count:
             taken, slots, levels = pulses[:count], slots[:count], levels[:count]
-            self._counter.extend(taken, [lock.slots[slot].step for slot in slots])
+            self._counter.extend(taken, [steps[slot] for slot in slots])
             self.counts['accepted'] += count
             model.accept(levels, gaps[:count])
             if size == 1:

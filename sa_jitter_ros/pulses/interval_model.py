@@ -22,6 +22,7 @@ from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
 import math
+from math import expm1
 from operator import mul
 
 import numpy as np
@@ -147,20 +148,19 @@ class IntervalModel:
     @property
     def expected(self) -> float:
         """Return the expected level of the next interval."""
-        return _predicted(self._chosen, self._levels, len(self._levels))
+        return _expected(_WEIGHTS[self._chosen], self._levels, len(self._levels))
 
     def deviations(self, levels: list[float]) -> list[float]:
         """Return by how much each of the next levels is off, relative to its interval."""
-        every, known = self._levels + levels, len(self._levels)
-        found = []
-        for number, level in enumerate(levels):
-            kinds: Sequence[int] = (self._chosen,)
-            if self.given or number < self._settling:  # which prediction is best is not known yet
-                kinds = range(len(_WEIGHTS))
-            found.append(min((math.expm1(min(
-                level - _predicted(kind, every, known + number), _LARGEST)) for kind in kinds),
-                key=abs))
-        return found
+        every = self._levels + levels
+        place = len(self._levels)
+        # Until then it is not known which prediction is the best one.
+        settled = len(every) if self.given else min(place + self._settling, len(every))
+        found = [min((expm1(min(every[number] - _expected(weights, every, number), _LARGEST))
+                      for weights in _WEIGHTS), key=abs) for number in range(place, settled)]
+        weights = _WEIGHTS[self._chosen]
+        return found + [expm1(min(every[number] - _expected(weights, every, number), _LARGEST))
+                        for number in range(settled, len(every))]
 
     def accept(self, levels: list[float], intervals: Sequence[float] = ()) -> None:
         """Take the next regular levels, at most `room`, and their intervals in s."""
@@ -248,10 +248,10 @@ def _is_displacement(deviations: FloatArray) -> bool:
     return bool(abs(deviations.sum()) < _OPPOSITE * np.abs(deviations).max())
 
 
-def _predicted(kind: int, levels: list[float], place: int) -> float:
+def _expected(weights: tuple[float, ...], levels: list[float], place: int) -> float:
     """Return what is expected of the level at this place, from those before it."""
-    weights = _WEIGHTS[kind]
-    return float(sum(map(mul, weights, levels[place - len(weights):place])))
+    total: float = sum(map(mul, weights, levels[place - len(weights):place]))
+    return total
 
 
 def _robust_square(squares: FloatArray) -> FloatArray:
