@@ -12,11 +12,14 @@
 Speed and accuracy of the core beside other software, and how its cost grows.
 
 `python benchmarks/core_speed.py` writes its figures as JSON to the standard output.
-`performance.py` starts it in an environment of its own that holds the other packages.
+`performance.py` starts it in an environment of its own that holds the other packages. With
+`--brief` it prints two tables within some minutes: the speed on line beside that of the spline
+that is compared, and the shares of a core.
 """
 
 import argparse
 from collections import deque
+from dataclasses import replace
 from functools import partial
 import json
 import os
@@ -25,7 +28,9 @@ import tracemalloc
 from typing import Any
 
 import numpy as np
-from peers import blocks, gains, make_record, METHODS, Package, PACKAGES, Record, stream
+from page import table
+from peers import (blocks, gains, make_record, METHODS, Package, PACKAGES, RATE, Record,
+                   stream)
 from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -33,6 +38,9 @@ from sa_jitter_ros.pulses.validation import PulseValidator
 from timing import interleaved, machine, memory_bandwidth, multiply_adds, Timing
 
 TAPS = 16  # of the band-limited kernel: multiply-adds in a resampled value
+ON_LINE, REFERENCE = 'sa_jitter_ros, on line', 'quintic spline'
+RECORDS = ((8, 1.0), (8, 2.40789), (1, 1.0), (64, 1.0))  # channels and ratio
+CLOCK = 3000.0  # Hz, of the keyphasor of the gear train
 
 
 def compare(channels: int, seconds: float, ratio: float, *, rounds: int, packages: bool
@@ -120,6 +128,34 @@ def memory(scale: float) -> dict[str, float]:
     return peaks
 
 
+def beside_the_spline(scale: float, rounds: int) -> str:
+    """Return a table of the speed on line beside that of the reference."""
+    rows = []
+    for channels, ratio in RECORDS:
+        record = make_record(channels=channels, ratio=ratio,
+                             seconds=scale * (10.0 if channels < 64 else 4.0))
+        timings = interleaved({name: partial(METHODS[name], record)
+                               for name in (ON_LINE, REFERENCE)}, rounds=rounds, budget=np.inf)
+        ours, theirs = (1e9 * timings[name].best / record.samples.size
+                        for name in (ON_LINE, REFERENCE))
+        rows.append((f'{channels} channel{"s" * (channels > 1)}, ratio {ratio:g}',
+                     f'{ours:.1f}', f'{theirs:.1f}', f'{theirs / ours:.1f}'))
+    return table(('on line', 'ns per sample and channel', REFERENCE,
+                  f'speed, {REFERENCE} = 1'), rows)
+
+
+def gear_train(ratios: list[float], *, channels: int, seconds: float) -> Record:
+    """Return the vibration of gears of 19 teeth on shafts of these ratios, in noise."""
+    record = make_record(channels=1, seconds=seconds, speed=25.0)
+    time = np.arange(record.samples.shape[1]) / RATE
+    angle = np.interp(time, record.pulses, np.arange(len(record.pulses)))
+    wave = sum(np.cos(2.0 * np.pi * order * ratio * angle)
+               for ratio in ratios for order in (19.0, 38.0))
+    noise = np.random.default_rng(1).standard_normal((channels, time.size))
+    return replace(record, samples=wave + 0.4 * noise,
+                   pulses=np.ceil(record.pulses * CLOCK) / CLOCK)
+
+
 def shares(scale: float, rounds: int) -> dict[str, float]:
     """Return the CPU time of settings that ask much, in seconds for a second of data."""
     seconds = max(4.0 * scale, 1.0)
@@ -130,6 +166,7 @@ def shares(scale: float, rounds: int) -> dict[str, float]:
                      np.empty(0), rate, 1.0, (20.0,))
     gearbox = make_record(seconds=seconds)
     ratios = [0.37 + 0.231 * k + 0.00013 * (k % 2) for k in range(20)]
+    train = gear_train(ratios[:12], channels=24, seconds=seconds)
 
     def of_encoder() -> None:
         keyphasor = KeyphasorParameters(pulses_per_revolution=marks, pulses_per_trigger=1)
@@ -142,11 +179,22 @@ def shares(scale: float, rounds: int) -> dict[str, float]:
                                          orders=(1.0, 19.0, 38.0))
             for k, ratio in enumerate(ratios)})
 
+    def of_train(correct: bool) -> None:
+        _exhaust_stream(train, PulseValidator(), {
+            f'shaft{k}': AverageSettings(
+                cycle_length=ratio, trigger_cycles=40, orders=(1.0, 19.0, 38.0),
+                correct_jitter=correct, keyphasor_rate=CLOCK)
+            for k, ratio in enumerate(ratios[:12])})
+
     timings = interleaved({
         f'encoder of {marks} pulses at {speed:g} Hz, each a trigger cycle; 1 channel at '
         f'{rate / 1e3:g} kHz': of_encoder,
         f'{len(ratios)} shafts of different ratios; 8 channels at {gearbox.rate / 1e3:g} kHz':
-            of_shafts}, rounds=rounds)
+            of_shafts,
+        f'12 shafts of different ratios; 24 channels at {RATE / 1e3:g} kHz':
+            partial(of_train, False),
+        '12 shafts; 24 channels, with correction every 40 trigger cycles':
+            partial(of_train, True)}, rounds=rounds)
     return {name: timing.best / seconds for name, timing in timings.items()}
 
 
@@ -172,12 +220,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Measure the core beside its peers.')
     parser.add_argument('--scale', type=float, default=1.0, help='of all record lengths')
     parser.add_argument('--rounds', type=int, default=7, help='turns of every method')
+    parser.add_argument('--brief', action='store_true', help='print two tables')
     options = parser.parse_args()
     if os.environ.get('OMP_NUM_THREADS') != '1':
         parser.error('set OMP_NUM_THREADS=1: CPU time is compared, threads that wait would count')
     seconds, rounds = 10.0 * options.scale, options.rounds
+    if options.brief:
+        print(beside_the_spline(options.scale, rounds), end='\n\n')
+        print(table(('on line', 'CPU share of one core'), [
+            (name, f'{share:.0%}') for name, share in shares(options.scale, rounds).items()]))
+        print(f'\nload average {os.getloadavg()[0]:.1f}')
+        return 0
     found: dict[str, Any] = {'machine': machine(), 'limits': limits(), 'comparisons': []}
-    for channels, ratio in ((8, 1.0), (8, 2.40789), (1, 1.0), (64, 1.0)):
+    for channels, ratio in RECORDS:
         print(f'core: {channels} channels, ratio {ratio:g}', file=sys.stderr, flush=True)
         found['comparisons'].append(compare(channels, seconds, ratio, packages=channels == 8,
                                             rounds=rounds if channels == 8 else min(rounds, 3)))
