@@ -294,11 +294,32 @@ def test_pulses_that_show_nothing(times, error, message):
         checked(np.zeros((1, int(SECONDS * RATE))), np.array(times))
 
 
-def test_strays_alone_are_no_target(rng):
-    check = checked(vibration(rng), np.sort(rng.uniform(0.0, SECONDS, 300)))
-    assert {'spurious', 'no_orders', 'marks_ambiguous'} <= codes(check)
-    text = next(item.text for item in check.warnings if item.code == 'spurious')
-    assert 'So many were not understood' in text
+@pytest.mark.parametrize('count', [50, 90, 400])
+def test_strays_alone_are_no_wheel(rng, count):
+    """The message counts what does not fit, and says what to look at."""
+    with pytest.raises(SignalError, match=r'belong to no steady wheel.*look at the waveform'):
+        checked(vibration(rng), np.sort(rng.uniform(0.0, SECONDS, count)))
+
+
+@pytest.mark.parametrize(('marks', 'missing'), [(1, ()), (8, ()), (36, (35,))])
+def test_a_wheel_with_a_fifth_lost_and_as_many_strays_is_one(rng, marks, missing):
+    pulses, *_ = tach(rng, marks, missing=missing, lost=0.2)
+    strays = rng.uniform(pulses[0], pulses[-1], pulses.size // 5)
+    assert checked(vibration(rng), np.sort(np.append(pulses, strays))).findings
+
+
+@pytest.mark.parametrize(('factor', 'wrong'), [(0.5, 2), (2.0, 1)])
+def test_another_sampling_rate_that_fits_the_spans_is_listed(rng, factor, wrong):
+    check = checked(vibration(rng), tach(rng)[0], rate=factor * RATE)
+    text, = (item.text for item in check.warnings if item.code == 'rate_ambiguous')
+    marks = f'{wrong} mark{"s" * (wrong > 1)}'
+    assert f'{marks} a revolution at sample_rate {factor * RATE:g} Hz' in text
+    assert f'1 mark a revolution at sample_rate {RATE:g} Hz' in text
+    marks = check.findings['pulses_per_revolution']
+    assert marks.value == wrong
+    assert f'{RATE:g} Hz' in marks.decided_by
+    assert 'strobe' in marks.decided_by
+    assert 'rate_ambiguous' not in codes(checked(vibration(rng), tach(rng)[0]))
 
 
 # --- delay --------------------------------------------------------------------------------------

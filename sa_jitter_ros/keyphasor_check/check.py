@@ -54,6 +54,10 @@ _SPAN_SHORT, _SPAN_LONG = 0.8, 1.05
 _APART = 4.0  # standard errors
 _KILO = (500.0, 2000.0)  # times as long: a rate in kHz instead of Hz
 _FEWEST_SAMPLES = 16
+_SAME_SPAN = 0.1  # by which spans of twice, or half, the length may differ
+# Share of strays and lost pulses, and mean distance of the others from their marks (teeth): pulses
+# at random have 0.58 to 0.8 and 0.07 to 0.13; a quarter lost and as many strays 0.6 and 0.056.
+_AT_RANDOM, _OFF_PLACE = 0.4, 0.065
 
 
 def check_keyphasor(recording: Recording, *, teeth: Sequence[int] = (),
@@ -93,6 +97,7 @@ class _Check:
         self._from_waveform = recording.pulse_times is None and recording.tach is not None
         self._orders: tuple[float, ...] = ()
         self._largest = 0.0  # pulse time as recorded, s: the larger, the coarser its last digit
+        self._other_rate = 0.0  # with which the vibration is as long as the pulses
 
     def run(self) -> KeyphasorCheck:
         """Return what was found."""
@@ -114,13 +119,17 @@ class _Check:
             self._progress('looking for lines of the vibration over the angle')
             base = first if not found else fit_pulses(numbered, found[0].teeth, tick=tick)
             once = base.once_a_revolution()
-            lines = find_lines(samples.T, self._start, self._rate, base.true[once],
-                               base.numbers[once].astype(np.float64))
+            turned = base.true[once], base.numbers[once].astype(np.float64)
+            lines = find_lines(samples.T, self._start, self._rate, *turned)
         marks, decided = self._marks(numbered, found, lines)
+        if samples is not None and self._other_rate:
+            marks = self._at_both_rates(marks, numbered, found, lines, find_lines(
+                samples.T, self._start, self._other_rate, *turned))
         count = int(marks.value)
         fitted = fit_pulses(numbered, count, tick=tick)
         if count == 1:
             fitted = first
+        _require_wheel(fitted, numbered)
         per_revolution = None if lines is None else lines.scaled(float(count))
         ratio, orders = self._ratio(per_revolution)
         self._orders = tuple(orders.value or ())
@@ -200,6 +209,9 @@ class _Check:
             self._warnings.append(Warn(
                 'span', f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s: '
                 'check that both were started and stopped together, and their sampling rates'))
+            for factor in (0.5, 2.0):
+                if abs(duration / (factor * span) - 1.0) < _SAME_SPAN:
+                    self._other_rate = factor * self._rate
 
     def _samples(self) -> FloatArray | None:
         """Return the good channels of the vibration (channel, sample); None without any."""
@@ -225,19 +237,7 @@ class _Check:
                ) -> tuple[Finding, bool]:
         """Return the marks of a revolution, and whether the pulses themselves show them."""
         declared = self._recording.pulses_per_revolution
-        span = int(numbered.numbers[-1] - numbered.numbers[0])
-        counts = sorted({*range(1, _MOST_MARKS + 1), *ENCODERS, *(item.teeth for item in found),
-                         declared})
-        counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
-        vibration = marks_evidence(lines, counts)
-        log = {}
-        for count in counts:
-            pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(
-                count / item.teeth)) for item in found if count % item.teeth == 0), default=0.0)
-            log[count] = usual_marks(count) + vibration[count] + pattern
-        if declared > 1:
-            log[declared] += _DECLARED
-        probability = _normalised(log)
+        probability, vibration = self._probabilities(numbered, found, lines)
         best = max(probability, key=lambda count: probability[count])
         shown = any(best % item.teeth == 0 for item in found)
         if shown:
@@ -264,6 +264,43 @@ class _Check:
                 f'pulses show {best}: check pulses_per_revolution',
                 tuple((g, 100.0) for g in self._recording.orders[:4])))
         return Finding(best, None, '1', others, by), shown
+
+    def _probabilities(self, numbered: NumberedPulses, found: Sequence[Pattern],
+                       lines: Lines | None) -> tuple[dict[int, float], dict[int, float]]:
+        """Return the probability of each number of marks, and what the vibration says for it."""
+        declared = self._recording.pulses_per_revolution
+        span = int(numbered.numbers[-1] - numbered.numbers[0])
+        counts = sorted({*range(1, _MOST_MARKS + 1), *ENCODERS, *(item.teeth for item in found),
+                         declared})
+        counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
+        vibration = marks_evidence(lines, counts)
+        log = {}
+        for count in counts:
+            pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(
+                count / item.teeth)) for item in found if count % item.teeth == 0), default=0.0)
+            log[count] = usual_marks(count) + vibration[count] + pattern
+        if declared > 1:
+            log[declared] += _DECLARED
+        return _normalised(log), vibration
+
+    def _at_both_rates(self, marks: Finding, numbered: NumberedPulses, found: Sequence[Pattern],
+                       lines: Lines | None, others: Lines | None) -> Finding:
+        """Return the marks, and say what they are at the other sampling rate."""
+        probability, _ = self._probabilities(numbered, found, others)
+        other = max(probability, key=lambda count: probability[count])
+        answers = ' or '.join(
+            f'{count} mark{"s" * (count > 1)} a revolution at sample_rate {rate:.10g} Hz '
+            f'({0 if seen is None else seen.places.size} lines of the vibration)'
+            for count, rate, seen in ((int(marks.value), self._rate, lines),
+                                      (other, self._other_rate, others)))
+        decides = ('time the length of the recording with a watch, or measure the speed of the '
+                   'shaft once with a strobe')
+        self._warnings.append(Warn(
+            'rate_ambiguous', f'the vibration is as long as the pulses with sample_rate='
+            f'{self._other_rate:.10g}, so that the answer may be {answers}: {decides}',
+            tuple((g, 100.0) for g in self._recording.orders[:4])))
+        return replace(marks, decided_by=f'{marks.decided_by}; the sampling rate may be '
+                       f'{self._other_rate:.10g} Hz: {decides}')
 
     def _target(self, fitted: FittedPulses, shown: bool) -> Finding:
         pattern = fitted.pattern
@@ -410,6 +447,18 @@ class _Check:
                        'phases of the orders turn alike with the speed')
 
     # --- what it costs ---
+
+
+def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
+    """Raise SignalError for pulses that come at random."""
+    true, strays, lost = fitted.true.size, fitted.strays.size, fitted.lost.size
+    off = float(np.mean(np.abs(numbered.places)))
+    if (strays + lost) > _AT_RANDOM * (true + strays + lost) and off > _OFF_PLACE:
+        raise SignalError(
+            f'the {true + strays} pulses belong to no steady wheel: where marks might be, {lost} '
+            f'have no pulse, {strays} pulses stand beside them, and the others {off:.0%} of the '
+            'distance of marks away, as pulses at random do; look at the waveform of the tach, '
+            'its threshold, its cable and the distance of the sensor')
 
 
 def _counted(times: FloatArray, by: str) -> Finding:
