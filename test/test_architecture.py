@@ -169,6 +169,15 @@ def test_import_of_the_library_loads_numpy_only():
     assert not packages & {'matplotlib', 'rclpy', 'rosbags', 'scipy', 'yaml'}
 
 
+@pytest.mark.parametrize('module', ['commands.loop_run', 'nodes.change_monitor'])
+def test_distributions_take_no_time_to_load(module):
+    loaded = subprocess.run(
+        [sys.executable, '-c', f'import sys, sa_jitter_ros.{module}; print(*sys.modules)'],
+        cwd=ROOT, check=True, capture_output=True, text=True).stdout.split()
+    assert 'scipy.special' in loaded
+    assert 'scipy.stats' not in loaded
+
+
 @pytest.mark.parametrize('path', MODULES, ids=name_of)
 def test_core_does_not_print(path):
     called = {

@@ -21,7 +21,7 @@ from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import noise_line_variance
-from scipy import stats
+from scipy import special
 
 _SIGNIFICANT = 1e-4
 # What weak lines that nobody declared leave in the noise beside an order, in parts of it.
@@ -80,7 +80,7 @@ class AdditiveNoise(DirectEffect):
         known, value, error = cls._power(evidence)
         count = len(evidence.lines.noise_density)
         # Lines of an average share its noise floor at worst: only acquisitions are independent.
-        p_value = float(stats.t.sf(value / error, count - 1)) if error > 0.0 else 1.0
+        p_value = float(special.stdtr(count - 1, -value / error)) if error > 0.0 else 1.0
         if not p_value < _SIGNIFICANT:
             return absent(cls.name, 'the noise around the lines is the declared one',
                           p_value=p_value)

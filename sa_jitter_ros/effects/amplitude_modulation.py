@@ -24,7 +24,7 @@ from sa_jitter_ros.effects.effect import (
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 _SIGNIFICANT = 1e-3
 
@@ -161,9 +161,9 @@ def _chance(mean: float, weight: Array, count: int) -> float:
     exponent = np.sign(s) * np.sqrt(max(count * (2.0 * s * mean + np.sum(np.log(factors))), 0.0))
     spread = s * np.sqrt(2.0 * count * np.sum((values / factors) ** 2))
     if abs(exponent) < 1e-3:  # the formula is 0/0 there
-        return float(stats.norm.sf(exponent))
-    return float(np.clip(stats.norm.sf(exponent) + stats.norm.pdf(exponent) * (
-        1.0 / spread - 1.0 / exponent), 0.0, 1.0))
+        return float(special.ndtr(-exponent))
+    return float(np.clip(special.ndtr(-exponent) + np.exp(-0.5 * exponent**2) / np.sqrt(
+        2.0 * np.pi) * (1.0 / spread - 1.0 / exponent), 0.0, 1.0))
 
 
 def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:

@@ -27,7 +27,7 @@ from sa_jitter_ros.effects.evidence import SAME_SPEED
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.scoring import Bench, Comparison
 from sa_jitter_ros.prediction.influence import mean_period
-from scipy import stats
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -138,6 +138,6 @@ def _judged(on: str, unit: str, values: Array, comparison: Comparison, across: A
     moved = [np.mean(along * (item @ across)) for item in comparison.moved]
     error = float(np.sqrt(spread**2 + np.sum(np.square(moved))))
     total = np.hypot(error, accuracy)
-    chance = 2.0 * stats.t.sf(abs(change) / total, freedom) if freedom >= _FREEDOM else 1.0
+    chance = 2.0 * special.stdtr(freedom, -abs(change) / total) if freedom >= _FREEDOM else 1.0
     return Dependence(on, unit, float(values.min()), float(values.max()), change, error,
                       float(chance))

@@ -28,7 +28,7 @@ from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation
 from sa_jitter_ros.inference.record_recovery import doubtful_lines
 from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses
 from sa_jitter_ros.recordings.recording import Recording
-from scipy import stats
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -207,7 +207,7 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     of_frequency = math.sqrt(12.0) * error / amplitude / (2.0 * np.pi * duration)
     tried = 0.5 * observation.sample_rate * duration
     return Tone(float(frequency[best]), amplitude, of_frequency, error, min(
-        1.0, tried * float(stats.chi2.sf(power, 2 * len(amplitudes)))))
+        1.0, tried * float(special.chdtrc(2 * len(amplitudes), power))))
 
 
 def _cycles(observation: Observation) -> Array:
@@ -270,7 +270,10 @@ def _unskewed(items: Sequence[Acquisition], motion: Array, smooth: Array) -> Arr
     slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(
         times**2, axis=1)
     slopes = slopes[np.isfinite(slopes)]
-    if slopes.size < 4 or stats.ttest_1samp(slopes, 0.0).pvalue > _CERTAIN:
+    if slopes.size < 4:
+        return motion
+    certainty = abs(slopes.mean()) / (slopes.std(ddof=1) / np.sqrt(slopes.size))
+    if 2.0 * special.stdtr(slopes.size - 1, -certainty) > _CERTAIN:
         return motion
     return np.asarray(motion - float(np.median(slopes)) * times)
 

@@ -35,14 +35,14 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Pattern, Spectrum
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
-from scipy import optimize, stats
+from scipy import optimize, special
 from scipy.special import ndtr
 
 Array = NDArray[Any]
 
 _CONFIDENCE = 0.95
-_FALL = float(stats.norm.isf(1.0 - _CONFIDENCE)) ** 2
-_TWO_SIDED = float(stats.norm.isf(0.5 * (1.0 - _CONFIDENCE)))
+_FALL = float(special.ndtri(_CONFIDENCE)) ** 2
+_TWO_SIDED = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
 _LEAST = -9.0  # logarithm of a power that is nothing
 _STEP, _EXACT = 1.5, 0.02  # of a logarithm of power
 _RESOLUTION = 4.0  # spacings of a number: finer grids are its own

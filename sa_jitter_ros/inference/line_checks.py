@@ -25,7 +25,7 @@ from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.prediction.influence import mean_period
-from scipy import stats
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -82,7 +82,7 @@ def _turns(ratio: Array, noise: Array, order: Array) -> Check:
     count = len(ratio)
     power = np.mean(ratio.imag**2, axis=0)
     own = np.sqrt(np.maximum(power - noise**2, 0.0))
-    chance = stats.chi2.sf(count * power / (noise**2 + _TURN**2), count - 1)
+    chance = special.chdtrc(count - 1, count * power / (noise**2 + _TURN**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
@@ -106,7 +106,7 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
         return ()
     freedom = count - 3
     ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
-    return (Check(float(stats.f.sf(ratio, 2, freedom)) * size.shape[1], LINES,
+    return (Check(float(special.fdtrc(2, freedom, ratio)) * size.shape[1], LINES,
                   math.sqrt(float(explained[worst])),
                   f'the amplitudes follow the speed: {math.sqrt(float(explained[worst])):.2g} of '
                   'an amplitude RMS, as a resonance makes them'),)

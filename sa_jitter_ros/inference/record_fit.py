@@ -37,7 +37,7 @@ from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len
 from scipy.linalg import (
     cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solveh_banded)
-from scipy.stats import gamma
+from scipy.special import gammaincc, gammainccinv
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -484,7 +484,7 @@ class _States:
         ratio = sum(item * np.log(2.0) / _medians(item, max(_WIDE, int(span / 2)))
                     for item in spectrum.T)
         places = np.rint(self.orders * (1.0 + best) * span).astype(int)
-        chance = gamma.sf(ratio[places], spectrum.shape[1])
+        chance = gammaincc(spectrum.shape[1], ratio[places])
         if (score.max() - score[most] > _SLOPE_GAIN * self.declared
                 and abs(best) > 1.5 * step
                 and np.mean(chance < _FALSE / number.size) > _SLOPE_LINES):
@@ -505,7 +505,7 @@ class _States:
         even = interpolate(flat, np.clip(at, 0.0, time.size - 1.0))
         least = _ACCURACY * np.sqrt(np.mean(self.vibration**2, axis=(1, 2)))
         over_angle, over_time = (_spectrum(item, span, least) for item in (flat, even))
-        limit = gamma.isf(_FALSE / len(over_angle[0]), flat.shape[1]) * _MARGIN
+        limit = gammainccinv(flat.shape[1], _FALSE / len(over_angle[0])) * _MARGIN
         found: list[tuple[float, float, bool]] = []
         for tone, (ratio, power), (_, other) in ((False, over_angle, over_time),
                                                  (True, over_time, over_angle)):

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -125,14 +125,13 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
     width = np.sqrt(amplitude_variance)
     z = shift / width
     inside = np.clip(probability.ravel(), 1e-12, 1.0 - 1e-12)
-    uniform = stats.cramervonmises(inside, 'uniform') if inside.size > 1 else None
+    ks, cramer_von_mises = _from_uniform(inside)
     return Residual(
         mean=mean, standard_error=error, rms=float(np.sqrt(np.mean(mean**2))),
         rms_standard_error=float(np.sqrt(np.mean(error**2))),
         rms_parameter_error=float(np.sqrt(np.mean(unsure))),
         chi2_per_dof=float(np.mean(z**2)),
-        ks=float(stats.kstest(inside, 'uniform').statistic),
-        cramer_von_mises=float(uniform.statistic) if uniform is not None else float('nan'),
+        ks=ks, cramer_von_mises=cramer_von_mises if inside.size > 1 else float('nan'),
         coverage=float(np.mean((inside > 0.025) & (inside < 0.975))),
         p_mean=_mean_p_value(difference / scale, scale, [item.mean for item in sensitivities]),
         p_scatter=_scatter_p_value(difference - mean, scale,
@@ -142,6 +141,21 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
             [item.amplitude_variance for item in sensitivities]),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)
+
+
+def _from_uniform(probability: Array) -> tuple[float, float]:
+    """
+    Return how far probabilities are from a uniform distribution: Kolmogorov, Cramer-von Mises.
+
+    >>> ks, cramer_von_mises = _from_uniform(np.array([0.1, 0.2, 0.9]))
+    >>> round(ks, 4), round(cramer_von_mises, 4)
+    (0.4667, 0.1267)
+    """
+    count, ordered = probability.size, np.sort(probability)
+    below = np.arange(count) / count
+    ks = np.max(np.maximum(ordered - below, below + 1.0 / count - ordered))
+    middle = below + 0.5 / count
+    return float(ks), float(1.0 / (12.0 * count) + np.sum((middle - ordered) ** 2))
 
 
 def _log_score(difference: Array, scale: Array) -> float:
@@ -184,7 +198,7 @@ def _mean_p_value(z: Array, scale: Array, sensitivities: Sequence[Array]) -> flo
     # The tail beyond the draws is that of a scaled chi-squared variable of the same moments.
     freedom = 2.0 * null.mean() ** 2 / null.var()
     return float(min(max(below, 1.0 / _DRAWS),
-                     stats.chi2.sf(statistic * freedom / null.mean(), freedom)))
+                     special.chdtrc(freedom, statistic * freedom / null.mean())))
 
 
 def _scatter_p_value(difference: Array, scale: Array, unsure: Sequence[float]) -> float:
@@ -204,4 +218,4 @@ def _scatter_p_value(difference: Array, scale: Array, unsure: Sequence[float]) -
     # never less than that of as many squares of one normal variable.
     spread = max(float(power.std(ddof=1)) / mean / np.sqrt(count), np.sqrt(1.0 / count))
     total = np.sqrt(spread**2 + np.sum(np.square(unsure)))
-    return float(stats.t.sf(np.log(mean) / total, count - 1))
+    return float(special.stdtr(count - 1, -np.log(mean) / total))

@@ -38,7 +38,7 @@ from sa_jitter_ros.inference.timing_choice import (
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import stats
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -211,7 +211,7 @@ def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
         return _CERTAIN
     without = chooser.fit(choice.best - {name}, choice.fit.starts)
     gain = max(choice.fit.value - without.value, 0.0)
-    return float(stats.chi2.sf(2.0 * gain, max(choice.fit.count - without.count, 1)))
+    return float(special.chdtrc(max(choice.fit.count - without.count, 1), 2.0 * gain))
 
 
 def _findings(chooser: Chooser, choice: Choice) -> list[Finding]:
@@ -307,7 +307,7 @@ def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
         return None
     effect, errors = EFFECTS[_EXCESS].of_timing(
         fit.starts[JITTER], fit.standard_errors(JITTER), choice.setting)
-    return Finding(_EXCESS, effect, errors, float(stats.chi2.sf(2.0 * gain, 1)),
+    return Finding(_EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
 
 
@@ -331,7 +331,7 @@ def _of_speed(choice: Choice) -> Finding | None:
         return None
     power, error = float(np.mean(parts)), float(np.std(parts, ddof=1) / math.sqrt(len(parts)))
     noise = share * float(np.mean([item.bend_std**2 for item in data.stretches]))
-    chance = float(stats.norm.sf(power / (noise * math.sqrt(2.0 / count) + 1e-300)))
+    chance = float(special.ndtr(-power / (noise * math.sqrt(2.0 / count) + 1e-300)))
     if power <= 0.0 or chance > _CHANCE:
         return None
     size, size_error = root(power, error)

@@ -26,7 +26,7 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import Jitter
-from scipy import stats
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None,
     # Pulse errors turn all orders at once: the orders are not independent of each other.
     mean, error, _ = _slope(centred, weight @ np.array(turned) / weight.sum())
     chi2 = float(((np.array(found) - mean) ** 2) @ weight)
-    if stats.chi2.sf(chi2, len(found) - 1) < _AGREE:
+    if special.chdtrc(len(found) - 1, chi2) < _AGREE:
         return None, ('the orders turn differently with the speed, as resonances make them: tap '
                       'the sensor, or compare with a second tach at the vibration input')
     return Delay(mean, error, tuple(orders)), ''

@@ -26,7 +26,7 @@ from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
 from sa_jitter_ros.monitoring.quantities import Layout, MonitoredAverage
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import Parameter, Values
-from scipy import stats
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -368,7 +368,7 @@ class ShaftMonitor:
                 estimate.change, estimate.variance, estimate.baseline, estimate.noise,
                 estimate.freedom, estimate.doubt))
             error = math.sqrt(variance)
-            chance = float(2.0 * stats.t.sf(abs(change) / error, freedom))
+            chance = float(2.0 * special.stdtr(freedom, -abs(change) / error))
             if quantity < len(self.layout.orders):
                 least = math.sqrt(noise * self.settings.group_averages)
                 change, error, doubt = _of_amplitude(change, error, doubt, mean, least)
