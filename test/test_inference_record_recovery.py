@@ -10,6 +10,8 @@
 
 """Pulse errors and undeclared orders of whole recordings, from vibration whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sa_jitter_ros.inference.observation import observe
@@ -103,6 +105,27 @@ def test_a_gap_of_unknown_length_breaks_the_record(rng):
         assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size))
     assert np.isnan(found.bridged_errors[80])
     assert found.errors.size == pulses.times.size
+
+
+@pytest.mark.parametrize('shows', [True, False])
+def test_strong_orders_far_above_the_declared_ones_show_the_errors(rng, shows):
+    """A weak order 1 alone does not; what the rest of the band holds is asked then."""
+    samples, pulses, errors = machine(rng)
+    time = np.arange(len(samples)) / RATE
+    turns = np.interp(time, pulses.times - errors, np.arange(errors.size) + 0.5)
+    weak = 0.05 * np.cos(2.0 * np.pi * 2.4 * turns)[:, None]
+    if not shows:
+        samples = 0.02 * rng.standard_normal(samples.shape)
+    found = recover_record(samples + weak, 0.0, RATE, pulses,
+                           replace(model_of(), orders=(1.0,), noise_std=0.02))
+    assert found.resolved == shows
+    wrong = (found.errors - errors)[2:-2]
+    z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
+    if shows:
+        assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size))
+        assert np.std(wrong) < 0.3 * np.std(errors)
+    else:
+        assert found.undeclared[0].size <= 1  # noise has no lines
 
 
 def test_autocovariance_is_that_of_what_the_errors_are_wrong_by(rng):

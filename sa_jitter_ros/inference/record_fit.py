@@ -47,6 +47,7 @@ BoolArray = NDArray[np.bool_]
 # trigger cycle. What lies further away does not leak into a cycle.
 _BEYOND, _BEYOND_LINES = 6.0, 3.0
 _EDGE = 1.15  # of the band, where the low pass ends
+_FULL_BAND = 0.4  # of the sample rate
 _POINTS, _SAMPLES = 2 * _EDGE, 3.7  # in a period of the band's end: of the angle, and of time
 _FEWEST_POINTS = 8
 # A first guess of the states: of bends in parts of the declared jitter, of gains.
@@ -120,17 +121,20 @@ class RecordFit:
 
 def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
                measured: BoolArray, cycle_length: float, orders: Sequence[float],
-               jitter_std: float, known: tuple[Array, Array] | None = None) -> RecordFit:
+               jitter_std: float, wider: float = 1.0,
+               known: tuple[Array, Array] | None = None) -> RecordFit:
     """
     Fit consecutive trigger cycles of a recording.
 
     `samples` (sample, channel) begin at `start_time` (s); `times` (pulse,) are the trigger pulses,
     of which some are `measured` (pulse,) and the others were put in evenly. `cycle_length` is r;
-    `jitter_std` (s) the declared size of the pulse errors. `known` are undeclared orders, and
-    tones (Hz), of an earlier fit; then none is looked for.
+    `jitter_std` (s) the declared size of the pulse errors. Lines are looked for up to little
+    beyond the highest order, or in a band that is `wider` by this factor. `known` are undeclared
+    orders, and tones (Hz), of an earlier fit; then none is looked for.
     """
-    top = max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)
     period = float(np.diff(times).mean())
+    top = min(wider * (max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)),
+              max(max(orders), _FULL_BAND * sample_rate * period / cycle_length))
     band, rate = _low_passed(samples, sample_rate, top * cycle_length / period)
     states = _States(band, rate, start_time, times, measured, cycle_length, np.array(orders), top,
                      jitter_std)

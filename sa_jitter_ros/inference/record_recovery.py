@@ -40,6 +40,7 @@ _DEAD = 1e-9  # range of a channel, in its largest value, that is rounding
 _LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
+_WIDER = 4.0, 16.0  # bands in which lines are looked for where the declared ones show no errors
 _APART = 1.5  # in what a stretch resolves: lines that it keeps apart
 # Second differences that are larger than this many of their median are no motion.
 _OUTLIER = 6.0
@@ -107,6 +108,12 @@ class RecordRecovery:
         power = float(np.var(self.errors[known]) - np.mean(self.standard_errors[known] ** 2))
         return max(self.jitter_std, float(np.sqrt(max(power, 0.0))))
 
+    @property
+    def resolved(self) -> bool:
+        """Tell whether the vibration shows the errors of single pulses, beside slow ones."""
+        known = self.standard_errors[np.isfinite(self.standard_errors)]
+        return bool(known.size and np.median(known) < RESOLVED * self.jitter_std)
+
 
 def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
                    model: DeclaredModel, *,
@@ -118,23 +125,32 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     (Hz) that are `known`, no other is looked for. Nothing is refused: where the vibration tells
     nothing, standard errors are as large as the errors expected, or NaN.
     """
-    def fits(lines: tuple[FloatArray, FloatArray] | None) -> list[RecordFit | None]:
+    def fits(lines: tuple[FloatArray, FloatArray] | None, wider: float) -> list[RecordFit | None]:
         found: list[RecordFit | None] = [None] * len(stretches)
         for i in sorted(range(len(stretches)), key=lambda i: stretches[i].start
                         - stretches[i].stop):
-            found[i] = fit = _fitted(samples, start_time, rate, pulses, stretches[i], model, lines)
+            found[i] = fit = _fitted(samples, start_time, rate, pulses, stretches[i], model, lines,
+                                     wider)
             if lines is None and fit is not None:
                 lines = fit.orders[len(model.orders):], fit.tones
         return found
 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
-    recovery = _joined(pulses, stretches, fits(known))
+    wider = 1.0
+    recovery = _joined(pulses, stretches, fits(known, wider))
+    if not recovery.resolved:
+        for more in _WIDER:
+            found = _joined(pulses, stretches, fits(known, more))
+            if found.resolved:  # orders that shafts must have tell how long the cycles are
+                lines = _made_exact(found.undeclared[0], model), found.undeclared[1]
+                wider, recovery = more, _joined(pulses, stretches, fits(lines, more))
+                break
     if known is None and any(item.size for item in recovery.undeclared):
         roughness, lags = _roughness(recovery), recovery.noise_autocovariance[:3]
         if roughness**2 < _SMOOTH**2 * lags @ (6.0, -8.0, 2.0):
             return recovery
         none = np.zeros(0), np.zeros(0)
-        bare = _joined(pulses, stretches, fits(none))
+        bare = _joined(pulses, stretches, fits(none, wider))
         if _roughness(bare) < roughness:
             return replace(bare, fits=recovery.fits)
     return recovery
@@ -156,7 +172,7 @@ def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> l
 
 def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
             stretch: slice, model: DeclaredModel,
-            known: tuple[FloatArray, FloatArray] | None) -> RecordFit | None:
+            known: tuple[FloatArray, FloatArray] | None, wider: float) -> RecordFit | None:
     """Return the fit of a stretch by its live channels; None where none tells anything."""
     times = pulses.bridged[stretch]
     measured = np.zeros(pulses.bridged.size, np.bool_)
@@ -176,7 +192,7 @@ def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
             part, rate, start_time + first / rate, times,
             measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
             jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER),
-            known=known)
+            wider=wider, known=known)
     except np.linalg.LinAlgError:
         return None
 
@@ -325,6 +341,12 @@ def _follow(sides: ComplexArray, shape: FloatArray, level: FloatArray, most: flo
     common = np.sum(weight * scaled) / weight.sum()
     away = np.sum(weight * np.abs(scaled - common) ** 2) / weight.sum()
     return bool(away < _UNLIKE * abs(common) ** 2 and 1.0 / most < abs(common) < most)
+
+
+def _made_exact(orders: FloatArray, model: DeclaredModel) -> FloatArray:
+    """Return orders, those that shafts must have without the error of the fit."""
+    exact = [_exact(order, model) for order in orders.tolist()]
+    return np.array([order if own is None else own for order, own in zip(orders.tolist(), exact)])
 
 
 def _exact(order: float, model: DeclaredModel) -> float | None:
