@@ -21,7 +21,7 @@ import argparse
 from collections import Counter
 from collections.abc import Mapping, Sequence
 import contextlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 import io
 import json
 from pathlib import Path
@@ -76,21 +76,28 @@ class Run:
         if set(self.effects) & set(UNKNOWN):
             return self.verdict == 'unexplained' and not self.found
         found = set(self.found) - ({'additive_noise'} if self.noisy else set())
+        if 'jitter_scale' in self.effects and 'jitter_scale' in self.rivals:
+            found = {'jitter_scale' if name == 'excess_jitter' else name for name in found}
         return self.status == 0 and found <= set(self.effects) <= found | set(self.present) and (
             self.verdict == ('traced' if self.found else 'none'))
 
 
 def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: bool = False,
-          pictures: bool = False) -> Run:
+          pictures: bool = False, scale: float = 1.0) -> Run:
     """
     Draw a case, run `close_loop` on it in `folder` and read its report.
 
+    The true jitter is `scale` times the declared one, which adds `jitter_scale` to the effects.
     Without `pictures`, which take most of its time, the command stops short of drawing them.
     """
     case = draw_case(effects, seed, only_declared=only_declared)
+    declaration, truth = case.machine, dict(case.truth)
+    if scale != 1.0:
+        declaration = replace(declaration, keyphasor_rate=scale * declaration.keyphasor_rate)
+        effects, truth['jitter_scale'] = (*effects, 'jitter_scale'), {'scale': scale}
     fields = record(case.machine, case.what, np.random.default_rng([seed, 1]))
     np.savez(folder / 'machine.npz', **fields)
-    (folder / 'model.yaml').write_text(declared(case.machine))
+    (folder / 'model.yaml').write_text(declared(declaration))
     arguments = [str(folder / 'machine.npz'), '--declared', str(folder / 'model.yaml'),
                  '--output', str(folder / 'report'), '--quiet']
     error = io.StringIO()
@@ -124,9 +131,9 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
         _rms(report['error_before']), _rms(report['error_after']),
         *chi2,
-        {f'{one["name"]}.{name}': _standard_errors(value, case.truth[one['name']][name])
+        {f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
          for one in found for name, value in one['parameters'].items()
-         if name in case.truth.get(one['name'], {}) and value['standard_error'] is not None})
+         if name in truth.get(one['name'], {}) and value['standard_error'] is not None})
 
 
 def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str, Any]]:
@@ -193,19 +200,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--null', type=int, default=40, help='machines that are as declared')
     parser.add_argument('--unknown', type=int, default=6, help='machines an effect in no module')
     parser.add_argument('--pairs', type=int, default=3, help='machines a pair of effects')
+    parser.add_argument('--scales', type=float, nargs='*', default=(),
+                        help='true jitter over the declared one, each for so many --seeds')
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--only', help='one case, effects joined by +')
     parser.add_argument('--only-declared', action='store_true', help='no undeclared orders')
     parser.add_argument('--pictures', action='store_true', help='run the whole command')
     parser.add_argument('--keep', type=Path, help='folder for all files of the runs')
     options = parser.parse_args(arguments)
-    plan = [((), options.null), *(((name,), options.seeds) for name in KNOWN),
-            *(((name,), options.unknown) for name in UNKNOWN),
-            *((pair, options.pairs) for pair in PAIRS)]
+    plan = [((), options.null, 1.0), *(((name,), options.seeds, 1.0) for name in KNOWN),
+            *(((name,), options.unknown, 1.0) for name in UNKNOWN),
+            *((pair, options.pairs, 1.0) for pair in PAIRS)]
     if options.only is not None:
-        plan = [(tuple(name for name in options.only.split('+') if name), options.seeds)]
+        plan = [(tuple(name for name in options.only.split('+') if name), options.seeds, 1.0)]
+    if options.scales:
+        plan = [((), options.seeds, scale) for scale in options.scales]
     runs = []
-    for effects, count in plan:
+    for effects, count, scale in plan:
         for seed in range(options.first, options.first + count):
             with tempfile.TemporaryDirectory() as temporary:
                 folder = Path(temporary)
@@ -213,7 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     folder = options.keep / f'{"+".join(effects) or "none"}_{seed}'
                     folder.mkdir(parents=True, exist_ok=True)
                 run = judge(effects, seed, folder, only_declared=options.only_declared,
-                            pictures=options.pictures)
+                            pictures=options.pictures, scale=scale)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
     print(table(runs))
