@@ -25,6 +25,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands import average, close_loop
 from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.offline.files import TEMPORARY
 from sa_jitter_ros.offline.fleet import find_recordings, run_jobs
 from sa_jitter_ros.offline.processes import Failure
 from sa_jitter_ros.recordings.npz_format import write_npz
@@ -87,6 +88,23 @@ def test_each_job_has_a_result_or_a_reason(processes):
 def test_full_disk_ends_the_run(processes):
     with pytest.raises(OSError, match='No space left'):
         list(run_jobs(work, ['a', 'is full', 'b', 'c'], processes=processes))
+
+
+def test_stopped_run_leaves_nothing_half_done(tmp_path, monkeypatch, capfd):
+    (tmp_path / 'a.npz').touch()
+
+    def stopped(job, told):
+        Path(job.folder, f'{TEMPORARY}x').mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(average, 'average_file', stopped)
+    try:
+        assert average.main([str(tmp_path), '--output', str(tmp_path / 'out'), '--quiet']) == 130
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert 'what was finished stays' in capfd.readouterr().err
+    assert list((tmp_path / 'out').rglob('*')) == [tmp_path / 'out' / 'a']
 
 
 def test_full_disk_is_one_line_and_what_was_finished_stays(tmp_path, monkeypatch, capfd):

@@ -117,9 +117,9 @@ def work_through(function: Callable[[Work], Row], jobs: Sequence[Work], rows: li
             rows.append(row)
             _say(row, progress)
             progress.show(done / len(jobs), f'{done} of {len(jobs)} done')
-        for job in jobs:  # of workers that died
-            remove_unfinished(Path(job.folder))
     finally:
+        for job in jobs:  # of workers that died, or were stopped
+            remove_unfinished(Path(job.folder))
         progress.clear()
 
 
