@@ -13,6 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.mark_pattern import steady_pattern
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings import read
@@ -197,6 +198,17 @@ def test_a_displaced_pulse_beside_a_gap_is_no_pattern_of_two_marks(again):
         lost += given.size - 1 - np.isin(given, found).sum()
     assert used <= 1
     assert lost < 200
+
+
+def test_two_displaced_pulses_do_not_hide_each_other(rng):
+    """Nor in what two marks show, which tells the scatter of the intervals."""
+    for _ in range(30):
+        errors = rng.normal(0.0, 2e-3, 21)
+        errors[[5, 12]] += rng.choice([-1.0, 1.0], 2) * rng.uniform(0.06, 0.12, 2)
+        levels = np.log(1.0 + np.diff(errors))
+        pattern = steady_pattern(np.arange(20) % 2, levels, 2)
+        assert 1e-3 < pattern.scatter < 7e-3
+        assert np.abs(pattern.widths).max() < 5e-3
 
 
 @pytest.mark.parametrize('clock', [0.0, 4000.0])

@@ -23,8 +23,10 @@ BoolArray = NDArray[np.bool_]
 _FEWEST = 2  # intervals of a mark
 # How much more the means of the marks have to scatter than the intervals of one mark explain.
 _SIGNIFICANT = 4.0
-_FEWEST_FREE = 4  # degrees of freedom of a few revolutions
-_DISPLACED = 64.0  # variances that a displaced pulse explains
+# Degrees of freedom of a few revolutions; those left where several pulses may be displaced.
+_FEWEST_FREE, _FREE_OF_SEVERAL = 4, 6
+_DISPLACED, _MOST_DISPLACED = 64.0, 3  # variances that a displaced pulse explains
+_TINY = 1e-9
 # Levels of two revolutions that repeat: tried from narrow to wide; and their change of speed.
 _UNEVEN = 0.5  # of levels: intervals of more than 1.6 times others are gaps
 _REPEATING, _CHANGE = (0.005, 0.02, 0.06), 0.3
@@ -98,12 +100,20 @@ def _shrunk(widths: FloatArray, known: BoolArray, variance: float) -> FloatArray
     return np.asarray(widths * (1.0 - variance / between))
 
 
+def _fit(design: FloatArray, levels: FloatArray) -> tuple[FloatArray, float]:
+    """Return the factors of a design (n, factor) and the variance of what it leaves of levels."""
+    found = np.linalg.lstsq(design, levels, rcond=None)[0]
+    left = levels - design @ found
+    return np.asarray(found), float(left @ left) / (levels.size - found.size)
+
+
 def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPattern | None:
     """
     Return the pattern of a few revolutions of few marks, None if they are too few.
 
     `marks`, `levels` and `count` are those of `mark_pattern`. The speed changes along a line, and
-    one of the pulses may be displaced: it makes an interval as much longer as the next is shorter.
+    up to three pulses may be displaced: each makes an interval as much longer as the next is
+    shorter.
 
     >>> late = np.tile([0.1, -0.1], 5) + 1e-3 * np.array([1, 0, -1, 2, 0, -2, 0, 1, -1, 0])
     >>> displaced = 0.05 * np.eye(10)[3] - 0.05 * np.eye(10)[4]
@@ -119,14 +129,17 @@ def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPatte
     design = np.column_stack((np.eye(count)[marks[place]], place - place.mean()))
     pulses = np.eye(place.size, place.size + 1, 1) - np.eye(place.size, place.size + 1)
     pulses = pulses[:, np.diff(place, prepend=place[0] - 1, append=place[-1] + 1) == 1]
-    fitted = np.linalg.qr(design).Q
-    left, moved = (item - fitted @ (fitted.T @ item) for item in (levels, pulses))
-    told = np.square(moved.T @ left) / np.sum(np.square(moved), axis=0)
-    largest = int(np.argmax(told))
-    if told[largest] > _DISPLACED * (left @ left - told[largest]) / (free - 1):
-        design, free = np.column_stack((design, pulses[:, largest])), free - 1
-    found = np.linalg.lstsq(design, levels, rcond=None)[0]
-    square = float(np.sum(np.square(levels - design @ found))) / free
+    found, square = _fit(design, levels)
+    for _ in range(max(1, min(_MOST_DISPLACED, free - _FREE_OF_SEVERAL))):
+        fitted = np.linalg.qr(design).Q
+        left, moved = (item - fitted @ (fitted.T @ item) for item in (levels, pulses))
+        told = np.square(moved.T @ left) / np.maximum(np.sum(np.square(moved), axis=0), _TINY)
+        largest = int(np.argmax(told))
+        design = np.column_stack((design, pulses[:, largest]))
+        without = _fit(design, levels)
+        # Two of them hide each other: the last one that is significant tells how many.
+        if told[largest] > _DISPLACED * without[1]:
+            found, square = without
     widths = found[:count] - found[:count].mean()
     known = np.ones(count, np.bool_)
     variance = square * count / place.size
