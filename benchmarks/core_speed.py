@@ -146,7 +146,7 @@ def beside_the_spline(scale: float, rounds: int) -> str:
 
 def gear_train(ratios: list[float], *, channels: int, seconds: float) -> Record:
     """Return the vibration of gears of 19 teeth on shafts of these ratios, in noise."""
-    record = make_record(channels=1, seconds=seconds, speed=25.0)
+    record = make_record(channels=1, seconds=seconds, speed=20.5)  # 41 cycles in 2 s
     time = np.arange(record.samples.shape[1]) / RATE
     angle = np.interp(time, record.pulses, np.arange(len(record.pulses)))
     wave = sum(np.cos(2.0 * np.pi * order * ratio * angle)
@@ -158,7 +158,7 @@ def gear_train(ratios: list[float], *, channels: int, seconds: float) -> Record:
 
 def shares(scale: float, rounds: int) -> dict[str, float]:
     """Return the CPU time of settings that ask much, in seconds for a second of data."""
-    seconds = max(4.0 * scale, 1.0)
+    seconds = max(4.0 * scale, 2.0)
     rate, speed, marks = 100e3, 50.0, 1024
     angle = speed * np.arange(round(seconds * rate)) / rate
     pulses = np.arange(1.0, np.floor(angle[-1] * marks)) / (speed * marks)
