@@ -107,8 +107,9 @@ def test_errors_within_ticks_are_separated_from_larger_ones(rng):
     grid = rng.uniform(-0.5, 0.5, (8, 21)) / clock
     recovered = grid - grid.mean(axis=1, keepdims=True) + rng.normal(0.0, 2e-6, grid.shape)
     small = np.full(grid.shape, 2e-6)
-    assert ticks_leave_room(recovered, small, clock)
-    assert not ticks_leave_room(recovered + rng.normal(0.0, 0.2 / clock, grid.shape), small, clock)
+    assert ticks_leave_room(recovered, np.mean(small**2), clock)
+    assert not ticks_leave_room(recovered + rng.normal(0.0, 0.2 / clock, grid.shape),
+                                np.mean(small**2), clock)
     placed, beyond = placed_on_grid(recovered[0], clock)
     assert beyond < 0.02 / clock
     assert np.abs(placed).max() < 0.54 / clock

@@ -10,6 +10,7 @@
 
 """The grid of a clock in pulse times: how it is found, and the error it implies for each pulse."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -128,10 +129,14 @@ def placed_on_grid(errors: Array, clock_rate: float) -> tuple[Array, float]:
     return np.asarray(errors + best), float(np.sqrt(cost.min()))
 
 
-def ticks_leave_room(errors: Array, standard_errors: Array, clock_rate: float) -> bool:
-    """Return whether a clock alone can make the pulse errors (acquisition, pulse) in s."""
+def ticks_leave_room(errors: Sequence[Array], variance: float, clock_rate: float) -> bool:
+    """
+    Return whether a clock alone can make the pulse errors (pulse,) of some stretches, in s.
+
+    `variance` is that of what the errors are wrong by.
+    """
     beyond = np.mean([placed_on_grid(row, clock_rate)[1] ** 2 for row in errors])
-    return bool(beyond < max(np.nanmean(standard_errors**2), (_ROOM / clock_rate) ** 2))
+    return bool(beyond < max(variance, (_ROOM / clock_rate) ** 2))
 
 
 def on_grid(errors: Array, clock_rate: float) -> Array:

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.lattice import placed_on_grid
+from sa_jitter_ros.effects.lattice import ticks_leave_room
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
@@ -48,7 +48,6 @@ _BESIDE_CLOCK = 2  # patterns beside that of a clock
 _STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
 _BETTER = 0.01
 _RARE = 1e9
-_ROOM = 0.02  # of a tick that errors may leave it by
 
 
 @dataclass(frozen=True)
@@ -169,17 +168,16 @@ class Chooser:
 
     def _room(self, known: Sequence[Array]) -> bool:
         """Tell whether the ticks can make the errors less `known` ones (all pulses), in units."""
-        rate, begin = self.setting.clock_rate, 0
-        beyond = []
+        begin, found = 0, []
         for item in self.data.stretches:
             part = slice(begin, begin + item.errors.size)
             begin = part.stop
             left = item.errors.copy()
             for row in known:
                 left -= self.data.unit * row[part]
-            beyond.append(placed_on_grid(left[item.measured], rate)[1] ** 2)
+            found.append(left[item.measured])
         noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
-        return bool(np.mean(beyond) < max(noise, (_ROOM / rate) ** 2))
+        return ticks_leave_room(found, noise, self.setting.clock_rate)
 
     def score(self, names: frozenset[str], fit: TimingFit) -> float:
         """Return the logarithm of the evidence for a set of effects, its prior odds included."""
