@@ -185,10 +185,13 @@ def _steadiness(chooser: Chooser, choice: Choice) -> Check:
     if len(seen) < 2:
         return Check(1.0, PULSES, 0.0, 'the size of the pulse errors')
     logs, p_value = np.log(np.array(seen)), 0.0
+    place = np.arange(logs.size) - 0.5 * (logs.size - 1)  # most change along the recording
     for scaled in _kinds(choice):
         null = np.log(np.array([power for item in items for power in _powers(
             chooser, choice, item, _drawn(choice, item, scaled))]))
-        p_value = max(p_value, _chance(float(np.var(logs)), np.var(null, axis=0)))
+        each = (_chance(float(np.var(logs)), np.var(null, axis=0)),
+                _chance(float(abs(place @ logs)), np.abs(place @ null)))
+        p_value = max(p_value, min(1.0, len(each) * min(each)))
     power = float(np.average(choice.fit.spectrum(choice.fit.parameters)[:, 1, 1].real,
                              weights=data.size))
     size = float(np.ptp(np.exp(logs - np.median(null))))
