@@ -246,7 +246,7 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
     errors = _unskewed(usable, np.array([item.errors for item in usable]), smooth)
     error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
         [item.standard_errors**2 for item in usable])))
-    if not ticks_leave_room(errors, float(np.nanmean(np.square(error))), clock):
+    if not ticks_leave_room(list(errors), float(np.nanmean(np.square(error))), clock):
         return 0.0, 0.0
     missed = errors - _of_acquisitions(smooth, usable)
     missed -= missed.mean(axis=1, keepdims=True)
