@@ -207,6 +207,14 @@ def test_limit_holds_as_often_as_it_says(name):
     assert 0.95 - np.mean(held) < 4.0 * np.sqrt(0.95 * 0.05 / len(held))
 
 
+def test_noise_that_hides_any_jitter_leaves_no_limit():
+    """The largest size that a fit tries is none."""
+    quiet, noisy = (limit_of(machine(1, noise=noise), 'excess_jitter') for noise in (3.0, 300.0))
+    assert 5.0 < noisy / quiet < 50.0  # jitter below the noise shows by its power
+    timing = read_timing([machine(1, noise=3e4)], names=frozenset())
+    assert largest(timing, 'excess_jitter') is None
+
+
 def limit_of(part, name):
     timing = read_timing([part], names=frozenset())
     effect = largest(timing, name)

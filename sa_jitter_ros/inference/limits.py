@@ -128,7 +128,10 @@ def largest(timing: Timing, name: str) -> Effect | None:
     high, top = low + _STEP, kind.timing.upper[0]
     while high < top and fallen(high) < 0.0:
         low, high = high, high + _STEP
-    at = top if high >= top else float(optimize.brentq(
+    high = min(high, top)
+    if fallen(high) < 0.0:  # however large it is
+        return None
+    at = float(optimize.brentq(
         fallen, low, high, xtol=_EXACT, disp=False)) if fallen(low) < 0.0 else low
     held = chooser.fit(names, start, held={(name, 0): at})
     return kind.of_timing(held.starts[name], np.zeros(len(kind.timing.upper)), choice.setting)[0]
