@@ -347,8 +347,8 @@ def _own_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], v
     noise = np.maximum(power.mean(axis=0), _TINY)
     least = _LEAST_NOISE * noise
     for _ in range(_ROUNDS):
-        weight = np.where(power < _OUTLIER * (noise + expected), 1.0, 0.0) / (
-            noise + expected) ** 2
+        weight = np.where(power < _OUTLIER * (noise + expected), 1.0, 0.0) * (
+            noise / (noise + expected)) ** 2
         noise = np.maximum(np.sum(weight * (power - expected), axis=0)
                            / np.maximum(weight.sum(axis=0), _TINY), least)
     freedom = np.where(shows, 2.0, 4.0) * np.sum((noise / (noise + expected)) ** 2, axis=0)
