@@ -38,7 +38,6 @@ from sa_jitter_ros.inference.record_recovery import (
 from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
-from sa_jitter_ros.recordings.limits import LEAST_RANGE
 from sa_jitter_ros.recordings.recording import Recording
 
 BoolArray = NDArray[np.bool_]
@@ -255,7 +254,6 @@ def _read(recording: Recording) -> tuple[FloatArray, BoolArray]:
     gaps = np.asarray(~np.isfinite(samples).all(axis=1))
     samples -= samples[~gaps].mean(axis=0) if not gaps.all() else 0.0
     samples[gaps] = 0.0
-    samples[:, np.ptp(samples, axis=0) < LEAST_RANGE] = 0.0
     return samples, gaps
 
 

@@ -29,6 +29,7 @@ from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.resampling import gain
+from sa_jitter_ros.recordings.limits import LEAST_RANGE
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -184,7 +185,8 @@ def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     first = max(int((times[0] - start_time) * rate) - _EDGE, 0)
     last = int((times[-1] - start_time) * rate) + _EDGE
     part = samples[first:last + 1]
-    part = part[:, np.ptp(part, axis=0) > _DEAD * np.abs(part).max(axis=0)]
+    part = part[:, np.ptp(part, axis=0) > np.maximum(
+        _DEAD * np.abs(part).max(axis=0), LEAST_RANGE)]
     if not part.size:
         return None
     try:
