@@ -1,0 +1,407 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Put effects into measured machines, and tell whether the loop finds them or gives a limit.
+
+`python benchmarks/measured_injections.py --data FOLDER` moves the pulses, resamples the vibration
+or adds to it, for every effect and for two that no module describes, so that the worst line
+changes by 0.01, 0.03 and 0.1 (mean, or standard deviation of an average). What the loop finds in
+the recording itself is declared before. It writes a line of JSON a run to the standard error and
+prints a table at the end.
+"""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+import json
+from pathlib import Path
+import sys
+import tempfile
+import time
+from typing import Any
+import warnings
+
+from measured_cases import GEAR0
+import numpy as np
+import sa_jitter_ros as sa
+from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings.recording import ArraySource
+from scipy import ndimage
+import yaml
+
+Array = np.ndarray[Any, Any]
+Generator = np.random.Generator
+SIZES = 0.01, 0.03, 0.1
+_STEPS, _STEP = 400, 1.1
+_CORRELATION, _BEAT, _OFF = 0.8, 0.2, 1.5
+_HUM = 59.8  # Hz
+_CHANGED = {'noise': 'additive_noise'}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """
+    A recording in arrays (`samples` channel x sample, `times` of pulses), and its model.
+
+    `true_times` are those without the declared jitter; `level` is the usual amplitude of a line.
+    """
+
+    samples: Array
+    rate: float
+    start: float
+    times: Array
+    true_times: Array
+    model: Mapping[str, Any]
+    recording: Recording
+    level: float
+
+    @property
+    def period(self) -> float:
+        """Return the duration of a trigger cycle in s."""
+        return float(self.model.get('pulses_per_trigger', 0) or self.model.get(
+            'pulses_per_revolution', 1)) * float(np.median(np.diff(self.times)))
+
+    @property
+    def clock(self) -> Array:
+        """Return the times of the samples."""
+        return self.start + np.arange(self.samples.shape[1]) / self.rate
+
+    def slow(self, rng: Generator, low: float, high: float) -> Callable[[Array], Array]:
+        """Return a process of unit variance of some frequencies, in cycles a trigger cycle."""
+        rates = rng.uniform(low, high, 24) / self.period
+        phases = rng.uniform(0.0, 2.0 * np.pi, 24)
+        return lambda times: sum(np.cos(2.0 * np.pi * rate * times + phase)
+                                 for rate, phase in zip(rates, phases)) / np.sqrt(12.0)
+
+    def moved(self, lead: Array) -> Array:
+        """Return the samples (channel, sample) that the machine makes `lead` (sample,) s later."""
+        places = np.arange(self.samples.shape[1]) + self.rate * lead
+        return np.stack([ndimage.map_coordinates(row, [places], order=5, mode='nearest')
+                         for row in self.samples])
+
+    def made(self) -> Recording:
+        """Return the recording."""
+        return replace(self.recording, vibration=ArraySource(self.samples), sample_rate=self.rate,
+                       pulse_times=self.times, tach=None, tach_rate=None,
+                       reference_pulse_times=None)
+
+
+Make = Callable[[Bench, Generator, float], Bench]
+
+
+def excess_jitter(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Add electrical noise."""
+    return replace(bench, times=bench.times + size * rng.standard_normal(bench.times.size))
+
+
+def correlated_jitter(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Add a trigger level that wanders."""
+    noise = rng.standard_normal(bench.times.size)
+    late = np.empty_like(noise)
+    pole = _CORRELATION ** (np.median(np.diff(bench.times)) / bench.period)
+    late[0] = noise[0]
+    for k in range(1, noise.size):
+        late[k] = pole * late[k - 1] + np.sqrt(1.0 - pole**2) * noise[k]
+    return replace(bench, times=bench.times + size * late)
+
+
+def clock_skew(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the clock of the keyphasor run fast."""
+    return replace(bench, times=bench.times + size * (bench.times - bench.start))
+
+
+def path_delay(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the keyphasor come late."""
+    return replace(bench, times=bench.times + size)
+
+
+def missing_pulses(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Lose pulses."""
+    return replace(bench, times=bench.times[rng.random(bench.times.size) >= size])
+
+
+def phase_wander(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the gears move against the tach shaft."""
+    turn = 2.0 * np.pi * bench.model['trigger_speed'] * bench.model.get('ratio', 1.0)
+    lead = size / turn * bench.slow(rng, 0.0, 0.2)(bench.clock)
+    return replace(bench, samples=bench.moved(lead))
+
+
+def speed_fluctuation(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the whole machine turn unevenly."""
+    low, high = 0.05, 0.3
+    motion = bench.slow(rng, low, high)
+    grid = np.linspace(bench.times[0], bench.times[-1], 20 * bench.times.size)
+    bent = np.gradient(np.gradient(motion(grid), grid), grid)[5:-5]
+    scale = size / (2.0 * np.pi * bench.model['trigger_speed'] * bent.std())
+    times = bench.times
+    for _ in range(20):  # t + motion(t) is when it happened before
+        times = bench.times - scale * motion(times)
+    return replace(bench, samples=bench.moved(scale * motion(bench.clock)), times=times)
+
+
+def keyphasor_quantisation(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Time the pulses by a clock, whose rate is declared."""
+    rate = 1.0 / size
+    return replace(bench, times=np.ceil(bench.true_times * rate) / rate,
+                   model={**bench.model, 'keyphasor_rate': rate})
+
+
+def interpolation_loss(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Interpolate the samples linearly from those of another clock."""
+    step = 1.0 + _BEAT / bench.period / bench.rate
+    places = np.arange(0.0, bench.samples.shape[1] - 1, step)
+    own = np.arange(bench.samples.shape[1])
+    return replace(bench, rate=bench.rate / step, samples=np.stack(
+        [np.interp(places, own, row) for row in bench.samples]))
+
+
+def additive_noise(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Add white noise."""
+    return replace(bench, samples=bench.samples + bench.level * size * rng.standard_normal(
+        bench.samples.shape))
+
+
+def amplitude_modulation(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the load vary slowly."""
+    return replace(bench, samples=bench.samples * (
+        1.0 + size * bench.slow(rng, 0.0, 0.5 / bench.model['trigger_cycles'])(bench.clock)))
+
+
+def _tone(bench: Bench) -> float:
+    """Return a frequency beside the middle order."""
+    model = bench.model
+    orders = model['orders']
+    return float(orders[len(orders) // 2] * model.get('ratio', 1.0) * model['trigger_speed']
+                 + _OFF / model['trigger_cycles'] / bench.period)
+
+
+def interfering_tone(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Add a tone beside an order."""
+    return replace(bench, samples=bench.samples + bench.level * size * np.cos(
+        2.0 * np.pi * _tone(bench) * bench.clock + 1.0))
+
+
+def hum(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the mains move the trigger level; no module describes it."""
+    return replace(bench, times=bench.times + size * np.sqrt(2.0) * np.sin(
+        2.0 * np.pi * _HUM * bench.times))
+
+
+def late_recovery(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the sensor drop out now and then and come late until it has recovered; unknown, too."""
+    late = np.zeros(bench.times.size)
+    for k in range(1, late.size):
+        hit = rng.uniform(0.5, 1.5) if rng.random() < 0.04 else 0.0
+        late[k] = 0.75 * late[k - 1] + hit
+    return replace(bench, times=bench.times + size * late)
+
+
+_MOTOR = {'pulses_per_revolution': 8, 'orders': [12.0, 16.0, 18.0, 36.0, 54.0, 72.0]}
+#: File, declared model, and the width (s) of the uniform pulse errors that are added.
+MACHINES: Mapping[str, tuple[str, Mapping[str, Any], float]] = {
+    'gearbox': ('gear0_gearbox.npz', {
+        **GEAR0, 'keyphasor_rate': 2e4, 'trigger_cycles': 10}, 5e-5),
+    'motor, 30 V': ('motor_30V_100kHz.npz', {
+        **_MOTOR, 'keyphasor_rate': 1e5, 'trigger_speed': 94.4, 'trigger_cycles': 5}, 1e-5),
+    'motor, run-up': ('motor_runup_20V_40kHz.npz', {
+        **_MOTOR, 'keyphasor_rate': 4e4, 'trigger_speed': 44.0, 'trigger_cycles': 8}, 0.0),
+    'bearing rig': ('uia_bearing_rig_1.npz', {
+        'keyphasor_rate': 1024.0, 'orders': [1.0, 2.0, 3.0], 'trigger_speed': 4.19,
+        'trigger_cycles': 10}, 0.0),
+    'turbine': ('turbine_20130316.npz', {
+        'keyphasor_rate': 3.125e6, 'pulses_per_revolution': 2, 'orders': [20.0, 40.0, 60.0],
+        'trigger_speed': 30.0, 'trigger_cycles': 10}, 0.0)}
+#: Effects, how to put them in, and their parameters at a size, for the prediction.
+KNOWN: Mapping[str, tuple[Make, Callable[[Bench, float], Mapping[str, Any]]]] = {
+    'excess_jitter': (excess_jitter, lambda bench, size: {'std': size}),
+    'correlated_jitter': (correlated_jitter, lambda bench, size: {
+        'std': size, 'correlation': _CORRELATION}),
+    'clock_skew': (clock_skew, lambda bench, size: {'skew': size}),
+    'path_delay': (path_delay, lambda bench, size: {'delay': size}),
+    'missing_pulses': (missing_pulses, lambda bench, size: {'probability': size}),
+    'phase_wander': (phase_wander, lambda bench, size: {'std': size, 'bandwidth': 0.2}),
+    'speed_fluctuation': (speed_fluctuation, lambda bench, size: {'acceleration_std': size}),
+    'keyphasor_quantisation': (keyphasor_quantisation, lambda bench, size: {
+        'clock_rate': 1.0 / size}),
+    'interpolation_loss': (interpolation_loss, lambda bench, size: {'method': 'linear'}),
+    'additive_noise': (additive_noise, lambda bench, size: {'std': size}),
+    'amplitude_modulation': (amplitude_modulation, lambda bench, size: {'std': size}),
+    'interfering_tone': (interfering_tone, lambda bench, size: {
+        'frequency': _tone(bench), 'amplitude': size})}
+# with as large a standard deviation as correlated jitter, which has the same second moments
+UNKNOWN: Mapping[str, Make] = {'hum': hum, 'late_recovery': late_recovery}
+_FIRST = {'excess_jitter': 1e-8, 'correlated_jitter': 1e-8, 'clock_skew': 1e-8, 'path_delay': 1e-5,
+          'missing_pulses': 1e-4, 'phase_wander': 1e-5, 'speed_fluctuation': 1e-3,
+          'keyphasor_quantisation': 1e-7, 'additive_noise': 1e-5, 'amplitude_modulation': 1e-4,
+          'interfering_tone': 1e-5}
+
+
+def size_of(name: str, bench: Bench, change: float) -> float | None:
+    """Return the size with which an effect changes the worst line by so much, None if at none."""
+    if name == 'interpolation_loss':
+        return 1.0
+    keywords = {**bench.model, 'sample_rate': bench.rate, 'effects': {}}
+    if name == 'keyphasor_quantisation':  # it replaces the declared jitter
+        keywords['keyphasor_rate'] = 1e9
+    plain = sa.predict(**keywords)
+    size = _FIRST[name]
+    for _ in range(_STEPS):
+        try:
+            with_it = sa.predict(**{**keywords, 'effects': {name: KNOWN[name][1](bench, size)}})
+        except SaJitterError:
+            return None
+        moved = max(float(np.abs(getattr(with_it, key) - getattr(plain, key)).max())
+                    for key in ('mean_attenuation', 'standard_deviation'))
+        if moved >= change:
+            return size
+        size *= _STEP
+    return None
+
+
+def opened(title: str, data: Path) -> Bench:
+    """Return a measured machine, with uniform pulse errors of a clock's period added to it."""
+    name, model, jitter = MACHINES[title]
+    recording = read(data / name)
+    times = recording.reference_pulse_times
+    if times is None:
+        times = recording.keyphasor_pulses()
+    rng = np.random.default_rng(7)
+    samples = np.concatenate(list(recording.blocks(1 << 20)), axis=1)
+    bench = Bench(samples, recording.sample_rate, recording.start_time,
+                  times + jitter * rng.uniform(-0.5, 0.5, times.size), times, model, recording,
+                  1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        averages = sa.average(
+            samples, bench.rate, bench.times, start_time=bench.start, orders=model['orders'],
+            trigger_cycles=model['trigger_cycles'],
+            pulses_per_revolution=model.get('pulses_per_revolution', 1))
+    level = float(np.median([np.abs(item.amplitudes) for item in averages]))
+    return replace(bench, level=level)
+
+
+def close(bench: Bench, declared: str) -> Mapping[str, Any]:
+    """Return the report on a recording with its model, or that of a parameter file (text)."""
+    sections = yaml.safe_load(declared) if declared else {}
+    known = {key: value for section in sections.values()
+             for key, value in section['ros__parameters'].items()}
+    values = {**bench.model, **known, 'keyphasor_rate': bench.model['keyphasor_rate']}
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as name:
+        warnings.simplefilter('ignore')
+        path = Path(name, 'model.yaml')
+        path.write_text(yaml.safe_dump({'jitter_predictor': {'ros__parameters': values}}),
+                        encoding='utf-8')
+        return sa.close_loop(bench.made(), path).report
+
+
+def outcome(report: Mapping[str, Any], name: str, parameters: Mapping[str, Any]) -> str:
+    """Return what became of an effect: found, present, within its limit or missed."""
+    found = {item['name']: item for item in report['missing_effects']}
+    extra = sorted(found.keys() - {name})
+    text = ''
+    if name in found:
+        rest = [abs(item['value'] - parameters[key]) / item['standard_error']
+                for key, item in found[name]['parameters'].items()
+                if key in parameters and key != 'amplitude' and item['standard_error']]
+        text = 'found' + (f' ({max(rest):.1f} s.e.)' if rest else '')
+    elif any(name in item['indistinguishable_from'] for item in found.values()):
+        text = 'rival'
+    elif name in {item['name'] for item in report['present']}:
+        text = 'present'
+    elif report['verdict'] == 'unexplained':
+        text = 'unexplained'
+    elif any(name == _CHANGED.get(item['name'], item['name'])
+             for item in report['declared_changes']):
+        text = 'declared wrongly'
+    else:
+        limits = {item['name']: item for item in report['limits']}
+        text = _limit(limits.get(name), parameters)
+    return text + (f' + {", ".join(extra)}' if extra else '') + (
+        ' *unexplained*' if report['verdict'] == 'unexplained' and text != 'unexplained' else '')
+
+
+def _limit(limit: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -> str:
+    if limit is None:
+        return 'missed'
+    if limit['upper_95'] is None and limit['lower_95'] is None:
+        return 'no limit'
+    size = parameters.get(limit['parameter'])
+    if size is None or limit['upper_95'] is None:
+        return 'limit'
+    return 'within its limit' if limit['upper_95'] >= abs(size) else 'excluded'
+
+
+def run(title: str, bench: Bench, name: str, change: float, declared: str
+        ) -> Mapping[str, Any]:
+    """Put an effect in, close the loop and return what came out."""
+    like = 'correlated_jitter' if name in UNKNOWN else name
+    size = size_of(like, bench, change)
+    row = {'machine': title, 'effect': name, 'change': change, 'size': size}
+    if size is None:
+        return {**row, 'outcome': 'changes nothing'}
+    rng = np.random.default_rng([round(1e3 * change), *name.encode()])
+    make = UNKNOWN[name] if name in UNKNOWN else KNOWN[name][0]
+    start = time.process_time()
+    try:
+        report = close(make(bench, rng, size), declared)
+    except SaJitterError as error:
+        return {**row, 'outcome': 'refused', 'error': str(error)}
+    parameters = {} if name in UNKNOWN else dict(KNOWN[name][1](bench, size))
+    if name == 'additive_noise':  # reported in the unit of the vibration
+        parameters['std'] *= bench.level
+    return {**row, 'outcome': outcome(report, name, parameters), 'verdict': report['verdict'],
+            'found': [item['name'] for item in report['missing_effects']],
+            'before': report['error_before']['rms'], 'after': report['error_after']['rms'],
+            'cpu': time.process_time() - start}
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the outcomes in Markdown, a row for each machine and effect."""
+    sizes = list(dict.fromkeys(row['change'] for row in rows))
+    lines = ['| machine | put in | ' + ' | '.join(f'{size:g}' for size in sizes) + ' |',
+             '|---|---|' + '---|' * len(sizes)]
+    for machine, effect in dict.fromkeys((row['machine'], row['effect']) for row in rows):
+        some = {row['change']: row['outcome'] for row in rows
+                if (row['machine'], row['effect']) == (machine, effect)}
+        lines.append(f'| {machine} | {effect} | '
+                     + ' | '.join(some.get(size, '-') for size in sizes) + ' |')
+    return '\n'.join(lines)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__,
+                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--data', type=Path, required=True, help='folder of the recordings')
+    parser.add_argument('--sizes', type=float, nargs='+', default=SIZES)
+    parser.add_argument('--machines', nargs='+', default=list(MACHINES), choices=list(MACHINES))
+    parser.add_argument('--effects', nargs='+', default=[*KNOWN, *UNKNOWN],
+                        choices=[*KNOWN, *UNKNOWN])
+    options = parser.parse_args()
+    rows = []
+    for title in options.machines:
+        bench = opened(title, options.data)
+        first = close(bench, '')
+        declared = first.get('parameter_file') or ''
+        print(json.dumps({'machine': title, 'verdict': first['verdict'],
+                          'declared': [item['name'] for item in first['missing_effects']],
+                          'rms': first['error_after']['rms']}), file=sys.stderr, flush=True)
+        for name in options.effects:
+            for change in options.sizes:
+                rows.append(run(title, bench, name, change, declared))
+                print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+    print(table(rows))
+
+
+if __name__ == '__main__':
+    main()
