@@ -436,8 +436,7 @@ def _scatter(observation: Observation, processes: Sequence[AngleErrorProcess]) -
         pair = np.sum((waves @ joint) * waves.conj(), axis=-1) * np.exp(-2j * np.pi * turns * lag)
         found += (1.0 if lag == 0 else 2.0) * (count - lag) / count**2 * pair.real
     found[(np.abs(turns) >= _NEAR) | (sources[:, None] == observation.orders)] = 0.0
-    found = found.T
-    return np.maximum(found, 0.0)
+    return np.asarray(np.maximum(found.T, 0.0))
 
 
 def _of_lines(item: Acquisition, lines: Lines, source: _Source, channels: Array,

@@ -36,7 +36,6 @@ from sa_jitter_ros.effects.timing import Pattern, Spectrum
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import optimize, special
-from scipy.special import ndtr
 
 Array = NDArray[Any]
 
@@ -140,7 +139,8 @@ def largest(timing: Timing, name: str) -> Effect | None:
 def _folded(size: float, error: float) -> float:
     """Return the size of which an estimate of at most `size`, either sign, is as rare as 5 %."""
     def missed(true: float) -> float:
-        return float(ndtr(size / error - true) - ndtr(-size / error - true)) - (1.0 - _CONFIDENCE)
+        return float(special.ndtr(size / error - true) - special.ndtr(-size / error - true)) - (
+            1.0 - _CONFIDENCE)
 
     if error <= 0.0 or not math.isfinite(error):
         return size
