@@ -18,7 +18,7 @@ import sys
 from bench import SteadyClock
 import numpy as np
 import pytest
-from sa_jitter_ros.commands import check_keyphasor, close_loop, progress
+from sa_jitter_ros.commands import check_keyphasor, close_loop, loop_run, progress
 from sa_jitter_ros.parameter_file import shipped
 
 
@@ -48,6 +48,16 @@ def test_loop_refuses_a_folder_that_it_cannot_write_before_it_reads(tmp_path, ca
     assert close_loop.main([*arguments, str(tmp_path / 'new')]) == 2
     assert 'none.npz: no such file' in capsys.readouterr().err
     assert [item.name for item in tmp_path.iterdir()] == ['file']
+
+
+def test_stopped_loop_says_so_in_one_line_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    def stopped(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(loop_run, 'run', stopped)
+    assert close_loop.main(['rig.npz', '--declared', str(shipped('machine.yaml')), '--quiet',
+                            '--output', str(tmp_path / 'report')]) == 130
+    assert capsys.readouterr().err == 'close_loop: stopped before the report was written\n'
+    assert not (tmp_path / 'report' / 'report.json').exists()
 
 
 def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypatch):

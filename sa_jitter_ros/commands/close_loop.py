@@ -66,6 +66,9 @@ def main(args: Sequence[str] | None = None) -> int:
     except (SaJitterError, OSError) as error:
         progress.say(failure(error, options.output))
         return 2
+    except KeyboardInterrupt:
+        progress.say('stopped before the report was written')
+        return 130
     return show('close_loop', found, f'report: {options.output / "report.html"}')
 
 
