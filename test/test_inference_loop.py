@@ -249,7 +249,26 @@ def test_recording_without_lines_to_compare_says_what_it_cannot_exclude(shared_d
     assert upper['clock_skew'] > 0.0  # the timing is known, if badly
     assert upper['additive_noise'] is None  # there is no line
     assert {'additive_noise', 'amplitude_modulation'} <= set(content['undecided'])
-    assert 'missing_pulses' not in upper  # which the pulse times show
+    assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
+
+
+def test_pulse_times_alone_show_lost_pulses(rng, tmp_path):
+    whole = noise_alone(rng)
+    recording = replace(whole, pulse_times=np.delete(whole.pulse_times, [20, 41, 42, 77]))
+    found = trace([observe(recording, MODEL)], [recording])
+    content = report(found)
+    assert content['verdict'] == 'traced'
+    effect, = content['missing_effects']
+    assert effect['name'] == 'missing_pulses'
+    assert effect['parameters']['probability']['value'] == pytest.approx(
+        4.0 / (whole.pulse_times.size - 1))
+    assert content['error_after']['rms'] is None
+    assert 'missing_pulses' in summary(content)
+    html = report_files(found, content)['report.html'].decode()
+    assert 'The pulse times alone show missing_pulses' in html
+    # noise holds no line that a drift would move
+    upper = {item['name']: item['upper_95'] for item in content['limits']}
+    assert upper['clock_skew'] is None
 
 
 def test_residual_of_what_is_predicted_is_chance(rng):

@@ -156,6 +156,17 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
                       noise_density=scatter.noise_density[list(usable)]))
 
 
+def pulse_evidence(observation: Observation) -> Evidence:
+    """Return the evidence of the pulse times alone, without any acquisition."""
+    none = np.zeros(0)
+    nothing, no_cycles = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    return Evidence(
+        model=observation.model, pulses=(), errors=nothing, standard_errors=nothing,
+        ripple=nothing, ripple_standard_error=float('nan'), against_reference=False,
+        record_times=observation.pulses.times, record_missing=observation.pulses.missing,
+        clock=Clock(0.0, 0.0), lines=LineEvidence(none, none, none, nothing, no_cycles, none))
+
+
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     """Return the scatter of the amplitudes of the lines in all acquisitions."""
     model = observation.model

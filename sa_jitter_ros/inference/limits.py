@@ -64,9 +64,9 @@ class Limit:
     effect: Effect | None = None
 
 
-def limits(timing: Timing | None, evidence: Evidence | None, found: Sequence[str]
+def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
            ) -> tuple[Limit, ...]:
-    """Return the limit of each effect that was not `found`."""
+    """Return the limit of each effect that was not `found`; `evidence` may hold pulses alone."""
     rows = []
     for name, kind in EFFECTS.items():
         if name in found:
@@ -74,7 +74,8 @@ def limits(timing: Timing | None, evidence: Evidence | None, found: Sequence[str
         lower: float | None = None
         effect: Effect | None = None
         if issubclass(kind, DirectEffect):
-            effect = kind.limit(evidence) if evidence is not None else None
+            effect = kind.limit(evidence) if kind.visible_in_pulse_times or evidence.pulses else (
+                None)
         elif timing is None:
             pass
         elif name == JITTER:

@@ -118,6 +118,17 @@ class RecordFit:
     jitter_std: float
     expected_std: Array
 
+    @property
+    def held(self) -> bool:
+        """
+        Tell whether declared lines stand out of the noise, at the best of the slopes tried.
+
+        Only lines of known orders hold the angle to the pulses: others go along with any drift.
+        """
+        lines = np.abs(self.amplitudes[:, :self.declared])
+        power = np.sum((lines / self.amplitude_errors[:, :self.declared]) ** 2)
+        return bool(gammaincc(lines.size, 0.5 * power) < _FALSE / _SLOPES)
+
 
 def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
                measured: BoolArray, cycle_length: float, orders: Sequence[float],

@@ -83,7 +83,8 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             if here.stop - here.start < 3:
                 continue
             found.append(replace(_stretch(observation, number, here, clock, unit),
-                                 sidebands=_sidebands(fit, model)))
+                                 sidebands=_sidebands(fit, model),
+                                 held=fit.held or observation.against_reference))
     return found
 
 

@@ -105,8 +105,9 @@ class Chooser:
         self.setting = self.data.stretches[0].setting
         self.declared = {item.name: item for item in declared if item.timing is not None}
         self.patterns: dict[str, tuple[Pattern, Array]] = {}
+        held = any(item.held for item in stretches)
         for name, kind in EFFECTS.items():
-            if isinstance(kind.timing, Pattern):
+            if isinstance(kind.timing, Pattern) and (held or kind.timing.show_in_times):
                 columns = self._columns(kind.timing)
                 if columns is not None:
                     self.patterns[name] = kind.timing, columns

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import absent, Finding
+from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.effects.timing import Pattern, SOURCE
@@ -39,7 +39,7 @@ from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
-    channel_groups, choose_lines, gather_pulses, line_evidence)
+    channel_groups, choose_lines, gather_pulses, line_evidence, pulse_evidence)
 from sa_jitter_ros.inference.line_checks import check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
@@ -162,16 +162,14 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     """
     Return the trace of a recording whose lines cannot be compared.
 
-    Nothing is found. What of the timing its vibration excludes still has a limit; whatever that
-    leaves, and all that only lines show, is undecided.
+    What pulse times show by themselves is found. What of the timing the vibration excludes still
+    has a limit; whatever that leaves, and all that only lines show, is undecided.
     """
     count = len(observation.acquisitions)
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
     fit, held_out = parted(count)
     parts = stretches(observation, range(count), Clock(0.0, 0.0)) if observation.recoveries else []
     timing = read_timing(parts, declared, names=frozenset()) if parts else None
-    told = [name for name, kind in EFFECTS.items() if kind.visible_in_pulse_times]
-    rows = limits(timing, None, [*told, *(item.name for item in declared)])
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
         without, with_it = (predict(observation.model, known) for known in (
@@ -179,14 +177,23 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         return float(max(np.abs(getattr(with_it, name) - getattr(without, name)).max()
                          for name in ('mean_attenuation', 'standard_deviation')))
 
+    evidence, known = pulse_evidence(observation), [item.name for item in declared]
+    findings = [kind.fit(evidence) for kind in EFFECTS.values()
+                if issubclass(kind, DirectEffect) and kind.visible_in_pulse_times
+                and kind.name not in known and not kind.unmodelled(observation.model)]
+    found = [replace(item, largest_change=change(declared, item.effect)) for item in findings
+             if item.effect is not None]
+    rows = limits(timing, evidence, [*known, *(item.name for item in found)])
+
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
     undecided = tuple(row.name for row in rows if row.name in {
         *open_, *_undecided(change, declared, rows)})
     return Trace(
-        observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, (), (), (),
-        UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing,
-        None, 'none', float('nan'), None, None, rows, undecided,
-        {row.name: _PRIOR for row in rows}, reason)
+        observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
+        (), (), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing,
+        nothing, None, 'traced' if found else 'none', float('nan'), None, None, rows, undecided,
+        {row.name: _PRIOR for row in rows} | {item.name: 1.0 - item.p_value for item in found},
+        reason)
 
 
 def require_acquisitions(observation: Observation) -> None:

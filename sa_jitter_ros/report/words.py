@@ -53,10 +53,12 @@ def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
 
 def verdict_sentence(content: Mapping[str, Json]) -> str:
     """Return the verdict of a report in one sentence."""
-    if not content['lines']:
-        return ('Nothing was found, and nothing could have been seen: no line of the vibration '
-                'can be compared with its prediction.')
     names = _listed([item['name'] for item in content['missing_effects']], 'and')
+    if not content['lines']:
+        found = f'The pulse times alone show {names}; nothing else' if names else (
+            'Nothing was found, and nothing')
+        return (f'{found} could have been seen: no line of the vibration can be compared with its '
+                'prediction.')
     if content['verdict'] == 'none':
         return ('The declared model suffices: the averages lose what it predicts, within '
                 f'{_rms(content, "before")} of an amplitude.')
