@@ -175,6 +175,36 @@ def test_silence_is_reported(ros_graph, monkeypatch):
     assert values['average_age'] == '8.0'
 
 
+@pytest.mark.parametrize('silent', KINDS[1:])
+def test_indicators_that_stay_away_are_named(ros_graph, monkeypatch, silent):
+    clock, machine = SteadyClock(), DrawnMachine(9)
+    monkeypatch.setattr(health, 'time', clock)
+    b = MonitorBench(ros_graph, stale_after=5.0)
+    b.play(machine, 1)
+    for seconds, expected in ((4.0, OK), (4.0, WARN), (12.0, ERROR)):
+        clock.now += seconds
+        b.play(machine, 1, kinds=[kind for kind in KINDS if kind != silent])
+        level, text, values = b.diagnostics()
+        assert level == expected
+        assert (f'no /input/{silent} for' in text) == (expected != OK)
+    assert (values['average_age'], values[f'{silent}_age']) == ('0.0', '20.0')
+    b.play(machine, 1)
+    assert b.diagnostics()[0] == OK
+
+
+def test_each_shaft_is_watched(ros_graph, monkeypatch):
+    clock, machine = SteadyClock(), DrawnMachine(9)
+    monkeypatch.setattr(health, 'time', clock)
+    b = MonitorBench(ros_graph, stale_after=5.0, shafts=('input', 'output'))
+    for shaft in ('input', 'output'):
+        b.play(machine, 1, shaft=shaft)
+    clock.now += 8.0
+    b.play(machine, 1)
+    level, text, values = b.diagnostics()
+    assert (level, text.partition(':')[0]) == (WARN, 'no /output/order_amplitude for 8 s')
+    assert (values['input.average_age'], values['output.average_age']) == ('0.0', '8.0')
+
+
 def test_parameters_that_do_not_fit_are_refused(ros_graph):
     with pytest.raises(ParameterError, match='learn at least 8 groups, 80 averages'):
         MonitorBench(ros_graph, learning_averages=79, group_averages=10)

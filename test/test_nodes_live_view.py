@@ -34,7 +34,7 @@ from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import live_view_board as board
 from sa_jitter_ros.nodes import live_view_server as server
-from sa_jitter_ros.nodes import messages
+from sa_jitter_ros.nodes import health, messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.live_view_server import is_name_of_this_machine, PORTS_TRIED
@@ -582,6 +582,25 @@ def test_the_port_is_free_again_after_the_node(ros_graph):
         assert probe.connect_ex(('127.0.0.1', port)) != 0
 
 
+def test_what_stays_away_is_named(bench, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(health, 'time', clock)
+    b = bench(stale_after=5.0, shafts=['shaft', 'other'])
+    publish_all(b)
+    b.graph.node.destroy_publisher(b.graph.publisher('prediction', Float64MultiArray))
+    assert b.spin(lambda: not b.node.count_publishers('prediction'))
+    clock.now += 8.0
+    b.send('shaft/order_amplitude', average(
+        'order_amplitude', amplitudes(), messages.AMPLITUDE_FIELDS))
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    for name in ('/prediction', '/other/order_amplitude', '/shaft/condition_indicator',
+                 '/shaft/pulse_error'):
+        assert f'no {name} ' in text
+    assert '/change' not in text  # is latched, and its publisher is there
+    assert values['shaft.average_age'] == '0.0'
+
+
 def test_labels_change_while_it_runs(bench):
     b = bench()
     assert b.set_parameter('vibration_unit', 'g') == (True, '')
@@ -695,7 +714,8 @@ def test_the_browser_shows_the_numbers(bench):
 
 # Keeps a cursor, saves what a chart shows, and tells the server what it found.
 TEST_PAGE = """<!DOCTYPE html><html><head><link rel="stylesheet" href="style.css">
-<script type="module" src="test.js"></script></head><body><section><div id="box"></div></section>
+<script type="module" src="test.js"></script></head><body><section><div id="both"><div id="box"></div>
+<div id="map"></div></div></section>
 </body></html>"""
 TEST_SCRIPT = """
 import {Chart, linear} from './charts.js';
@@ -712,7 +732,17 @@ const chart = new Chart(box, 200, () => {
   chart.curve('raw', i => i, [0, 1, 0, 1]);
   chart.follow(position => { found.seen.push(position); });
 });
-addButtons(box, () => ({columns: ['x'], rows: [[1]]}), () => 'file');
+const dot = document.createElement('canvas');
+dot.width = dot.height = 300;
+const noise = dot.getContext('2d').createImageData(300, 300);
+noise.data.forEach((_, i, data) => { data[i] = i % 4 % 2 ? 190 + 65 * Math.random() : 0; });
+noise.data.forEach((_, i, data) => { if (i % 4 === 3) data[i] = 255; });
+dot.getContext('2d').putImageData(noise, 0, 0);
+new Chart(document.getElementById('map'), 200, map => {
+  map.axes({x: linear([0, 10]), y: linear([0, 1]), xLabel: 'x', yLabel: 'y'});
+  map.picture(dot.toDataURL());
+});
+addButtons(document.getElementById('both'), () => ({columns: ['x'], rows: [[1]]}), () => 'file');
 const wait = time => new Promise(done => setTimeout(done, time));
 await wait(200);
 const place = chart.svg.getBoundingClientRect();
@@ -734,9 +764,10 @@ canvas.canvas.width = picture.width;
 canvas.canvas.height = picture.height;
 canvas.drawImage(picture, 0, 0);
 const pixels = canvas.getImageData(0, 0, picture.width, picture.height).data;
-found.red = false;
+Object.assign(found, {red: 0, green: 0});
 for (let i = 0; i < pixels.length; i += 4) {
-  if (pixels[i] > 180 && pixels[i + 1] < 100 && pixels[i + 2] < 80) found.red = true;
+  found.red += pixels[i] > 180 && pixels[i + 1] < 100 && pixels[i + 2] < 80;
+  found.green += pixels[i] < 10 && pixels[i + 1] > 180 && pixels[i + 2] < 10;
 }
 fetch(`found?${encodeURIComponent(JSON.stringify(found))}`);
 """
@@ -762,8 +793,9 @@ def test_charts_keep_a_cursor_and_are_saved_as_csv_and_png(bench, monkeypatch, t
     # clicked, drawn again, pointed elsewhere
     np.testing.assert_allclose(found['seen'][-3:], 0.5, atol=2e-3)
     assert (found['name'], found['text']) == ('file.png', 'x\n1\n')
-    assert found['size'][:2] == [found['size'][2], 400]
+    assert found['size'][:2] == [found['size'][2], 800]
     assert found['red']
+    assert found['green'] == (found['size'][2] - 2 * 76) * 2 * 136  # the pixels within its axes
 
 
 def test_malformed_report_does_not_disturb_the_page(bench):

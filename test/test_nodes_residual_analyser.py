@@ -22,7 +22,7 @@ from sa_jitter_ros.errors import ModelError, ParameterError, SignalError
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
 from sa_jitter_ros.inference.online_trace import trace_averages
-from sa_jitter_ros.nodes import messages, residual_analyser
+from sa_jitter_ros.nodes import health, messages, residual_analyser
 from sa_jitter_ros.nodes.base import LATCHED_QOS
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor, prediction_message
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
@@ -233,7 +233,7 @@ class AnalyserBench(NodeBench):
             prediction_message(predict(replace(MODEL, **changes)))))
         self.settle()
 
-    def average(self, averages, *, corrected=True):
+    def average(self, averages, *, corrected=True, pulses=True):
         """Publish averages."""
         for number, item in enumerate(averages):
             header = messages.AverageHeader(
@@ -247,7 +247,7 @@ class AnalyserBench(NodeBench):
                 table[..., 3:7] = np.nan
             self.send('shaft/order_amplitude', messages.encode_average(
                 'order_amplitude', messages.AverageMessage(header, table)))
-            if corrected:
+            if corrected and pulses:
                 self.send('shaft/pulse_error', messages.encode_average(
                     'pulse_error', messages.AverageMessage(header, item.pulses)))
         self.settle()
@@ -385,6 +385,36 @@ def test_averages_with_unresolved_pulses_are_counted(bench):
     assert b.spin(lambda: b.reported('8 of 8 averages have pulses whose error the vibration'))
     assert b.spin(lambda: b.diagnostics()[2]['averages_not_traced'] == '12')
     assert b.diagnostics()[2]['averages_with_unresolved_pulses'] == '10'
+
+
+def test_silent_inputs_are_named(bench, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(health, 'time', clock)
+    b = bench(stale_after=5.0)
+    b.predict()
+    b.average(synthetic(1))
+    assert b.diagnostics()[0] == b'\x00'
+    for seconds, expected in ((8.0, b'\x01'), (12.0, b'\x02')):
+        clock.now += seconds
+        b.average(synthetic(1), pulses=False)
+        level, text, _ = b.diagnostics()
+        assert (level, 'no /shaft/pulse_error for' in text) == (expected, True)
+        assert 'prediction' not in text  # it is latched
+    b.average(synthetic(1), corrected=False)  # has no pulse errors
+    assert 'pulse_error' not in b.diagnostics()[1]
+    b.average(synthetic(1))
+    assert 'no /' not in b.diagnostics()[1]
+    b.graph.node.destroy_publisher(b.graph.publisher('prediction', Float64MultiArray))
+    assert b.spin(lambda: not b.node.count_publishers('prediction'))
+    for seconds, expected, silence in ((8.0, b'\x01', 8), (12.0, b'\x02', 20)):
+        clock.now += seconds
+        b.average(synthetic(1))
+        level, text, _ = b.diagnostics()
+        assert (level, text.partition(': start')[0]) == (
+            expected, f'no /prediction for {silence} s: nobody publishes it')
+    again = b.graph.node.create_publisher(Float64MultiArray, 'prediction', LATCHED_QOS)
+    again.publish(messages.encode_prediction(prediction_message(predict(MODEL))))
+    assert b.spin(lambda: 'no /' not in b.diagnostics()[1])
 
 
 def test_bad_messages_are_counted(bench):

@@ -254,6 +254,9 @@ class MonitoringNode(Node):
         self._find_crowds()
         grown = [key for key, count in self.counts.items() if count > self._reported.get(key, 0)]
         faults = [*self.faults.values(), *self._incompatibilities()]
+        for flow in self.health.flows.values():
+            if flow.once and self.count_publishers(flow.what):
+                flow.lasts()
         silent = self.health.silent(self.get_parameter(STALE_AFTER.name).value
                                     if self.takes_data else 0.0)
         for _, flow in silent:

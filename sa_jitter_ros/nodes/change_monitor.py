@@ -24,6 +24,7 @@ from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import decode_average
+from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64MultiArray, String
 
@@ -70,9 +71,7 @@ class ChangeMonitor(MonitoringNode):
             for kind in KINDS:
                 self.create_input(Float64MultiArray, f'{shaft}/{kind}',
                                   partial(self._on_array, shaft, kind))
-        self._average_flow = self.watch_input(
-            'average', f'{shafts[0]}/order_amplitude',
-            'has it vibration and pulses? (see its status)')
+        self._flows = ResultFlows(self, shafts, KINDS[1:])
         self.parameters.watch(check=Settings.of, apply=self._apply)
         self._publish()
         if self._monitor is not None:
@@ -106,9 +105,7 @@ class ChangeMonitor(MonitoringNode):
 
     def _on_array(self, shaft: str, kind: str, message: Float64MultiArray) -> None:
         decoded = decode_average(kind, message)
-        if kind == KINDS[0]:
-            self._average_flow.came()
-            self._average_flow.allowance = decoded.header.end_time - decoded.header.start_time
+        self._flows.came(shaft, kind, decoded)
         if self._monitor is None:
             return
         try:

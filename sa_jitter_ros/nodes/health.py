@@ -40,8 +40,8 @@ class Flow:
     `look_at` says where the cause of silence may lie, `cause` what is known of it. Silence is
     judged if `judged`. It counts from `since` or the last data. What is made of other flows,
     `after`, is judged while these flow: `since` is when they began. Silence may last `allowance`
-    (s) longer than that of others. Data that come `once` are not repeated: only the first are
-    waited for.
+    (s) longer than that of others. Data that come `once` are not repeated: they last while their
+    publisher is there (`lasts`). What is `optional` is missed only after it came.
     """
 
     name: str
@@ -50,6 +50,7 @@ class Flow:
     judged: bool = True
     after: tuple[str, ...] = ()
     once: bool = False
+    optional: bool = False
     allowance: float = 0.0
     cause: str = ''
     since: float = field(default_factory=lambda: time.monotonic())
@@ -60,6 +61,11 @@ class Flow:
     def came(self) -> None:
         """Note that data came now."""
         self.last = time.monotonic()
+
+    def lasts(self) -> None:
+        """Note that the publisher of what came once is there now."""
+        if not math.isnan(self.last):
+            self.since = time.monotonic()
 
     @property
     def age(self) -> float:
@@ -73,8 +79,8 @@ class Flow:
 
     def level(self, stale_after: float) -> Level:
         """Return how severe the silence is."""
-        seen = not math.isnan(self.last)
-        if stale_after <= 0.0 or not self.judged or (self.once and seen):
+        if stale_after <= 0.0 or not self.judged or (
+                self.optional and math.isnan(self.last)):
             return Level.OK
         silence = self.silence - self.allowance
         if silence > ERROR_FACTOR * stale_after:
@@ -104,10 +110,10 @@ class Health:
         """
         Return the age of each flow in s as a text, `nan` before its first data.
 
-        Flows that are neither judged nor ever came mean nothing to the node.
+        Flows that never came and are not judged, or optional, mean nothing to the node.
         """
         return {f'{flow.name}_age': f'{flow.age:.1f}' for flow in self.flows.values()
-                if flow.judged or not math.isnan(flow.last)}
+                if (flow.judged and not flow.optional) or not math.isnan(flow.last)}
 
     def silent(self, stale_after: float) -> list[tuple[Level, Flow]]:
         """Return the silent flows, the worst first."""
@@ -131,7 +137,8 @@ class Health:
                 flow.reported = level
                 if self._flowing:
                     lines.append((Level.OK, f'{flow.what} continues'))
-        arrived = [flow for flow in self.flows.values() if flow.judged and not flow.after]
+        arrived = [flow for flow in self.flows.values()
+                   if flow.judged and not (flow.after or flow.optional)]
         if not self._flowing and arrived and not any(math.isnan(flow.last) for flow in arrived):
             self._flowing = True
             lines.append((Level.OK, f'data flow: {", ".join(flow.what for flow in arrived)}'))

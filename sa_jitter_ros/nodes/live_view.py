@@ -21,7 +21,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, RESULT_QOS, run_node
-from sa_jitter_ros.nodes.health import Flow
 from sa_jitter_ros.nodes.live_view_board import (
     amplitude_rows, Attenuations, Board, CHANNELS, INDICATORS, indicators_content, OrderMap,
     ORDERS, orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content,
@@ -29,6 +28,7 @@ from sa_jitter_ros.nodes.live_view_board import (
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
 from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
                                           PREDICTION_FIELDS, RESIDUAL_FIELDS)
+from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
 
@@ -68,10 +68,11 @@ class LiveView(MonitoringNode):
         self._apply(values)
         for shaft in values['shafts']:
             self._watch_shaft(shaft)
-        self._average_flow = self.watch_input(
-            'average', f'{values["shafts"][0]}/order_amplitude',
-            'has it vibration and pulses? (see its status)')
-        self._prediction_flow = self.health.add(Flow('prediction', 'prediction', judged=False))
+        self._flows = ResultFlows(
+            self, values['shafts'], ['condition_indicator', 'pulse_error'])
+        self._prediction_flow, self._change_flow = (
+            self.watch_input(name, name, f'see the status of the {node}', once=True, optional=True)
+            for name, node in (('prediction', 'predictor'), ('change', 'change monitor')))
         # Several shafts have a prediction each, and an analyser each if their topics are remapped.
         for prefix in ('', *(f'{shaft}/' for shaft in values['shafts'])):
             for kind, topic, callback, qos in (
@@ -121,6 +122,7 @@ class LiveView(MonitoringNode):
 
         def on_indicators(message: Float64MultiArray) -> None:
             average = decode_average('condition_indicator', message)
+            self._flows.came(shaft, 'condition_indicator', average)
             self._board.put(f'{shaft}/condition_indicator', partial(indicators_content, average))
             values = average.values[:CHANNELS, :INDICATORS]
             if average.names:
@@ -140,8 +142,7 @@ class LiveView(MonitoringNode):
         def on_orders(message: Float64MultiArray) -> None:
             average = decode_average('order_amplitude', message)
             self._averages += 1
-            self._average_flow.came()
-            self._average_flow.allowance = average.header.end_time - average.header.start_time
+            self._flows.came(shaft, 'order_amplitude', average)
             names, channels = self._labels['channel_names'], len(average.values)
             self.set_missing('names of the channels', (
                 f'channel_names has {len(names)} and {shaft} has {channels} channels: name each'
@@ -156,6 +157,7 @@ class LiveView(MonitoringNode):
 
         def on_pulses(message: Float64MultiArray) -> None:
             average = decode_average('pulse_error', message)
+            self._flows.came(shaft, 'pulse_error', average)
             self._board.put(f'{shaft}/pulse_error', partial(
                 pulses_content, average, errors.add(average.values)))
 
@@ -171,8 +173,9 @@ class LiveView(MonitoringNode):
     def _on_prediction(self, topic: str, message: Float64MultiArray) -> None:
         prediction = decode_prediction(message)
         self._prediction_flow.came()
-        if not self._average_flow.allowance and prediction.trigger_speed > 0.0:
-            self._average_flow.allowance = prediction.trigger_cycles / prediction.trigger_speed
+        self._prediction_flow.what = self.resolve_topic_name(topic)
+        if prediction.trigger_speed > 0.0:
+            self._flows.expect(prediction.trigger_cycles / prediction.trigger_speed)
         self._board.put(topic, partial(table_content, prediction, PREDICTION_FIELDS), data=False)
 
     def _on_residual(self, topic: str, message: Float64MultiArray) -> None:
@@ -190,6 +193,8 @@ class LiveView(MonitoringNode):
             raise MessageError(f'the text is no JSON: {error}') from None
         if not isinstance(report, dict):
             raise MessageError(f'the text is a JSON {type(report).__name__}: send an object')
+        if topic == 'change':
+            self._change_flow.came()
         self._board.put(topic, lambda: report, data=False)
 
     def _on_speed(self, message: Float64) -> None:

@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 import json
 import threading
 import time
@@ -36,6 +37,7 @@ from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)
 from sa_jitter_ros.nodes.parameters import as_ros_parameter, require_node_name
+from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.report import report
@@ -87,9 +89,9 @@ class ResidualAnalyser(MonitoringNode):
         self.create_input(Float64MultiArray, f'{shaft}/pulse_error', self._on_pulse_error)
         # A predictor of several shafts publishes one prediction for each.
         for topic in ('prediction', f'{shaft}/prediction'):
-            self.create_input(Float64MultiArray, topic, self._on_prediction, LATCHED_QOS)
-        self._average_flow = self.watch_input(
-            'average', f'{shaft}/order_amplitude', 'has it vibration and pulses? (see its status)')
+            self.create_input(Float64MultiArray, topic, partial(self._on_prediction, topic),
+                              LATCHED_QOS)
+        self._flows = ResultFlows(self, [shaft], ['pulse_error'])
         self._prediction_flow = self.watch_input(
             'prediction', 'prediction', 'see the status of the predictor', once=True)
         self.create_steady_timer(_PERIOD, lambda: self._step())
@@ -106,8 +108,7 @@ class ResidualAnalyser(MonitoringNode):
     def _on_average(self, message: Float64MultiArray) -> None:
         decoded = decode_average('order_amplitude', message)
         average = average_of(decoded)
-        self._average_flow.came()
-        self._average_flow.allowance = average.end_time - average.start_time
+        self._flows.came(self._values['shaft'], 'order_amplitude', decoded)
         corrected = bool(np.isfinite(average.attenuation).any())
         interrupted = bool(decoded.header.discarded_cycles)
         if interrupted:
@@ -129,6 +130,7 @@ class ResidualAnalyser(MonitoringNode):
 
     def _on_pulse_error(self, message: Float64MultiArray) -> None:
         received = decode_average('pulse_error', message)
+        self._flows.came(self._values['shaft'], 'pulse_error', received)
         if received.header.discarded_cycles:
             return
         values = received.values[:, :3]  # time, error and its standard error
@@ -141,7 +143,7 @@ class ResidualAnalyser(MonitoringNode):
         while len(self._pulses) > 2 * self._batch.size + 10:
             del self._pulses[next(iter(self._pulses))]
 
-    def _on_prediction(self, message: Float64MultiArray) -> None:
+    def _on_prediction(self, topic: str, message: Float64MultiArray) -> None:
         received = decode_prediction(message)
         table = received.values
         if not (np.isfinite(table[:, :4]).all() and received.trigger_speed > 0.0
@@ -149,8 +151,8 @@ class ResidualAnalyser(MonitoringNode):
             raise MessageError(f'prediction at {received.trigger_speed} Hz: send finite numbers, '
                                'a positive speed and a positive keyphasor rate')
         self._prediction_flow.came()
-        if not self._average_flow.allowance:
-            self._average_flow.allowance = received.trigger_cycles / received.trigger_speed
+        self._prediction_flow.what = self.resolve_topic_name(topic)
+        self._flows.expect(received.trigger_cycles / received.trigger_speed)
         self._prediction = Published(
             table[:, 0], table[:, 1], table[:, 3], received.trigger_speed,
             received.keyphasor_rate, received.trigger_cycles, received.ratio,

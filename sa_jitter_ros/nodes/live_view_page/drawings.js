@@ -113,7 +113,7 @@ export function drawAttenuation(chart) {
                                       row.predicted?.high]);
   chart.axes({
     x: orderAxis(chart, rows), xLabel: `order of ${find('shaft').value}`,
-    y: linear(range(values, {include: [1]})), yLabel: 'attenuation [1]',
+    y: linear(range(values, {include: [1]})), yLabel: 'attenuation',
     title: note || channelName(channel())});
   chart.level('zero', 1);
   rows.forEach((row, i) => {
@@ -180,7 +180,7 @@ export function drawResidual(chart) {
   chart.axes({
     x: places(orders.map(order => format(order, 6)), chart.inner), xLabel: `order of ${find('shaft').value}`,
     y: linear(range([...before, ...after, ...bars], {include: [0]})),
-    yLabel: 'observed − predicted [1]'});
+    yLabel: 'observed − predicted'});
   chart.level('zero', 0);
   const at = order => orders.indexOf(order);
   lines.forEach((line, i) => {

@@ -22,13 +22,14 @@ function save(blob, name) {
   setTimeout(() => URL.revokeObjectURL(link.href), 10000);
 }
 
-// A copy of a picture that needs no style sheet.
+// A copy of a picture that needs no style sheet, without the pixels in it, which come after it.
 function standalone(svg) {
   const copy = svg.cloneNode(true), targets = copy.querySelectorAll('*');
   svg.querySelectorAll('*').forEach((node, i) => {
     const style = getComputedStyle(node);
     for (const key of DRAWN_BY) targets[i].setAttribute(key, style.getPropertyValue(key));
   });
+  copy.querySelectorAll('image').forEach(node => node.remove());
   copy.setAttribute('width', svg.clientWidth);
   return new Blob([new XMLSerializer().serializeToString(copy)], {type: 'image/svg+xml'});
 }
@@ -44,12 +45,22 @@ export async function png(svgs, name, background) {
   context.fillRect(0, 0, canvas.width, canvas.height);
   context.scale(SCALE, SCALE);
   let top = 0;
-  for (const [i, svg] of svgs.entries()) {
-    const image = new Image(), url = URL.createObjectURL(standalone(svg));
-    image.src = url;
+  context.imageSmoothingEnabled = false;
+  const draw = async (address, ...place) => {
+    const image = new Image();
+    image.src = address;
     await image.decode();
-    context.drawImage(image, 0, top, svg.clientWidth, heights[i]);
+    context.drawImage(image, ...place);
+  };
+  for (const [i, svg] of svgs.entries()) {
+    const url = URL.createObjectURL(standalone(svg));
+    await draw(url, 0, top, svg.clientWidth, heights[i]);
     URL.revokeObjectURL(url);
+    for (const node of svg.querySelectorAll('image')) {
+      const [x, y, width, height] = ['x', 'y', 'width', 'height'].map(
+        key => Number(node.getAttribute(key)));
+      await draw(node.getAttribute('href'), x, top + y, width, height);
+    }
     top += heights[i];
   }
   canvas.toBlob(blob => save(blob, name), 'image/png');

@@ -25,7 +25,11 @@ function spectra() {
 
 export function drawSpectrum(chart) {
   const shown = spectra();
-  if (!shown.length) { chart.empty(missing()); return; }
+  if (!shown.length) {
+    find('spectrum-note').textContent = '';
+    chart.empty(missing());
+    return;
+  }
   const peak = Math.max(...shown.flatMap(([, amplitudes]) => finite(amplitudes)));
   const most = Math.max(...shown.map(([, amplitudes]) => amplitudes.length));
   const x = linear([0, most + 1], Math.max(4, Math.min(12, chart.inner / 70)));
@@ -73,6 +77,7 @@ export function spectrumTable() {
 const trendCharts = new Map();  // by choice: 'order 19', 'indicator rms'
 let chosen = null;  // until somebody chooses: strongest order, first indicator, what has changed
 const MOST_CHANGED = 4;
+const LEAST_STEP = 6;  // pixels from average to average that leave room for error bars
 
 const namesOf = kind => ofShaft(kind === 'order' ? 'raw_trend' : 'indicator_trend')?.names ?? [];
 const choices = () => ['order', 'indicator'].flatMap(
@@ -149,7 +154,7 @@ function drawTrend(chart, choice) {
     x: linear([-(span || 1) / size * 1.03, 0.02 * (span || 1) / size],
               Math.max(4, Math.min(10, chart.inner / 80))),
     xLabel: `end of the average before the last one [${letter}]`, y: linear(range(limits), 4),
-    yLabel: measure ? `amplitude [${measure}]` : name,
+    yLabel: `${choice.startsWith('order ') ? 'amplitude' : name}${measure ? ` [${measure}]` : ''}`,
     title: name + (change ? `: ${changeText(change)} since average ${change.since_sequence}` : '')});
   if (change && change.since_time >= first) {
     chart.upright('change', (change.since_time - last) / size,
@@ -157,9 +162,15 @@ function drawTrend(chart, choice) {
   }
   for (const [kind, time, values, errors] of curves) {
     const xs = time.map(item => (item - last) / size);
+    const dense = LEAST_STEP * xs.length > chart.inner;  // bars would touch
+    if (dense) {
+      chart.between(`spread ${kind}`, i => xs[i], ...[-2, 2].map(width => values.map((value, i) =>
+        known(value) && known(errors[i]) ? value + width * errors[i] : null)));
+    }
     chart.curve(`thin ${kind}`, i => xs[i], values);
     values.forEach((value, i) => chart.mark(kind, xs[i], value, {
-      size: 2, square: kind === 'corrected', error: known(errors[i]) ? 2 * errors[i] : null,
+      size: dense ? 0.7 : 2, square: kind === 'corrected',
+      error: known(errors[i]) && !dense ? 2 * errors[i] : null,
       tip: `average that ended at ${format(time[i], 9)} s: ${kind} `
         + `${withError(value, errors[i])} ${measure}`}));
   }

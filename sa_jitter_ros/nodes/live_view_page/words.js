@@ -75,8 +75,8 @@ function fill(table, headings, rows) {
 export function drawOrders() {
   const right = text => [text, 'number'];
   fill(find('orders'), [
-    'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation [1]',
-    'predicted [1]', '5 % to 95 % [1]', 'in band'].map(right), orderRows().map(row => {
+    'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation',
+    'predicted', '5 % to 95 %', 'in band'].map(right), orderRows().map(row => {
     const inside = inBand(row), band = row.predicted;
     return [...[format(row.order, 6), withError(row.raw_amplitude, row.raw_standard_error),
                 withError(row.corrected_amplitude, row.corrected_standard_error),
