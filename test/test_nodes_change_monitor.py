@@ -12,14 +12,18 @@
 
 from contextlib import contextmanager
 import json
+import os
 from pathlib import Path
+import subprocess
+import sys
 
 from bench import NodeBench, SteadyClock
 from diagnostic_msgs.msg import DiagnosticStatus
 from drawn_machine import DrawnMachine
 import numpy as np
 import pytest
-from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.monitoring.baseline_file import lock_baseline
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.nodes import health, messages
 from sa_jitter_ros.nodes.change_monitor import baseline_path, ChangeMonitor
@@ -264,6 +268,36 @@ def test_corrupt_file_is_refused_and_kept(learned, capfd):
     assert path.read_bytes() == before
 
 
+def test_second_monitor_of_a_file_is_refused_until_the_first_has_ended(learned):
+    machine, path, content = learned
+    with running(baseline_file=str(path)):
+        before = path.read_bytes()
+        with running(baseline_file=str(path)) as b:
+            level, text, _ = b.diagnostics()
+            assert (level, text) == (
+                ERROR, f'{path}: process {os.getpid()} keeps its baseline there: end that one, or '
+                'give another baseline_file')
+            b.play(machine, 60)
+        assert path.read_bytes() == before
+    with running(baseline_file=str(path)) as b:
+        assert b.change() == content
+
+
+def test_lock_of_a_file_ends_with_its_process(tmp_path):
+    path = tmp_path / 'baseline.npz'
+    process = subprocess.Popen(
+        [sys.executable, '-c', 'import sys, time\nfrom pathlib import Path\n'
+         'from sa_jitter_ros.monitoring.baseline_file import lock_baseline\n'
+         'lock = lock_baseline(Path(sys.argv[1]))\nprint(flush=True)\ntime.sleep(600.0)',
+         str(path)], stdout=subprocess.PIPE)
+    assert process.stdout.readline()
+    with pytest.raises(RecordingError, match=f'process {process.pid} keeps'):
+        lock_baseline(path)
+    process.kill()
+    process.communicate()
+    lock_baseline(path).close()
+
+
 def test_baseline_of_another_machine_is_refused_and_kept(learned):
     machine, path, _ = learned
     before = path.read_bytes()
@@ -296,7 +330,7 @@ def test_baseline_survives_a_restart_without_any_setting(tmp_path, monkeypatch):
         with running(**{**usual, **other}) as b:
             assert b.change()['baseline'] == {'averages': 0, 'complete': False}
             b.play(machine, 60)
-    assert {item.name for item in path.parent.iterdir()} == {
+    assert {item.name for item in path.parent.glob('[!.]*')} == {
         path.name, 'pump%204.change_monitor.npz'}
 
 

@@ -32,9 +32,10 @@ import numpy as np
 import pytest
 from rclpy.parameter import Parameter
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.nodes import health
 from sa_jitter_ros.nodes import live_view_board as board
 from sa_jitter_ros.nodes import live_view_server as server
-from sa_jitter_ros.nodes import health, messages
+from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS, LATCHED_QOS, RESULT_QOS
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.live_view_server import is_name_of_this_machine, PORTS_TRIED
@@ -714,7 +715,8 @@ def test_the_browser_shows_the_numbers(bench):
 
 # Keeps a cursor, saves what a chart shows, and tells the server what it found.
 TEST_PAGE = """<!DOCTYPE html><html><head><link rel="stylesheet" href="style.css">
-<script type="module" src="test.js"></script></head><body><section><div id="both"><div id="box"></div>
+<script type="module" src="test.js"></script></head><body><section>
+<div id="both"><div id="box"></div>
 <div id="map"></div></div></section>
 </body></html>"""
 TEST_SCRIPT = """

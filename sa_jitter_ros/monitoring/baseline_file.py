@@ -19,11 +19,12 @@ damage.
 
 from collections.abc import Mapping
 from dataclasses import asdict
+import fcntl
 import json
 import os
 from pathlib import Path
 import tempfile
-from typing import Any
+from typing import Any, TextIO
 import zipfile
 
 import numpy as np
@@ -37,6 +38,37 @@ FORMAT = 'sa_jitter_ros change baseline 1'
 _LARGEST_FILE = 1 << 28
 # The settings of the learning: of other ones the sums cannot be used.
 _LEARNING = ('group_averages', 'speed_bin')
+
+
+def lock_baseline(path: Path) -> TextIO | None:
+    """
+    Keep other processes from using a baseline until the result is closed, or this process ends.
+
+    The lock is that of a file beside it, whose text is the number of the process that holds it.
+    None where there can be no such file, nor a baseline.
+    Raises RecordingError, in one line, while another one has the lock.
+    """
+    if path.exists() and not path.is_file():
+        return None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = path.with_name(f'.{path.name}.lock').open('a+')
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock.truncate(0)
+        lock.write(f'{os.getpid()}')
+        lock.flush()
+    except BlockingIOError:
+        with lock:
+            lock.seek(0)
+            raise RecordingError(
+                f'{path}: process {lock.read(20)} keeps its baseline there: end that one, or give '
+                'another baseline_file') from None
+    except OSError:  # a full disk, or a file system without locks
+        pass
+    return lock
 
 
 def write_baseline(path: Path, machine: str, monitors: Mapping[str, ShaftMonitor],

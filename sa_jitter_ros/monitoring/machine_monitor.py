@@ -16,9 +16,10 @@ from typing import Any
 
 from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
-from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.json_values import json_values
-from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
+from sa_jitter_ros.monitoring.baseline_file import (
+    lock_baseline, read_baseline, write_baseline)
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import monitored, MonitoredAverage
 
@@ -64,8 +65,8 @@ class MachineMonitor:
     """
     The monitors of the shafts of a machine, whose baseline is kept in a file.
 
-    `path` is the file, None: it is not kept. Raises RecordingError for a file that cannot be used,
-    and for one without these shafts.
+    `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
+    the process. Raises RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
@@ -73,8 +74,14 @@ class MachineMonitor:
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
         self._others: dict[str, ShaftMonitor] = {}
+        self._lock = None
         if path is not None:
-            found = read_baseline(path, machine, settings, 1.0 / len(shafts))
+            self._lock = lock_baseline(path)
+            try:
+                found = read_baseline(path, machine, settings, 1.0 / len(shafts))
+            except RecordingError:
+                self.close()
+                raise
             self.monitors = {shaft: found[shaft] for shaft in shafts if shaft in found}
             self._others = {name: item for name, item in found.items() if name not in shafts}
         self._pairings = {shaft: Pairing() for shaft in shafts}
@@ -84,6 +91,11 @@ class MachineMonitor:
         self.uncorrected = {shaft: Shortfall() for shaft in shafts}
         #: Whether the file lacks what is known now.
         self.unsaved = False
+
+    def close(self) -> None:
+        """Let others use the file."""
+        if self._lock is not None:
+            self._lock.close()
 
     def use(self, settings: Settings) -> None:
         """Use another rate of false alarms, and take uncorrected averages or not."""

@@ -83,8 +83,10 @@ class ChangeMonitor(MonitoringNode):
 
     def destroy_node(self) -> None:
         """Keep the baseline and destroy the node."""
-        if self._monitor is not None and self._monitor.unsaved:
-            self._save(self._monitor)
+        if self._monitor is not None:
+            if self._monitor.unsaved:
+                self._save(self._monitor)
+            self._monitor.close()
         super().destroy_node()
 
     def _apply(self, values: Values) -> None:
