@@ -12,6 +12,7 @@
 
 from dataclasses import replace
 
+from limit_coverage import limit_of, machine, MODEL, UNIT
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import EFFECTS
@@ -19,71 +20,13 @@ from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.lattice import smooth_on_grid
-from sa_jitter_ros.effects.timing import MOTION, Setting
+from sa_jitter_ros.effects.timing import MOTION
 from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing
 from sa_jitter_ros.inference.timing_choice import Chooser
-from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import steering, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
-from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import stats
-from scipy.signal import lfilter
-
-PERIOD, SHAFT_MARKS = 0.02, 4
-MODEL = DeclaredModel(
-    keyphasor_rate=20e3, trigger_speed=1.0 / PERIOD / SHAFT_MARKS, trigger_cycles=20,
-    orders=(20.0, 40.0), ratio=SHAFT_MARKS, pulses_per_revolution=SHAFT_MARKS,
-    pulses_per_trigger=1)
-UNIT = float(np.sqrt(MODEL.distribution.variance))
-NOISE = 0.05  # of the declared jitter: what recovered errors are wrong by
-
-
-def machine(seed, *, count=400, scale=1.0, excess=0.0, rho=0.0, wander=0.0, skew=0.0, marks=None,
-            delay=0.0, shocks=0.0, hum=0.0, noise=NOISE):
-    """Return the stretch of a shaft whose speed walks at random; sizes in units of the jitter."""
-    rng = np.random.default_rng([29, seed])
-    index = np.arange(count)
-    speed = 5e-5 * lfilter([1.0], [1.0, -0.99], rng.standard_normal(count))
-    slow = 2e-3 * np.sin(2.0 * np.pi * index / count) if delay else 0.0
-    motion = PERIOD * np.cumsum(1.0 + speed + slow)
-    errors = scale * rng.uniform(-0.5, 0.5, count) / MODEL.keyphasor_rate
-    drawn = rng.standard_normal(count) * np.sqrt(1.0 - rho**2)
-    errors += excess * UNIT * lfilter([1.0], [1.0, -rho], drawn)
-    if marks is not None:
-        errors += UNIT * np.asarray(marks)[index % len(marks)]
-    errors += shocks * UNIT * lfilter([1.0], [1.0, -0.7], rng.uniform(size=count) < 0.03)
-    errors += hum * UNIT * np.cos(2.0 * np.pi * 0.1371 * index)
-    times = motion + errors
-    source = wander * UNIT * np.convolve(rng.standard_normal(count + 16), np.hanning(17) / np.sqrt(
-        np.sum(np.hanning(17) ** 2)), 'valid')
-    late = errors - source + skew * (motion - motion[0])
-    late = late + delay * (PERIOD / np.gradient(motion) - 1.0)
-    wrong, bends = recovery_noise(rng, count)
-    late = late + noise * UNIT * wrong
-    late -= late.mean()
-    bends = noise * UNIT * bends
-    setting = Setting(MODEL, UNIT, index, times, times - late)
-    return Stretch(setting, np.ones(count, bool), late, noise * UNIT, np.inf,
-                   bends[:-1] + np.gradient(np.gradient(motion))[:-1] / 2.0, float(np.std(bends)),
-                   np.inf)
-
-
-def recovery_noise(rng, count):
-    """
-    Return what errors and bends of a least squares fit to white noise are wrong by.
-
-    The fit is that of hat functions and of u (1 - u) and u (1 - u) (2 u - 1); errors have size 1.
-    """
-    u = (np.arange(64) + 0.5) / 64
-    frequency = np.fft.rfftfreq(count)
-    hat = 1.0 - u + u * np.exp(2j * np.pi * frequency)[:, None]
-    bend = np.broadcast_to(u * (1.0 - u), hat.shape)
-    shapes = np.stack([hat, bend, bend * (2.0 * u - 1.0)], axis=-1)
-    inverse = np.linalg.inv(np.einsum('fui,fuj->fij', shapes.conj(), shapes) / u.size)
-    inverse /= np.fft.irfft(inverse[:, 0, 0], count)[0]
-    root = np.linalg.cholesky(inverse)
-    drawn = np.fft.rfft(rng.standard_normal((3, count))).T
-    return np.fft.irfft(np.einsum('fij,fj->fi', root, drawn), count, axis=0)[:, :2].T
 
 
 def names_of(timing):
@@ -213,12 +156,6 @@ def test_noise_that_hides_any_jitter_leaves_no_limit():
     assert 5.0 < noisy / quiet < 50.0  # jitter below the noise shows by its power
     timing = read_timing([machine(1, noise=3e4)], names=frozenset())
     assert largest(timing, 'excess_jitter') is None
-
-
-def limit_of(part, name):
-    timing = read_timing([part], names=frozenset())
-    effect = largest(timing, name)
-    return next(iter(effect.values.values()))
 
 
 def test_short_or_missing_stretches_show_nothing():

@@ -244,16 +244,15 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         moves = dependences(bench, effects, chosen)
     attenuation, _, amplitude = bench.observed(everything)
     rows = limits(timing, evidence, [item.name for item in (*chosen, *present)])
-    names = {item.name for item in candidates}
-    if timing is not None:
-        candidates += [Candidate(name, 0, absent(name, 'the likelihood of the timing gains '
-                                                 f'nothing: probability {value:.2g}'), None,
-                                 f'the likelihood of the timing gains nothing by it: probability '
-                                 f'{value:.2g}')
-                       for name, value in timing.probabilities.items() if name not in names]
-    names |= {item.name for item in candidates}
-    for name in EFFECTS.keys() - names:
-        reason = bench.untold.get(name, _UNSEEN)
+    known = {item.name for item in candidates}
+    for name in EFFECTS:
+        if name in known:
+            continue
+        if timing is not None and name in timing.probabilities:
+            reason = ('the likelihood of the timing gains nothing by it: probability '
+                      f'{timing.probabilities[name]:.2g}')
+        else:
+            reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
