@@ -263,6 +263,22 @@ def test_sentence_names_effects_that_do_not_suffice(traces):
     assert 'even with excess_jitter the prediction' in verdict_sentence(content)
 
 
+def test_what_remains_is_a_sentence_of_its_own(traces):
+    content = {**report(traces['unexplained']), 'remains': 'a sinusoid'}
+    assert verdict_sentence(content).endswith('explains it. What remains: a sinusoid.')
+    content = {**report(traces['unexplained']), 'remains': '', 'undecided': ['clock_skew']}
+    assert verdict_sentence(content).endswith('explains it.')
+    assert 'cannot exclude' not in ' '.join(next_steps(content))  # nothing is excluded
+
+
+def test_effect_that_does_not_help_the_prediction_is_not_said_to(traces):
+    content = report(traces['traced'])
+    content = {**content, 'error_after': {**content['error_after'], 'rms': 2.0 * content[
+        'error_before']['rms']}}
+    assert 'does not predict the amplitudes better with it' in verdict_sentence(content)
+    assert next_steps(content)[0].endswith('here predictions are no better with it.')
+
+
 def test_undefined_numbers_are_dashes(traces):
     trace = traces['none']
     content = report(replace(trace, before=replace(trace.before, ks=float('nan'))))

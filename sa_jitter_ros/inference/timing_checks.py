@@ -131,7 +131,7 @@ def _shape(chooser: Chooser, choice: Choice) -> Check:
     power = sum(float(np.average(fit.contribution(name)[:, 1, 1].real, weights=data.size))
                 for name in names)
     return Check(p_value, PULSES, data.unit * math.sqrt(power),
-                 'skewness and kurtosis of the pulse errors')
+                 'the pulse errors are distributed as no effect makes them (skewness, kurtosis)')
 
 
 def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
@@ -148,7 +148,8 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
         np.interp(even, data.frequency, np.log(made + _TINY))))
     return Check(_likeness(chooser, choice, response.conj() / total), fit.moves(name),
                  data.unit * math.sqrt(float(np.average(made, weights=data.size))),
-                 f'skewness and kurtosis of the events behind {name}')
+                 f'the pulse errors have the memory of {name}, but come from single events, each '
+                 'of which fades (skewness, kurtosis)')
 
 
 def _minimum_phase(log_power: Array) -> Array:

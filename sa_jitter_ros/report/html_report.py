@@ -20,7 +20,8 @@ from typing import Any
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report.figures import illustrate, Illustration
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
-from sa_jitter_ros.report.number_text import measured_text, number_text, p_text, percent_text
+from sa_jitter_ros.report.number_text import (
+    measured_text, number_text, order_text, p_text, percent_text)
 from sa_jitter_ros.report.report import parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
@@ -124,7 +125,8 @@ def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
     if recordings:
         yield f'<p class="quiet">{_TITLE}</p>'
     count = sum(content['acquisitions'].values())
-    orders = '; orders ' + number_text(content['orders']) if len(shafts) == 1 else ''
+    orders = ('; orders ' + ', '.join(map(order_text, content['orders']))
+              if len(shafts) == 1 else '')
     names = ', '.join(name for name in shafts if name != ONLY_SHAFT)
     analysed = ' '.join(filter(None, (
         content['created'].replace('T', ' ').replace('+00:00', ' UTC'),
@@ -161,7 +163,7 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
     added = bool(content['missing_effects'])
     yield '<h2>What it does to the amplitudes</h2>'
     yield _table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
-        (number_text(item.order), percent_text(item.observed, item.standard_error),
+        (order_text(item.order), percent_text(item.observed, item.standard_error),
          *(percent_text(value, item.standard_error, shown=False)
            for value in (item.before, *((item.after,) if added else ())))) for item in shares])
     yield ('<p class="quiet">Share of the true amplitude that an average keeps, with one standard '
@@ -258,7 +260,7 @@ def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> s
 def _line_table(content: Mapping[str, Json]) -> str:
     return _table(
         ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
-        [(number_text(item['order']), item['channel'],
+        [(order_text(item['order']), item['channel'],
           measured_text(item['level'], None, content['unit']),
           percent_text(item['observed'], item['standard_error']),
           *(percent_text(item[key], item['standard_error'], shown=False)
@@ -268,7 +270,7 @@ def _line_table(content: Mapping[str, Json]) -> str:
 
 def _declared_table(content: Mapping[str, Json]) -> str:
     declared = content['declared']
-    rows = [(key, f'{_given(value)} {_UNITS.get(key, "")}'.rstrip())
+    rows = [(key, f'{_given(value)} {_UNITS.get(key, "") if value != [] else ""}'.rstrip())
             for key, value in declared.items() if key != 'effects']
     rows += [(f'effects.{name}.{key}', _given(value))
              for name, values in declared['effects'].items() for key, value in values.items()]

@@ -38,6 +38,8 @@ def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
     '6.10 ± 0.21, -4.20 ± 0.21 mrad'
     >>> measured_text(0.01931, 0.00131, '1'), measured_text(None)
     ('0.0193 ± 0.0013', '–')
+    >>> measured_text(280835514.3, None, 'Hz')
+    '281 MHz'
     """
     values = value if isinstance(value, list) else [value]
     errors = error if isinstance(error, list) else [error] * len(values)
@@ -72,6 +74,16 @@ def number_text(value: Json) -> str:
     return measured_text(value)
 
 
+def order_text(order: float) -> str:
+    """
+    Return an order with the digits that tell it from others.
+
+    >>> order_text(39.047619), order_text(60.0)
+    ('39.0476', '60')
+    """
+    return f'{order:.6g}'
+
+
 def p_text(value: Json) -> str:
     """
     Return a probability; one that is smaller than anybody should believe is a limit.
@@ -88,6 +100,8 @@ def _unit(values: Sequence[Json], unit: str) -> tuple[float, str]:
     """Return the size of a unit that suits the largest value, and its name."""
     unit = '' if unit == '1' else unit.replace('^2', '²')
     largest = max((abs(item) for item in values if isinstance(item, (int, float))), default=0.0)
+    if unit == 'Hz' and largest >= 1e6:
+        return 1e6, 'MHz'
     if unit not in _PREFIXED or not 0.0 < largest < 1.0:
         return 1.0, unit
     prefix, scale = next((item for item in _PREFIXES if largest >= item[1]), _PREFIXES[-1])

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.report.number_text import number_text, p_text, percent_text
+from sa_jitter_ros.report.number_text import order_text, p_text, percent_text
 from sa_jitter_ros.report.report import parameters_text
 
 Json = Any
@@ -63,15 +63,25 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
         return ('The declared model suffices: the averages lose what it predicts, within '
                 f'{_rms(content, "before")} of an amplitude.')
     if content['verdict'] == 'traced':
+        if not _improves(content):
+            return (f'The declared model lacks {names}, but does not predict the amplitudes '
+                    f'better with it: it misses them by {_rms(content, "after")} instead of '
+                    f'{_rms(content, "before")}.')
         return (f'The declared model lacks {names}. With it the prediction misses the measured '
                 f'amplitudes by {_rms(content, "after")} instead of {_rms(content, "before")}.')
-    remains = ', '.join(filter(None, (f'p {_equals(content["error_after"]["p_value"])}',
-                                      content['remains'])))
+    missed = f'{_rms(content, "after")} (p {_equals(content["error_after"]["p_value"])})'
+    remains = f' What remains: {content["remains"]}.' if content['remains'] else ''
     if names:
         return (f'The averages are not explained: even with {names} the prediction misses the '
-                f'measured amplitudes by {_rms(content, "after")} ({remains}).')
+                f'measured amplitudes by {missed}.{remains}')
     return (f'The averages are not explained: the prediction misses the measured amplitudes by '
-            f'{_rms(content, "after")} ({remains}), and none of the known effects explains it.')
+            f'{missed}, and none of the known effects explains it.{remains}')
+
+
+def _improves(content: Mapping[str, Json]) -> bool:
+    """Return whether the prediction is nearer to the amplitudes with what was found."""
+    before, after = content['error_before']['rms'], content['error_after']['rms']
+    return None in (before, after) or after <= before
 
 
 def _rms(content: Mapping[str, Json], when: str) -> str:
@@ -100,8 +110,10 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
     steps = []
     shares = order_shares(content)
     if content['parameter_file']:
-        steps.append('Paste the section below into your machine file: predictions then hold for '
-                     'this machine.')
+        steps.append('Paste the section below into your machine file'
+                     + (': predictions then hold for this machine.' if _improves(content) else
+                        ' only if a longer recording confirms it: here predictions are no better '
+                        'with it.'))
     if content['verdict'] == 'unexplained':
         steps.append('Do not rely on predictions for this machine. Take corrected amplitudes, '
                      'which need none, and look in the evidence below at when and where the rest '
@@ -110,7 +122,7 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
         worst = min(shares, key=lambda item: item.observed)
         steps.append(
             f'The averages lose {percent_text(1.0 - worst.observed, worst.standard_error)} of '
-            f'order {number_text(worst.order)}. Take corrected amplitudes (correct_jitter: true '
+            f'order {order_text(worst.order)}. Take corrected amplitudes (correct_jitter: true '
             'in synchronous_averager), and compare no raw amplitudes across keyphasors.')
     for item in content['missing_effects']:
         if item['name'] in EFFECTS and EFFECTS[item['name']].remedy:
@@ -119,7 +131,7 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
             steps.append(f'To tell {item["name"]} from '
                          f'{_listed(item["indistinguishable_from"], "or")}, take '
                          f'{item["deciding_measurement"]}.')
-    if content['undecided'] and content['lines']:
+    if content['undecided'] and content['lines'] and content['verdict'] != 'unexplained':
         steps.append('This recording cannot exclude '
                      f'{_listed(content["undecided"], "or")}, which may change '
                      f'an amplitude by {percent_text(_LARGEST)} or more. A longer recording '
