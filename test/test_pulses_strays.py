@@ -379,3 +379,30 @@ def test_a_wheel_that_changes_its_pattern_is_learnt_again(rng):
     found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
     assert np.abs(np.diff(found.times)[~found.starts_run[1:]] * 12.0 - 1.0).max() < 4e-3
     assert found.times.size > 40
+
+
+@pytest.mark.parametrize('share', [0.1, 0.15])
+def test_missing_pulses_beside_steps_of_a_clock_cost_themselves_only(share):
+    """Pulses missing in turns are no shaft at half the speed, and a tick is no displacement."""
+    clock, lost = 6667.0, 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        true = np.arange(300) / 36.45 + 0.02 * rng.random()
+        every = np.ceil((true + rng.normal(0.0, 1e-6, true.size)) * clock) / clock
+        given = every[rng.random(true.size) > share]
+        validator = PulseValidator()
+        found = TriggerPulses.joined([validator.update(given), validator.flush()])
+        cycles = np.diff(np.searchsorted(every, found.times))[~found.starts_run[1:]]
+        assert np.all(cycles == 1)
+        assert not validator.take_messages()
+        lost += given.size - validator.counts.accepted
+    assert lost < 20
+
+
+def test_every_other_pulse_that_stays_away_is_named():
+    validator = PulseValidator()
+    validator.update(np.arange(60) / 30.0)
+    found = validator.update(2.0 + np.arange(60) / 15.0)
+    assert np.count_nonzero(~found.starts_run) >= 50
+    message, = validator.take_messages()
+    assert 'every other pulse is missing' in message

@@ -40,7 +40,7 @@ from sa_jitter_ros.pulses.alternation import Alternation
 from sa_jitter_ros.pulses.interval_model import IntervalModel
 from sa_jitter_ros.pulses.mark_pattern import (
     mark_pattern, regular_start, repeating, steady_pattern)
-from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
+from sa_jitter_ros.pulses.pulse_paths import is_multiple, likely, Path, PathRules
 from sa_jitter_ros.pulses.target import EvenTarget, Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter
 
@@ -58,6 +58,8 @@ _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
 _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
 _LONGEST_GAP = 1000.0  # revolutions
+_LACKING = 6  # intervals in a row with as many missing pulses that show another pulse rate
+_NO_INTERVALS = np.empty(0)
 _FITS = 0.1  # tolerance with which a pulse after a step of time fits
 # A change of the interval that is reported: across so many intervals, by this much of its
 # logarithm; near a factor of two; and the number of reports that wait.
@@ -121,6 +123,7 @@ class IntervalJudge:
         self._marks: list[int] = []  # levels and ends of intervals since the pattern was learnt
         self._levels: list[float] = []
         self._times: list[float] = []
+        self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
         self._learnt = 0  # times that the pattern was learnt
         self._alternation = Alternation()
 
@@ -220,6 +223,7 @@ class IntervalJudge:
             self._counter.extend(taken, [steps[slot] for slot in slots])
             self.counts['accepted'] += count
             model.accept(levels, gaps[:count])
+            self._lacking = []
             if size == 1:
                 self._look_at_turns(levels)
             self._recent = [*self._recent, *taken[-_AGREEING - 1:]][-_AGREEING - 1:]
@@ -260,7 +264,7 @@ class IntervalJudge:
         return PathRules(
             self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
             np.maximum(self._lock.believed, self._options.tolerance).tolist(),
-            self._options.maximum_missing, self._model.expected)
+            self._options.maximum_missing, self._model.expected, self._model.tick)
 
     def _decide(self, final: bool) -> bool:
         """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""
@@ -296,8 +300,15 @@ class IntervalJudge:
         """Whether the ticks of a clock explain the next two intervals, which are regular then."""
         assert self._lock is not None
         pulses = np.array([self.confirmed, *self._queue[:2]])
-        slots = (self._slot + np.arange(pulses.size - 1)) % self._lock.steps.size
-        return self._model.explains(np.diff(pulses), self._lock.widths[slots], float(pulses[-1]))
+        gaps, widths, slot = np.diff(pulses), [], self._slot
+        for gap in gaps.tolist():
+            passed = self._slots_in(gap, self._model.expected, slot)
+            if not 0 < passed <= 1 + self._options.maximum_missing:
+                return False
+            slots = (slot + np.arange(passed)) % self._lock.steps.size
+            widths.append(float(self._lock.widths[slots].sum()))
+            slot = (slot + passed) % self._lock.steps.size
+        return self._model.explains(gaps, np.array(widths), float(pulses[-1]))
 
     def _commit(self, paths: list[Path], final: bool) -> bool:
         """Decide about the first pulses if the likely paths agree about them."""
@@ -355,6 +366,7 @@ class IntervalJudge:
         slots, steps = self._passed(mark)
         pulse = self._next(slots, level)
         self._model.accept([level])
+        self._lacking = []
         self._counter.extend([pulse], [steps])
 
     def _irregular(self, mark: int, level: float, deviation: float, after: float | None) -> None:
@@ -383,7 +395,9 @@ class IntervalJudge:
             self.counts[kind] += mark - 1
             pulse = self._next(slots, level)
             model.accept([level])
-            if self._options.bridge:
+            if self._lacks_alike(mark, gap):
+                self._counter.begin(pulse, 0, passed=steps)
+            elif self._options.bridge:
                 self._counter.extend([pulse], [steps])
             else:
                 self._counter.begin(pulse, 0, passed=steps)
@@ -392,8 +406,8 @@ class IntervalJudge:
         if mark == 1:
             model.refuse(deviation)
         if not known and mark == 1 and after is not None:
-            passed = self._slots_in(gap, model.level)
-            if passed and passed == self._slots_in(gap, after):
+            passed = self._slots_in(gap, model.level, self._slot)
+            if passed and passed == self._slots_in(gap, after, self._slot):
                 slots, steps = self._passed(passed)
                 known = True
         if not known and (self._rehearses or not self._lock_is_plain):
@@ -406,6 +420,18 @@ class IntervalJudge:
         if after is not None:
             model.jump(after)
         self._counter.begin(pulse, 0, passed=steps if known else None)
+
+    def _lacks_alike(self, mark: int, gap: float) -> bool:
+        """Take the latest interval for the usual one if many have lacked as many pulses."""
+        self._lacking = [*self._lacking, mark] if mark in self._lacking else [mark]
+        if len(self._lacking) < _LACKING:
+            return False
+        level = self._model.level
+        self._report_change(gap, level, level + math.log(mark))
+        self.counts['relearnt'] += 1
+        self._model.jump(level + math.log(mark))
+        self._lacking = []
+        return True
 
     def _report_change(self, gap: float, before: float, after: float) -> None:
         """Say that the interval changed across a gap (s) as no shaft changes it."""
@@ -458,10 +484,10 @@ class IntervalJudge:
         self._learn_marks()
         return pulse
 
-    def _slots_in(self, gap: float, level: float) -> int:
-        """Return how many slots a gap (s) of intervals of this level has, 0 if not a whole one."""
+    def _slots_in(self, gap: float, level: float, slot: int) -> int:
+        """Return how many slots a gap (s) from `slot` on has at a level, 0 if no whole one."""
         assert self._lock is not None
-        widths = np.roll(self._lock.widths, -self._slot)
+        widths = np.roll(self._lock.widths, -slot)
         revolution = float(widths.sum())
         turns, rest = divmod(gap / math.exp(level), revolution)
         if turns > _LONGEST_GAP:
@@ -512,7 +538,7 @@ class IntervalJudge:
             if self._candidate is None and excess > 0:
                 self._drop_unlocked(excess)
                 queue = queue[excess:]
-        lock = self._candidate
+        lock = self._candidate = self._at_known_speed(self._candidate)
         if lock.steps.size > 1:
             wanted = lock.first + 1 + min(
                 _REVOLUTIONS * lock.steps.size, math.ceil(_LONGEST / lock.interval))
@@ -528,6 +554,15 @@ class IntervalJudge:
         self._drop_unlocked(lock.first)
         self._begin(lock)
         return True
+
+    def _at_known_speed(self, lock: Lock) -> Lock:
+        """Return the lock with the interval before, if its own is twice, thrice, ... as long."""
+        if self._end is None or not lock.even:
+            return lock
+        longer = lock.interval / math.exp(self._end.level)
+        if not (is_multiple(longer - 1.0) and round(longer) <= 1 + self._options.maximum_missing):
+            return lock
+        return replace(lock, interval=lock.interval / round(longer), intervals=_NO_INTERVALS)
 
     def _drop_unlocked(self, count: int) -> None:
         del self._queue[:count]

@@ -126,6 +126,11 @@ class IntervalModel:
         return bool(self._tick or clock_tick(np.array(self._intervals), 0.0))
 
     @property
+    def tick(self) -> float:
+        """Tick of the clock, as far as one is known, in parts of the interval."""
+        return self._tick
+
+    @property
     def known(self) -> int:
         """Return the number of intervals from which the scatter is known."""
         return int(self._count)
@@ -198,14 +203,14 @@ class IntervalModel:
         if self.given:
             return False
         length = math.exp(self.expected)
-        if np.any(np.abs(intervals / widths / length - 1.0) > 2.0 * LONGEST_TICK):
+        if np.any(np.abs(intervals / length - widths) > 2.0 * LONGEST_TICK):
             return False
         tick = clock_tick(np.array([*self._intervals, *intervals]), latest) / length
         if tick <= self._tick:
             return False
         # If all others are equal, a displaced pulse or a step of the time looks like a tick, too.
         lone = not clock_tick(np.array(self._intervals), latest)
-        opposite = _is_displacement(intervals / widths / length - 1.0)
+        opposite = _is_displacement(intervals / length - widths)
         if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
             return False
         before, self._tick, self._latest = self.tolerance, tick, latest

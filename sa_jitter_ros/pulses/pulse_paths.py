@@ -31,6 +31,8 @@ IntArray = NDArray[np.int64]
 
 # Logarithms of how unlikely they are.
 STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
+# More, of a speed that falls to a half, a third, ... at once: rather, pulses are missing.
+FRACTION, _WHOLE = 48.0, 0.03
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
 _DROPPED = 16.0
@@ -79,9 +81,8 @@ class PathRules:
     `steps` (slot,) are the teeth from each slot to the next, `widths` (slot,) the same with what
     is known of uneven marks. `scatter` is that of the intervals, relative to 1; deviations within
     `given` (slot,) are believed. Up to `maximum_missing` pulses may be missing. `expected` is the
-    level that earlier intervals predict (None: not known). A stray costs `stray`, any interval
-    `each`;
-    `most` paths are kept.
+    level that earlier intervals predict (None: not known), and the clock moves a pulse by up to a
+    `tick` of the interval. A stray costs `stray`, any interval `each`; `most` paths are kept.
     """
 
     steps: Sequence[int]
@@ -90,6 +91,7 @@ class PathRules:
     given: Sequence[float]
     maximum_missing: int
     expected: float | None
+    tick: float = 0.0
     stray: float = STRAY
     each: float = 0.0
     most: int = _MOST_PATHS
@@ -116,7 +118,8 @@ class PathRules:
             slot = (slot + 1) % len(self.steps)
             level = math.log(gap / width)
             off = self._deviation(path, level, mark)
-            cost = min(0.5 * (off / self.scatter)**2, JUMP)
+            beyond = max(abs(off) - self.tick / mark, 0.0)
+            cost = min(0.5 * (beyond / self.scatter)**2, JUMP)
             if self._believed(path, level, off):
                 cost = min(cost, BELIEVED)
             if mark > 1:
@@ -125,13 +128,15 @@ class PathRules:
                         break
                     continue
                 cost += MISSING + MORE_MISSING * (mark - 2)
-            if cost == JUMP:  # the angle jumps, and the speed stays as it was
+            if cost == JUMP:
+                # The angle jumps, and the speed stays as it was; or the speed jumps.
                 found.append(path._replace(
                     cost=path.cost + cost + self.each, last=pulse, slot=slot,
                     passed=path.passed + passed, marks=(*path.marks, mark),
                     deviations=(*path.deviations, off), levels=(*path.levels, level)))
+            unlike = FRACTION if cost == JUMP and is_multiple(off) else 0.0
             found.append(path._replace(
-                cost=path.cost + cost + self.each, last=pulse, slot=slot,
+                cost=path.cost + cost + unlike + self.each, last=pulse, slot=slot,
                 passed=path.passed + passed, level=level, before=path.level,
                 jumped=path.jumped or cost == JUMP, marks=(*path.marks, mark),
                 deviations=(*path.deviations, off), levels=(*path.levels, level)))
@@ -165,6 +170,12 @@ class PathRules:
         return math.expm1(min((level - each for each in expected), key=abs))
 
 
+def is_multiple(off: float) -> bool:
+    """Whether an interval that is longer by `off` of another one is two, three, ... of them."""
+    times = 1.0 + off
+    return times > 1.5 and abs(times / round(times) - 1.0) < _WHOLE
+
+
 def likely(paths: list[Path]) -> list[Path]:
     """Return the paths that are not out of the question, of those sorted by cost."""
     return [path for path in paths if path.cost < paths[0].cost + MARGIN]
@@ -194,7 +205,8 @@ def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRA
     for tried in _LADDER if scatter is None else (*_LADDER, scatter):
         # A wide normal distribution explains everything, but each interval with less density.
         each = math.log(tried / min(_LADDER)) if tried > min(_LADDER) else 0.0
-        rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray, each, _MOST_OF_CHAIN)
+        rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray=stray, each=each,
+                          most=_MOST_OF_CHAIN)
         paths: list[Path] = []
         for number, pulse in enumerate(pulses.tolist()):
             paths = rules.extend(paths, pulse) if paths else []
