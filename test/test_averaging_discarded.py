@@ -69,6 +69,44 @@ def test_more_discarded_cycles_than_allowed_end_the_average():
     assert [average.start_time for average in averages] == [45 / SPEED, 85 / SPEED]
 
 
+def test_an_average_with_too_many_discarded_cycles_begins_later():
+    missing = [*range(2, 32, 3), 55]
+    pulses = np.delete(np.arange(160) / SPEED, missing)
+    averages = sa.average(machine(6.5), RATE, pulses, orders=ORDERS, trigger_cycles=40,
+                          maximum_discarded=0.5)
+    assert averages[0].start_time == 3 / SPEED
+    assert averages[0].discarded_cycles == 20
+    for average in averages:
+        assert average.used.sum() == 40
+        assert abs(average.amplitudes[0] - AMPLITUDES).max() < 1e-3
+    np.testing.assert_array_equal(averages[0].cycle_numbers[:2], [0, 3])
+
+
+@pytest.mark.parametrize('correct', [False, True])
+@pytest.mark.parametrize('seed', range(3))
+def test_averages_that_begin_later_do_not_depend_on_the_cutting(seed, correct):
+    rng = np.random.default_rng(seed)
+    pulses = (np.arange(160) / SPEED)[rng.random(160) > 0.2]
+    wave = machine(6.5, ratio=2.40789, noise=0.1, rng=rng)
+    options = {'orders': ORDERS, 'trigger_cycles': 20, 'maximum_discarded': 0.5,
+               'ratio': 2.40789, 'correct_jitter': correct}
+    whole = sa.average(wave, RATE, pulses, **options)
+    averager, found = sa.Averager(RATE, **options), []
+    for part in np.array_split(np.arange(wave.size), 40):
+        due = pulses[pulses < (part[-1] + 1) / RATE]
+        found += averager.update(wave[part], due)
+        pulses = pulses[due.size:]
+    found += averager.update(None, pulses) + averager.flush()
+    assert averager.counts['averages_dropped'] > 1
+    assert len(found) == len(whole) > 2
+    for a, b in zip(found, whole):
+        np.testing.assert_allclose(a.amplitudes, b.amplitudes, rtol=1e-9)
+        np.testing.assert_allclose(a.waveform, b.waveform, rtol=1e-9)
+        np.testing.assert_array_equal(a.pulses, b.pulses)
+        np.testing.assert_array_equal(a.cycle_numbers, b.cycle_numbers)
+        assert a.discarded_cycles == b.discarded_cycles <= 10
+
+
 def test_a_gap_of_unknown_length_ends_the_average():
     pulses = np.arange(160) / SPEED
     pulses = np.append(pulses[:30], pulses[33:] + 0.4 / SPEED)

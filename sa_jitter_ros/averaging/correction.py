@@ -115,6 +115,17 @@ class CorrectingAverager:
         """Leave out discarded cycles; return whether the average goes on (`ShaftAverager`)."""
         return self._shaft.skip(count)
 
+    def begin_later(self, count: int) -> bool:
+        """Begin the block at a later cycle, as `ShaftAverager` does; return whether it could."""
+        runs = self._shaft.begin_later(count)
+        if not runs:
+            return False
+        self._cycles.clear()
+        self._gaps = ChannelGaps()
+        for run in runs:
+            self._keep(run)
+        return True
+
     def change(self, settings: AverageSettings) -> bool:
         """Continue at the same angle with other settings; return whether an average was lost."""
         self._cycles.clear()
@@ -138,10 +149,13 @@ class CorrectingAverager:
     def update(self, cycles: CycleSamples) -> Average | None:
         """Take cycles, not more than `room`; return the average and its correction when due."""
         average = self._shaft.update(cycles)
+        self._keep(cycles)
+        return self._completed(average)
+
+    def _keep(self, cycles: CycleSamples) -> None:
         self._gaps.take(cycles)
         if self._keeps_cycles:
             self._cycles += [cycles.part(k, k + 1) for k in range(cycles.count)]
-        return self._completed(average)
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""

@@ -17,7 +17,7 @@ a fraction of the same for each of them. The settings limit its memory.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 from itertools import pairwise
 import math
@@ -55,7 +55,7 @@ class ShaftAverager:
     def __init__(self, settings: AverageSettings, *, first_cycle: int = 0) -> None:
         self.settings = settings
         self._law = angle_law(settings.angle_law)
-        self._cycle = first_cycle
+        self._cycle = self._next = first_cycle  # to be averaged, and to be taken
         self._sequence = 0
         self._points = settings.samples_per_revolution
         self._start()
@@ -72,7 +72,7 @@ class ShaftAverager:
     def reset(self) -> bool:
         """Begin again at angle 0; return whether an unfinished average was lost."""
         lost = self._unfinished
-        self._cycle = 0
+        self._cycle = self._next = 0
         self._start()
         return lost
 
@@ -83,16 +83,36 @@ class ShaftAverager:
         Returns False, and does nothing, if they are more than the average may lack.
         """
         most = self.settings.trigger_cycles
-        begun = self._cycle + self._taken - self._counted  # that of the next cycle
-        numbers = [*self._numbers, *range(self._cycle, begun), begun + count][-most:]
-        if (not self.settings.maximum_discarded or numbers[-1] - numbers[0] + 1 - len(numbers)
-                > self.settings.maximum_discarded * most):
+        numbers = [*self._numbers, *self._numbers_waiting, self._next + count][-most:]
+        if not self.settings.maximum_discarded or (
+                _discarded(numbers) > self.settings.maximum_discarded * most):
             return False
-        self._average_waiting()
-        self._cycle += count
-        self._full = False
-        self._expect_from(self._angle(self._cycle))
+        self._next += count
         return True
+
+    def begin_later(self, count: int) -> list[CycleSamples]:
+        """
+        Begin the unfinished block at a later cycle, so that `count` discarded ones may follow.
+
+        Returns its cycles; none, and does nothing, where it cannot: the cycles are known until
+        they are averaged, which those of a large block are before it is full.
+        """
+        if self._counted or not self._unfinished:
+            return []
+        numbers = [*self._numbers_waiting, self._next + count]
+        most = math.floor(self.settings.maximum_discarded * self.settings.trigger_cycles)
+        first = next(k for k in range(len(numbers)) if _discarded(numbers[k:]) <= most)
+        kept, ahead = [], first
+        for number, run in self._waiting:
+            if ahead < run.count:
+                kept.append((number + ahead, run.part(ahead, run.count) if ahead else run))
+            ahead = max(ahead - run.count, 0)
+        if kept:
+            self._start()
+            for self._next, run in kept:
+                self.update(run)
+            self._next = numbers[-1]
+        return [run for _, run in kept]
 
     def finish(self) -> Average | None:
         """Return the average of the cycles of an unfinished block, None if there are none."""
@@ -106,9 +126,9 @@ class ShaftAverager:
     def change(self, settings: AverageSettings) -> bool:
         """Continue at the same angle with other settings; return whether an average was lost."""
         lost = self._unfinished
-        self._cycle += self._taken - self._counted
         if settings.cycle_length != self.settings.cycle_length:
-            self._cycle = 0
+            self._next = 0
+        self._cycle = self._next
         self.settings, self._law = settings, angle_law(settings.angle_law)
         self._points = settings.samples_per_revolution
         self._start()
@@ -138,9 +158,11 @@ class ShaftAverager:
                 'pulses_per_revolution')
         if not self._taken:
             self._choose_grid(float(periods[0]), cycles.rate)
-        self._waiting.append(cycles)
+        self._waiting.append((self._next, cycles))
+        self._next += cycles.count
         self._taken += cycles.count
-        self._waiting_size += cycles.samples.size
+        # Not their samples, which depend on how the cycles were handed over.
+        self._waiting_size += float(cycles.periods.sum() * cycles.rate * cycles.samples.shape[1])
         if self._taken < self.settings.trigger_cycles:
             if self._waiting_size >= TOGETHER:
                 self._average_waiting()
@@ -158,11 +180,22 @@ class ShaftAverager:
 
     def _average_waiting(self) -> None:
         """Average the cycles that wait."""
-        for run in joined(self._waiting):
+        numbers = self._numbers_waiting
+        for run in joined([run for _, run in self._waiting]):
+            if numbers[0] != self._cycle:  # behind discarded ones
+                self._cycle = numbers[0]
+                self._full = False
+                self._expect_from(self._angle(self._cycle))
+            del numbers[:run.count]
             for part in self._alike(run):
                 self._average(part)
         self._waiting.clear()
-        self._waiting_size = 0
+        self._waiting_size = 0.0
+
+    @property
+    def _numbers_waiting(self) -> list[int]:
+        """Return the numbers of the cycles that wait."""
+        return [number + k for number, run in self._waiting for k in range(run.count)]
 
     def _average(self, cycles: CycleSamples) -> None:
         """Average cycles that have grids of the same size."""
@@ -238,8 +271,8 @@ class ShaftAverager:
     def _start(self) -> None:
         settings = self.settings
         self._taken = self._counted = self._noise_due = 0  # those that wait are not yet counted
-        self._waiting: list[CycleSamples] = []
-        self._waiting_size = 0  # samples times channels
+        self._waiting: list[tuple[int, CycleSamples]] = []  # with the number of the first
+        self._waiting_size = 0.0  # samples times channels
         self._noise: tuple[FloatArray, Repeatability] | None = None
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
@@ -469,6 +502,11 @@ class ShaftAverager:
                 cycles, clean, np.array(orders), cycle_length=cycle_length)
             self._noise_due = self._counted + max(self.settings.trigger_cycles // 8, 1)
         return self._noise
+
+
+def _discarded(numbers: Sequence[int]) -> int:
+    """Return how many cycles lie between those of these ascending numbers."""
+    return numbers[-1] - numbers[0] + 1 - len(numbers)
 
 
 def average_cycles(cycles: Iterable[CycleSamples], settings: AverageSettings, *,

@@ -490,6 +490,9 @@ class StreamingAverager:
         for name, shaft in self.shafts.items():
             if skipped and shaft.skip(skipped):
                 continue
+            if skipped and shaft.begin_later(skipped):
+                self.counts.averages_dropped += 1
+                continue
             average = shaft.finish() if self._keep_unfinished else None
             if average is not None:
                 self._due.append((name, average))
