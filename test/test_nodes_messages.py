@@ -357,6 +357,24 @@ def test_averages_of_older_and_newer_versions_are_read(elements, fields):
         messages.decode_average('order_amplitude', swapped).values, got.values)
 
 
+def test_input_with_more_header_elements_is_read():
+    """Newer versions append elements to the header of vibration and pulses."""
+    for kind, header, made in (('std_msgs/Float64MultiArray', (1.5, 100.0, 150.0, 7.0, 8.0),
+                                Float64MultiArray),
+                               ('std_msgs/Float32MultiArray', (0.0, 150.0, 7.0, 8.0),
+                                Float32MultiArray)):
+        message = made(data=[*header, 1.0, 2.0])
+        message.layout.data_offset = len(header)
+        for sizes in ((), (('channel', 1), ('sample', 2))):
+            message.layout.dim = [MultiArrayDimension(label=name, size=size)
+                                  for name, size in sizes]
+            block = SampleDecoder(kind, sample_rate=100.0).decode(message)
+            assert (block.start_time, block.sample_rate, block.index) == (1.5, 100.0, 150)
+            np.testing.assert_array_equal(block.samples, [[1.0, 2.0]])
+    pulses = messages.encode_array(np.array([0.5, 1.0]), ('pulse',), (7.0, 8.0))
+    np.testing.assert_array_equal(messages.decode_pulse_array(pulses), [0.5, 1.0])
+
+
 def test_pulse_errors_without_the_field_used_are_read():
     message = messages.encode_array(
         np.ones((5, 3)), ('pulse', 'field:time,error,standard_error'), (0.0, 1.0, 0, 4, 4, 4.0))

@@ -810,7 +810,7 @@ def float64_block(index, *, time=None, rate=RATE, shape=(2, 100), sizes=None, of
     def make(types):
         dims = [types['std_msgs/msg/MultiArrayDimension'](label, size, 0)
                 for label, size in zip(('channel', 'sample'), sizes or shape)]
-        data = np.concatenate([np.array([time, rate, index], np.float64)[:offset],
+        data = np.concatenate([np.array([time, rate, index, 7.0, 8.0], np.float64)[:offset],
                                samples.ravel()])
         layout = types['std_msgs/msg/MultiArrayLayout'](dims, offset)
         return types['std_msgs/msg/Float64MultiArray'](layout, data)
@@ -827,6 +827,18 @@ def test_repeats_in_a_bag_are_dropped(tmp_path):
     assert opened.start_time == 500 / RATE
     assert opened.remarks == ('/vibration: 50 lost samples are NaN',
                               '/vibration: 250 repeated samples were skipped')
+
+
+@pytest.mark.parametrize('kind', ['bag', 'old bag'])
+def test_bags_of_newer_and_older_versions_are_read(recording, tmp_path, kind):
+    """Header elements are appended; an old bag has the topics and layouts of the first version."""
+    pytest.importorskip('rosbags')
+    offset = 5 if kind == 'bag' else 3
+    path = write_messages(tmp_path / kind, 'std_msgs/msg/Float64MultiArray',
+                          [float64_block(index, offset=offset) for index in (0, 100)])
+    opened = read(path)
+    np.testing.assert_array_equal(opened.read()[1], np.arange(200))
+    assert (opened.sample_rate, opened.start_time) == (RATE, 0.0)
 
 
 def test_a_bag_block_without_header_is_counted(tmp_path):

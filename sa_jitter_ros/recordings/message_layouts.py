@@ -49,8 +49,9 @@ def decode_array(message: Any, labels: tuple[str, ...], header_size: int | None
     """
     Decode a MultiArray.
 
-    Returns header elements, values in the shape of the layout, names of the last dimension. With
-    `header_size` None there may be any number of header elements.
+    Returns header elements, values in the shape of the layout, names of the last dimension. There
+    may be more header elements than `header_size`, as in newer versions; these are left out. With
+    None there may be any number, and all are returned.
     Raises `MessageError` if labels, number of dimensions, size or offset do not fit.
 
     >>> from types import SimpleNamespace as Message
@@ -65,21 +66,21 @@ def decode_array(message: Any, labels: tuple[str, ...], header_size: int | None
         raise MessageError(f'dimensions {list(got)} received, {list(labels)} expected: '
                            'label layout.dim with the expected names')
     shape = tuple(dim.size for dim in layout.dim)
-    if header_size is None:
-        header_size = layout.data_offset
-    if layout.data_offset != header_size:
-        raise MessageError(f'data_offset {layout.data_offset} received, {header_size} expected: '
-                           'put exactly that many header elements in front of the array')
-    if math.prod(shape) != data.size - header_size or math.prod(filter(None, shape)) > _LARGEST:
+    offset = layout.data_offset
+    header_size = offset if header_size is None else header_size
+    if offset < header_size:
+        raise MessageError(f'data_offset {offset} received, {header_size} expected: put that many '
+                           'header elements in front of the array')
+    if math.prod(shape) != data.size - offset or math.prod(filter(None, shape)) > _LARGEST:
         raise MessageError(
-            f'layout {"x".join(map(str, shape))} behind {header_size} header elements does not '
-            f'fit {data.size} elements: make layout and data agree')
+            f'layout {"x".join(map(str, shape))} behind {offset} header elements does not fit '
+            f'{data.size} elements: make layout and data agree')
     label = layout.dim[-1].label if layout.dim else ''
     names = tuple(label.split(':', 1)[1].split(',')) if ':' in label else ()
     if names and len(names) != shape[-1]:
         raise MessageError(f'{len(names)} names for {shape[-1]} elements in "{label}": give a '
                            'name for each element, or none')
-    return data[:header_size].astype(np.float64), data[header_size:].reshape(shape), names
+    return data[:header_size].astype(np.float64), data[offset:].reshape(shape), names
 
 
 def whole(name: str, value: float) -> int:
@@ -241,6 +242,9 @@ class SampleDecoder:
     def _float32(self, message: Any) -> SampleBlock:
         if message.layout.data_offset == 0:
             return self._count(_samples(message, 0)[1])
+        if message.layout.data_offset == 3:
+            raise MessageError('data_offset 3 received, 2 expected: the header of '
+                               'Float64MultiArray has 3 elements, that of Float32MultiArray 2')
         header, samples = _samples(message, 2)
         high, low = (whole('index of the first sample', float(item)) for item in header)
         index = whole('index of the first sample', high * INDEX_BASE + low)
@@ -263,15 +267,14 @@ def _samples(message: Any, header_size: int) -> tuple[FloatArray, FloatArray]:
     if message.layout.dim:
         header, values, _ = decode_array(message, ('channel', 'sample'), header_size)
     else:  # an empty layout means one channel
-        data = np.asarray(message.data)
-        if message.layout.data_offset != header_size:
-            raise MessageError(f'data_offset {message.layout.data_offset} received, '
-                               f'{header_size} expected: put exactly that many header elements '
-                               'in front of the array')
-        if data.size < header_size:
-            raise MessageError(f'{data.size} elements received, at least {header_size} header '
+        data, offset = np.asarray(message.data), message.layout.data_offset
+        if offset < header_size:
+            raise MessageError(f'data_offset {offset} received, {header_size} expected: put that '
+                               'many header elements in front of the array')
+        if data.size < offset:
+            raise MessageError(f'{data.size} elements received, at least {offset} header '
                                'elements expected: send the header, or data_offset 0')
-        header, values = data[:header_size].astype(np.float64), data[header_size:][None, :]
+        header, values = data[:header_size].astype(np.float64), data[offset:][None, :]
     if values.size == 0:
         raise MessageError(f'empty block of {values.shape[0]} channels x {values.shape[1]} '
                            'samples: send at least one sample of one channel')
