@@ -77,6 +77,68 @@ def test_what_does_not_fit_is_said_once(recording, change, declared, text):
     assert len(found) == 1
 
 
+@pytest.fixture
+def gearbox(rng):
+    """Return a function for a machine with a shaft at 2.5 times the speed, and 8 marks."""
+    time = np.arange(int(6400.0 * SECONDS)) / 6400.0
+    turns = 20.0 * time + 0.02 * np.sin(time)
+    samples = rng.normal(0.0, 0.3, time.size)
+    for order in (1.0, 2.0, 3.0, 11.37, 24.02, 2.5, 5.0, 37.5, 75.0):
+        samples += rng.uniform(0.3, 1.0) * np.cos(2.0 * np.pi * order * turns)
+
+    def made(marks, first=0.0, last=1.0):
+        """Return the machine with pulses of `marks` (revolutions) in a part of its time."""
+        every = (np.arange(1, int(20.0 * SECONDS) - 1)[:, None] + np.asarray(marks)).ravel()
+        pulses = np.interp(every, turns, time)
+        return Recording(ArraySource(samples[None]), 6400.0, ratio=2.5,
+                         orders=(1.0, 2.0, 15.0, 30.0), pulse_times=pulses[
+                             (pulses > first * SECONDS) & (pulses < last * SECONDS)])
+    return made
+
+
+EIGHT = np.arange(8) / 8.0
+
+
+@pytest.mark.parametrize(('declared', 'texts'), [
+    ({}, ()), ({'ratio': 2.4}, ('none of the orders 1, 2, 15, 30', 'ratio 2.4')),
+    ({'pulses_per_revolution': 4}, ('pulses_per_revolution 8 instead of 4',)),
+    ({'pulses_per_revolution': 16}, ('pulses_per_revolution 8 instead of 16',)),
+    ({'pulses_per_revolution': 7}, ('none of the orders 1, 2, 15, 30', 'pulses_per_revolution')),
+])
+def test_what_leaks_from_strong_lines_is_no_order(gearbox, declared, texts):
+    rig = gearbox(EIGHT)
+    found = doubts(rig, rig.pulse_times, **{
+        'orders': rig.orders, 'ratio': 2.5, 'pulses_per_revolution': 8, **declared})
+    assert len(found) == bool(texts)
+    assert all(text in found[0] for text in texts)
+
+
+@pytest.mark.parametrize(('first', 'second', 'declared', 'text'), [
+    (EIGHT, EIGHT[:7], {'missing_teeth': 1}, 's give no trigger cycle: they are not those of a '
+     'target with 8 marks a revolution, 1 of them missing'),
+    (EIGHT, EIGHT[:7], {}, 's give no trigger cycle: they are not those of a target with 8 marks'),
+    (EIGHT[:7], EIGHT[:6], {'missing_teeth': 1}, 'give no trigger cycle'),
+    (EIGHT, EIGHT[::2], {}, 'every other pulse is missing'),
+    (EIGHT[:1], [0.0, 0.4], {'pulses_per_revolution': 1}, 'pulses are strays'),
+])
+def test_a_target_that_changes_half_way_is_named(gearbox, first, second, declared, text):
+    pulses = np.concatenate([gearbox(first, last=0.5).pulse_times,
+                             gearbox(second, first=0.5).pulse_times])
+    found, = doubts(gearbox(EIGHT), pulses, **{'pulses_per_revolution': 8, **declared})
+    assert text in found
+
+
+@pytest.mark.parametrize(('offset', 'text'), [
+    (0.5, 'pulses_per_revolution 2 instead of 1'), (0.499, 'longer and shorter in turns'),
+    (0.3, 'are strays: is there a second keyphasor'), (0.05, 'are strays: is there a second'),
+])
+def test_two_keyphasors_of_one_name_are_named(gearbox, rng, offset, text):
+    rig = gearbox([0.0, offset])
+    pulses = np.sort(rig.pulse_times + rng.normal(0.0, 2e-6, rig.pulse_times.size))
+    found, = doubts(rig, pulses, orders=rig.orders, ratio=2.5)
+    assert text in found
+
+
 def test_noise_alone_is_seldom_taken_for_an_order(rng):
     """Of 30 recordings of noise at most one has an order above it, by chance."""
     time, missed = np.arange(20_000) / 2e3, 0

@@ -83,27 +83,10 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
     The shaft has turned `teeth` (n,) at `times` (n,) in s; the first sample was at `start`. None
     where too few teeth passed during the samples.
     """
-    end = start + (len(samples) - 1) / rate
-    inside = (times >= start) & (times <= end)
-    times, teeth = times[inside], teeth[inside]
-    if times.size < 3 or teeth[-1] - teeth[0] < _FEWEST_TEETH:
+    angular = angle_spectrum(samples, start, rate, times, teeth, fewest=_FEWEST_TEETH)
+    if angular is None:
         return None
-    most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
-    if (times[-1] - times[0]) * rate > most:  # its first part
-        count = int(np.searchsorted(times, times[0] + most / rate))
-        if count < 3 or teeth[count - 1] - teeth[0] < _FEWEST_TEETH:
-            return None
-        times, teeth = times[:count], teeth[:count]
-    turned = teeth[-1] - teeth[0]
-    points = int((times[-1] - times[0]) * rate)
-    angle = teeth[0] + turned * np.arange(points) / points
-    position = (np.interp(angle, teeth, times) - start) * rate
-    over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
-    over_angle -= over_angle.mean(axis=0)
-    window = np.hanning(points + 1)[:-1, None]
-    spectrum = np.abs(np.fft.rfft(over_angle * window, axis=0))[:int(0.42 * points)]
-    step = 1.0 / turned
-    base = _background(spectrum)
+    spectrum, base, step = angular
     share = spectrum / np.maximum(base, np.finfo(float).tiny)
     size, level = share.max(axis=1), (spectrum / np.max(spectrum, axis=0)).max(axis=1)
     peak = np.zeros(size.size, np.bool_)
@@ -117,6 +100,33 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
     bend = left - 2.0 * middle + right
     offset = np.where(bend < 0.0, 0.5 * (left - right) / np.minimum(bend, -1e-12), 0.0)
     return Lines((found + np.clip(offset, -0.5, 0.5)) * step, size[found], level[found], step)
+
+
+def angle_spectrum(samples: FloatArray, start: float, rate: float, times: FloatArray,
+                   turned: FloatArray, *, fewest: float
+                   ) -> tuple[FloatArray, FloatArray, float] | None:
+    """
+    Return the amplitude spectrum (bin, channel) over the angle, its background, and its bin.
+
+    `samples` and the angles `turned` (n,) at `times` (n,) in s are those of `find_lines`. None
+    where the shaft turns by less than `fewest` during the samples.
+    """
+    end = start + (len(samples) - 1) / rate
+    inside = (times >= start) & (times <= end)
+    times, turned = times[inside], turned[inside]
+    most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
+    count = int(np.searchsorted(times, times[0] + most / rate)) if times.size else 0
+    times, turned = times[:count], turned[:count]
+    if times.size < 3 or turned[-1] - turned[0] < fewest:
+        return None
+    points = int((times[-1] - times[0]) * rate)
+    angle = turned[0] + (turned[-1] - turned[0]) * np.arange(points) / points
+    position = (np.interp(angle, turned, times) - start) * rate
+    over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
+    over_angle -= over_angle.mean(axis=0)
+    window = np.hanning(points + 1)[:-1, None]
+    spectrum = np.abs(np.fft.rfft(over_angle * window, axis=0))[:int(0.42 * points)]
+    return spectrum, _background(spectrum), 1.0 / float(turned[-1] - turned[0])
 
 
 def _background(spectrum: FloatArray) -> FloatArray:

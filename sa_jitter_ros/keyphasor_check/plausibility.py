@@ -10,17 +10,22 @@
 
 """Whether pulses, vibration and declaration can belong together: a sentence for each doubt."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
+from sa_jitter_ros.keyphasor_check.lines import angle_spectrum
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses
+from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.unit_check import likely_mistake
+from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
@@ -28,8 +33,21 @@ _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000
 _SHORT = 0.8  # of the vibration
-_CYCLES = 20  # at least 4, of which the noise is measured
-_CLEAR = 4.0  # amplitude over its noise, which noise alone exceeds in 3e-4 of orders
+_FEWEST_REVOLUTIONS = 12
+_LONGEST_GAP = 10.0  # trigger cycles without a pulse
+# Bins of a peak on either side, and of what is beside it; the peak over the median of the
+# spectrum around, which noise alone exceeds in 5e-5 of orders, and over what is beside it.
+_PEAK, _SKIRT = 1, (3, 7)
+_CLEAR, _ABOVE = 4.0, 1.5
+# Places at which a spectrum is looked at for peaks there by chance; probability that so many stand
+# by chance, above which nothing is said for the orders; other numbers of marks, in parts of the
+# stated one, and by how much the logarithms of the peaks are larger with them on average.
+_PLACES, _BY_CHANCE = 400, 0.05
+_OTHER_MARKS = (Fraction(1, 2), 2, Fraction(1, 3), 3, Fraction(1, 4), 4, Fraction(1, 8), 8)
+_LARGER = 0.7
+_MOST_VALIDATED = 100_000
+_UNUSED, _FEW = 0.25, 20  # of the time without a trigger cycle, and pulses in it
+_MOST_STRAYS = 0.05
 _OTHER_SIZE, _SURE = 3.0, 4.0  # times as large; standard errors
 
 
@@ -65,57 +83,135 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
         found.append(f'the pulses span {np.ptp(pulses):.6g} s, the vibration spans '
                      f'{recording.duration:.6g} s: check that both were recorded together, and '
                      'their sampling rates')
-    if orders:
-        found += _weak(recording, pulses, orders=list(orders), ratio=ratio,
-                       pulses_per_revolution=pulses_per_revolution,
-                       pulses_per_trigger=pulses_per_trigger, missing_teeth=missing_teeth)
+    target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
+              'pulses_per_trigger': pulses_per_trigger}
+    unfit = _unfit(pulses, target)
+    found += unfit
+    if orders and not unfit:  # which has one cause with it
+        found += weak_orders(recording, pulses, orders, ratio=ratio, **target)
     if jitter_std:
         found += _other_jitter(pulses, jitter_std)
     return tuple(found)
 
 
-def _weak(recording: Recording, pulses: FloatArray, *, orders: list[float], ratio: float,
-          pulses_per_revolution: int, pulses_per_trigger: int | None, missing_teeth: int
-          ) -> list[str]:
-    """Return whether no order stands above its noise."""
+def _validated(pulses: FloatArray, target: Mapping[str, Any]
+               ) -> tuple[PulseValidator, TriggerPulses] | None:
+    """Return the trigger pulses of pulses (n,) in s, and what found them; None if it cannot."""
+    try:
+        validator = PulseValidator(**{
+            **target, 'pulses_per_trigger': target['pulses_per_trigger'] or None})
+    except SaJitterError:
+        return None
+    pulses = pulses[:_MOST_VALIDATED]
+    return validator, TriggerPulses.joined([validator.update(pulses), validator.flush()])
+
+
+def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
+    """Return what pulses (n,) in s do not have in common with their target."""
+    found = _validated(pulses, target)
+    if found is None:
+        return []
+    validator, triggers = found
+    pulses = pulses[:_MOST_VALIDATED]
+    messages, counts = validator.take_messages(), validator.finish()
+    strays = counts.doubles + counts.early + counts.unlocked
+    begins = np.flatnonzero(~triggers.starts_run[1:])
+    ends = triggers.times[np.append(begins + 1, -1)[:begins.size]]
+    used = np.concatenate(([pulses[0]], ends)), np.append(triggers.times[begins], pulses[-1])
+    longest = int(np.argmax(used[1] - used[0]))
+    start, end = float(used[0][longest]), float(used[1][longest])
+    inside = int(np.count_nonzero((pulses >= start) & (pulses <= end)))
+    if end - start > _UNUSED * np.ptp(pulses) and inside > _FEW:
+        of = f'{validator.pulses_per_revolution} marks a revolution'
+        if target['missing_teeth']:
+            of += f', {target["missing_teeth"]} of them missing'
+        return [f'the {inside} pulses from {start:.6g} s to {end:.6g} s give no trigger cycle: '
+                f'they are not those of a target with {of}; does the target, or the signal, '
+                'change there? Check pulses_per_revolution and missing_teeth (check_keyphasor '
+                'finds them)']
+    if messages:
+        return messages[:1]
+    if strays > _MOST_STRAYS * pulses.size:
+        return [f'{strays} of {pulses.size} pulses are strays: is there a second keyphasor of '
+                'the same name, a second mark (pulses_per_revolution), or too little hysteresis?']
+    return []
+
+
+def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float], *,
+                ratio: float, **target: Any) -> tuple[str, ...]:
+    """
+    Return a sentence if no more orders stand above their noise than by chance, nothing else.
+
+    An order stands where the spectrum over the angle has a peak; what leaks from its neighbours
+    is none. So many peaks as there are anywhere in the spectrum are there by chance. `pulses`
+    (n,) in s are those of a `target` with `pulses_per_revolution`, `pulses_per_trigger` and
+    `missing_teeth`.
+    """
+    found = _validated(pulses, target)
+    if found is None:
+        return ()
+    validator, triggers = found
+    if triggers.times.size < 2:
+        return ()
+    gaps = np.diff(triggers.times, prepend=triggers.times[0])
+    # Between these parts the angle is not known, or the shaft stands still.
+    parts = np.cumsum(triggers.restarted | (gaps > _LONGEST_GAP * np.median(gaps)))
+    chosen = parts == np.argmax(np.bincount(parts))
+    times = triggers.times[chosen]
+    share = validator.pulses_per_trigger / validator.pulses_per_revolution
     count = round(min(_FIRST_SECONDS * recording.sample_rate, recording.samples,
                       _MOST_VALUES / recording.channels))
-    try:
-        samples = next(recording.blocks(max(count, 1)))
-        stop = recording.start_time + samples.shape[1] / recording.sample_rate
-        averager = Averager(
-            recording.sample_rate, start_time=recording.start_time, ratio=ratio, orders=orders,
-            pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
-            missing_teeth=missing_teeth, trigger_cycles=_CYCLES)
-        averages = averager.update(samples, pulses[pulses <= stop])
-    except SaJitterError:
-        return []
-    if not averages:
-        return []
-    with np.errstate(divide='ignore', invalid='ignore'):
-        clear = np.array([np.abs(item.amplitudes) / item.noise for item in averages])
-    return list(weak_orders(clear, orders, speed=float(np.median(
-        [item.trigger_speed for item in averages])), ratio=ratio))
-
-
-def weak_orders(clear: FloatArray, orders: Sequence[float], *, speed: float, ratio: float
-                ) -> tuple[str, ...]:
-    """
-    Return a sentence if no order stands above its noise, nothing else.
-
-    `clear` (average, channel, order) are amplitudes over their noise, NaN where there is none;
-    `speed` of the tach shaft in Hz.
-
-    >>> weak_orders(np.array([[[5.0, 0.8]]]), (19.0, 38.0), speed=20.0, ratio=1.0)
-    ()
-    """
-    known = clear[:, ~np.isnan(clear).any(axis=0)]
-    if not known.size or np.any(np.median(known, axis=0) > _CLEAR):
+    samples = next(recording.blocks(max(count, 1)))
+    spectrum = angle_spectrum(
+        np.nan_to_num(samples.T, posinf=0.0, neginf=0.0), recording.start_time,
+        recording.sample_rate, times, triggers.count[chosen] * share, fewest=_FEWEST_REVOLUTIONS)
+    if spectrum is None:
         return ()
-    listed = ', '.join(f'{order:g}' for order in orders[:6])
-    return (f'none of the orders {listed} stands above its noise at {speed:.4g} Hz and ratio '
-            f'{ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
-            '(check_keyphasor finds them)',)
+    places = ratio * np.asarray(orders)
+    sizes = _sizes(*spectrum, places)
+    stand = sizes > 0.0
+    least, most = 0.8 * float(places.min()), 1.2 * float(places.max())
+    chance = float(np.mean(_sizes(*spectrum, np.linspace(least, most, _PLACES)) > 0.0))
+    count, listed = int(np.count_nonzero(stand)), ', '.join(f'{order:g}' for order in orders[:6])
+    speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.maximum(
+        np.diff(triggers.count[chosen]), 1)))
+    by_chance = float(special.betainc(count, stand.size - count + 1, chance)) if count else 1.0
+    if count < stand.size and by_chance > _BY_CHANCE:
+        beyond = ' more often than by chance' if count else ''
+        return (f'none of the orders {listed} stands above its noise{beyond} at {speed:.4g} Hz '
+                f'and ratio {ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
+                '(check_keyphasor finds them)',)
+    if count < stand.size:
+        marks = validator.pulses_per_revolution
+        for other in _OTHER_MARKS:
+            fitting = round(other * marks)
+            if fitting != other * marks:
+                continue
+            others = _sizes(*spectrum, places / float(other))
+            if others.min() > 0.0 and others.sum() > sizes.sum() + _LARGER * sizes.size:
+                return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} '
+                        f'Hz and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead '
+                        f'of {marks} all of them do (check_keyphasor finds out)',)
+    return ()
+
+
+def _sizes(spectrum: FloatArray, base: FloatArray, step: float, places: FloatArray
+           ) -> FloatArray:
+    """
+    Return logarithms of the peaks of a spectrum (bin, channel) at places (n,), 0 for none.
+
+    They are relative to the spectrum around, its `base`; a bin is `step`.
+    """
+    found = np.zeros(places.size)
+    for number, at in enumerate(np.rint(places / step).astype(int).tolist()):
+        if not _SKIRT[1] < at < len(spectrum) - _SKIRT[1]:
+            continue
+        peak = spectrum[at - _PEAK:at + _PEAK + 1].max(axis=0)
+        beside = np.concatenate([spectrum[at + sign * np.arange(*_SKIRT)] for sign in (-1, 1)])
+        above = np.maximum(base[at], np.finfo(float).tiny)
+        stands = (peak > _CLEAR * above) & (peak > _ABOVE * beside.max(axis=0))
+        found[number] = np.log(np.where(stands, peak / above, 1.0)).max()
+    return found
 
 
 def _other_jitter(pulses: FloatArray, declared: float) -> list[str]:

@@ -145,19 +145,18 @@ class RecordingAverager:
     def doubts(self, series: Sequence[ShaftSeries]) -> tuple[str, ...]:
         """Return what contradicts each other in recording, settings and averages of the shafts."""
         rate = self._values['keyphasor_rate']
+        target = {name: self._values[name] for name in (
+            'pulses_per_revolution', 'pulses_per_trigger', 'missing_teeth')}
         found = list(doubts(
-            self._recording, self._pulses,
+            self._recording, self._pulses, **target,
             jitter_std=1.0 / math.sqrt(12.0) / rate
             if rate and self._recording.tach is None else None))
         weak = []  # a shaft of which the vibration shows nothing is no mistake beside others
         for item in series:
             settings = self._stream.shafts[item.shaft].settings
-            amplitude, noise = item.field('raw_amplitude'), item.field('noise_standard_deviation')
-            with np.errstate(divide='ignore', invalid='ignore'):
-                clear = amplitude / noise
             weak.append(weak_orders(
-                clear, item.orders.tolist(), speed=float(np.median(item['trigger_speed'])),
-                ratio=settings.cycle_length / settings.revolutions_per_trigger))
+                self._recording, self._pulses, item.orders.tolist(),
+                ratio=settings.cycle_length / settings.revolutions_per_trigger, **target))
         return (*found, *(weak[0] if all(weak) else ()))
 
     def _arrays(self, averages: list[tuple[str, Average]]
