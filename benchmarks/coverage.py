@@ -148,6 +148,45 @@ def amplitude_table(trials: int) -> Iterator[str]:
                        + f' | {shares(item.phase["strong"])} | ' + ' | '.join(limits) + ' |')
 
 
+def strong_amplitudes(cycles: int, turn: float, uniform: bool, trials: int, seed: int
+                      ) -> FloatArray:
+    """
+    Return mean amplitudes (trial,) of an order without noise, of amplitude 1.
+
+    Independent errors of the pulses turn it by `turn` rad (standard deviation).
+    """
+    rng = np.random.default_rng(seed)
+    draw = (rng.uniform(-np.sqrt(3.0), np.sqrt(3.0), (trials, cycles + 1)) if uniform
+            else rng.standard_normal((trials, cycles + 1)))
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    u = 0.5 * (nodes + 1.0)
+    return np.abs(sum(np.exp(1j * turn * (np.outer(draw[:, k], 1.0 - u)
+                                          + np.outer(draw[:, k + 1], u))) @ (0.5 * weights)
+                      for k in range(cycles)) / cycles)
+
+
+def shape_table(trials: int) -> Iterator[str]:
+    """
+    Iterate over the lines of the table of shapes of the pulse errors.
+
+    It shows how often the mean plus and minus 1 / 1.96 exact standard deviations of one shape
+    contains amplitudes of the other one: what a perfect estimate of the size would reach.
+    """
+    yield ('| N_t | jitter | standard deviation, uniform | normal | uniform errors in intervals '
+           'of uniform ones | normal in uniform | normal in normal | uniform in normal |')
+    yield '|' + '---|' * 8
+    for cycles in (5, 10):
+        for turn in (0.3, 0.8, 1.6):
+            drawn = [strong_amplitudes(cycles, turn, uniform, trials, seed=1000 + cycles)
+                     for uniform in (True, False)]
+            z = [(sizes - sizes.mean()) / by.std()
+                 for by, order in ((drawn[0], (0, 1)), (drawn[1], (1, 0)))
+                 for sizes in (drawn[item] for item in order)]
+            yield (f'| {cycles} | {turn:g} rad | '
+                   + ' | '.join(f'{sizes.std():.4f}' for sizes in drawn) + ' | '
+                   + ' | '.join(map(shares, z)) + ' |')
+
+
 def indicator_coverage(noise: float, damage: float, cycles: int, channels: int, seed: int
                        ) -> dict[str, FloatArray]:
     """
@@ -190,9 +229,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--trials', type=int, default=900, help='averages of a row; 0: no table')
     parser.add_argument('--indicators', type=int, default=1500, help='channels; 0: no table')
+    parser.add_argument('--shapes', type=int, default=20000, help='averages of a row; 0: no table')
     options = parser.parse_args()
     if options.trials:
         print('\n'.join(amplitude_table(options.trials)), '', sep='\n', flush=True)
+    if options.shapes:
+        print('\n'.join(shape_table(options.shapes)), '', sep='\n', flush=True)
     if options.indicators:
         print('\n'.join(indicator_table(options.indicators)), flush=True)
 

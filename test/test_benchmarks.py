@@ -22,6 +22,7 @@ import sys
 
 import numpy as np
 import pytest
+import sa_jitter_ros as sa
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / 'benchmarks'
@@ -113,6 +114,17 @@ def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
         error = 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
         assert -0.03 - error < off < safe + error
     assert raw.upper['absent'].mean() > 0.92
+
+
+@pytest.mark.parametrize(('uniform', 'distribution'), [(True, 'uniform'), (False, 'normal')])
+def test_drawn_strong_amplitudes_are_those_that_are_predicted(benchmark, uniform, distribution):
+    drawn = benchmark('coverage').strong_amplitudes(5, 0.8, uniform, 20000, seed=1)
+    std = 0.8 / (2.0 * np.pi * 16.0 * 25.0)
+    wanted = sa.predict(keyphasor_rate=1.0 / (np.sqrt(12.0) * std), trigger_speed=25.0,
+                        trigger_cycles=5, orders=[16.0], jitter_distribution=distribution,
+                        jitter_std=0.0 if uniform else std)
+    assert drawn.mean() == pytest.approx(wanted.mean_attenuation[0], rel=3e-3)
+    assert drawn.std() == pytest.approx(wanted.standard_deviation[0], rel=0.03)
 
 
 @pytest.mark.campaign
