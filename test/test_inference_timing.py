@@ -22,7 +22,7 @@ from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.lattice import smooth_on_grid
 from sa_jitter_ros.effects.timing import MOTION
 from sa_jitter_ros.inference.limits import largest
-from sa_jitter_ros.inference.timing import read_timing
+from sa_jitter_ros.inference.timing import read_timing, refitted
 from sa_jitter_ros.inference.timing_choice import Chooser
 from sa_jitter_ros.inference.timing_data import steering, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
@@ -60,6 +60,17 @@ def test_effect_is_found_with_its_size(name):
         assert timing.probabilities[name] > 0.45  # half of it, where two names share the power
     assert np.max(np.abs(off)) < 4.0
     assert np.sqrt(np.mean(np.square(off))) < 2.0
+
+
+def test_parameters_that_fit_more_pulses_are_surer():
+    first, second = machine(3, skew=2e-5), machine(4, skew=2e-5)
+    timing = read_timing([first])
+    again = refitted(timing, [first, second], [])
+    assert names_of(again) == names_of(timing) == {'clock_skew'}
+    assert again.probabilities == timing.probabilities
+    value, error = value_of(again, 'clock_skew', 'skew')
+    assert error == pytest.approx(value_of(timing, 'clock_skew', 'skew')[1] / np.sqrt(2.0), rel=.1)
+    assert abs(value - 2e-5) < 4.0 * error
 
 
 def test_uneven_marks_are_found_mark_by_mark():

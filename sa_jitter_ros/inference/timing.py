@@ -195,6 +195,24 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
     return Timing(findings, _probabilities(choice, findings), chooser, choice, checks)
 
 
+def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect]) -> Timing:
+    """
+    Return what was chosen, with parameters that fit other stretches.
+
+    It is `timing` itself where ticks of a clock make all errors, or where other effects result.
+    """
+    if timing.choice.ticked:
+        return timing
+    chooser, best = Chooser(parts, declared), timing.choice.best
+    fit = chooser.fit(best, timing.choice.fit.starts)
+    choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
+                     setting=chooser.setting)
+    findings = tuple(_findings(chooser, choice))
+    if [item.name for item in findings] != [item.name for item in timing.findings]:
+        return timing
+    return replace(timing, findings=findings)
+
+
 def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:
     """Return the probability of each effect; power beyond the declared is of two names."""
     found = {name: value for name, value in choice.probabilities.items() if name in EFFECTS}

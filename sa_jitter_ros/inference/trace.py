@@ -45,7 +45,7 @@ from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
 from sa_jitter_ros.inference.residual import ACCURACY, Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
-from sa_jitter_ros.inference.timing import read_timing, stretches, Timing
+from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
@@ -77,6 +77,9 @@ _SAME_CLOCK = 0.01
 class Trace:
     """
     Result of the trace; `before` and `after` are residuals of held-out acquisitions.
+
+    The parameters of `findings` and `present` fit all acquisitions; residuals and predictions are
+    those of parameters that fit the others.
 
     `dependences_before` and `dependences_after` are their changes with order, speed and cycles.
     `prediction_before` and `prediction_after` are predictions for all acquisitions
@@ -256,7 +259,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        tuple(chosen), tuple(present), tuple(candidates), before, after, at_first, moves,
+        tuple(_on_all(bench, timing, chosen)), tuple(_on_all(bench, timing, present)),
+        tuple(candidates), before, after, at_first, moves,
         attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
@@ -309,6 +313,22 @@ def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
         more.append(winner.finding)
         say(f'found {winner.name}: {winner.finding.evidence}')
     return more, tried, evidence
+
+
+def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings with parameters that fit all acquisitions, as all scores are known."""
+    everything = range(len(bench.observation.acquisitions))
+    of_timing = {} if timing is None else {item.name: item for item in refitted(
+        timing, stretches(bench.observation, everything, bench.clock), bench.declared).findings}
+    found: list[Finding] = []
+    for finding in findings:
+        kind = EFFECTS[finding.name]
+        again = kind.fit(bench.gather(_effects(found), everything)) if issubclass(
+            kind, DirectEffect) else of_timing.get(finding.name)
+        found.append(finding if again is None or again.effect is None else replace(
+            finding, effect=again.effect, standard_errors=again.standard_errors,
+            evidence=again.evidence))
+    return found
 
 
 def _little_is_gained(chosen: Sequence[Finding], before: Residual, after: Residual) -> str:
