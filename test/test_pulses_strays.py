@@ -399,6 +399,22 @@ def test_missing_pulses_beside_steps_of_a_clock_cost_themselves_only(share):
     assert lost < 20
 
 
+@pytest.mark.parametrize('marks', [2, 4, 8])
+def test_uneven_marks_are_matched_again_behind_a_step_of_the_time(marks):
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        places = np.arange(marks) / marks + rng.normal(0.0, 0.003, marks)
+        pulses = (np.arange(60)[:, None] + places).ravel() / 25.0
+        pulses += rng.normal(0.0, 5e-6, pulses.size)
+        pulses[pulses.size // 2 + seed % marks:] += rng.uniform(0.2, 1.0)
+        validator = PulseValidator(pulses_per_revolution=marks)
+        found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
+        counts = validator.finish()
+        assert (counts.accepted, counts.late) == (pulses.size, 1)
+        turned = np.diff(np.searchsorted(pulses, found.times))[~found.starts_run[1:]]
+        assert np.all(turned == marks)
+
+
 def test_every_other_pulse_that_stays_away_is_named():
     validator = PulseValidator()
     validator.update(np.arange(60) / 30.0)

@@ -58,6 +58,7 @@ _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
 _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
 _LONGEST_GAP = 1000.0  # revolutions
+_LONG = 2.0  # revolutions, of a gap behind which the marks are matched again
 _LACKING = 6  # intervals in a row with as many missing pulses that show another pulse rate
 _NO_INTERVALS = np.empty(0)
 _FITS = 0.1  # tolerance with which a pulse after a step of time fits
@@ -410,7 +411,10 @@ class IntervalJudge:
             if passed and passed == self._slots_in(gap, after, self._slot):
                 slots, steps = self._passed(passed)
                 known = True
-        if not known and (self._rehearses or not self._lock_is_plain):
+        assert self._lock is not None
+        # A step of the time may be whole by chance: uneven marks tell which of them comes next.
+        long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
+        if (not known or long) and (self._rehearses or not self._lock_is_plain):
             self._lose()
             return
         if after is not None and abs(after - model.level) > tolerance:
