@@ -102,6 +102,16 @@ def test_lines_that_beat_otherwise_were_not_interpolated(rng):
     assert method(np.stack([np.roll(row, n) for row, n in zip(beat.T, delay)], axis=1)) == ''
 
 
+def test_a_sideband_of_one_order_is_no_beat(rng):
+    cycle = np.arange(240)[:, None]
+    beat = beats(FREQUENCY, (0.0873 * cycle) % 1.0)
+    noise = rng.normal(0.0, 0.05, beat.shape)
+    noise[:, -1] *= 0.1  # the other orders could not show it
+    alone = np.where(np.arange(FREQUENCY.size) == FREQUENCY.size - 1, beat, 0.0)
+    assert find_beat(alone + noise, FREQUENCY).method == ''
+    assert find_beat(beat + 0.1 * noise, FREQUENCY).method == 'linear'
+
+
 def test_errors_within_ticks_are_separated_from_larger_ones(rng):
     clock = 4000.0
     grid = rng.uniform(-0.5, 0.5, (8, 21)) / clock

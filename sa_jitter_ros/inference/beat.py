@@ -35,6 +35,7 @@ _OFF = 0.15  # depth beside that of samples at even places between the others
 _KNOWN = 0.05  # error of the shape
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 _POOR = 3.0  # mean square misfit of the depths, in their errors, that is no interpolator's
+_OTHERS = 1e-3  # p value of the other orders at the beat of the one that shows it best
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,11 @@ def find_beat(radial: Array, frequency: Array) -> Beat:
         least = min(least, float(np.exp(np.min(chance))))
         peak = int(np.argmin(np.where(fitting, chance, np.inf)))
         if not (fitting[peak] and chance[peak] < rarest):
+            continue
+        shown = np.abs(swings[peak] / error[peak]) * swing / mean
+        others = frequency != frequency[np.argmax(shown)]  # a sideband is one order's alone
+        here = np.ix_([peak], others)
+        if _fits(swings[here], (swing / mean)[others], error[here])[0][0] > np.log(_OTHERS):
             continue
         rarest = chance[peak]
         depth = np.abs(swings[peak])
