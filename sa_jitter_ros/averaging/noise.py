@@ -137,25 +137,52 @@ def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float)
     order, in phase with it (pulse errors only turn the order), without lines of other orders and
     tones.
     """
-    flat = grid.reshape(-1, grid.shape[2]).T
-    window = np.hanning(flat.shape[1] + 1)[:-1]
-    turns = cycles / grid.shape[1] * np.arange(flat.shape[1])
+    flat = np.ascontiguousarray(grid.reshape(-1, grid.shape[2]).T)
+    window, waves = _windowed_waves(cycles, grid.shape[1], flat.shape[1], tuple(orders.tolist()))
     lines = len(grid) * cycles
     floors = []
-    for order in orders:
-        turned = flat * np.exp(-2j * np.pi * order * turns)
-        turned = turned * np.exp(-1j * np.angle(turned.mean(axis=1, keepdims=True)))
+    for order, (cos, sin) in zip(orders, waves):
+        phase = np.angle(flat @ cos - 1j * (flat @ sin))[:, None]
+        in_phase = 2.0 * flat * window
+        in_phase *= np.cos(phase) * cos - np.sin(phase) * sin
         reach = int(np.clip((top - order) * lines, 4 * _LOBE, max(_AROUND, 100.0 * lines)))
-        spectrum = np.fft.rfft(2.0 * turned.real * window, axis=1)[:, _LOBE:reach]
+        spectrum = np.fft.rfft(in_phase, axis=1)[:, _LOBE:reach]
         floors.append(_without_lines(np.abs(spectrum) ** 2))
-    return np.sqrt(np.array(floors).T / (flat.shape[1] * np.sum(window**2)))
+    return np.asarray(np.sqrt(np.array(floors).T / (flat.shape[1] * np.sum(window**2))))
+
+
+@lru_cache(maxsize=4)
+def _windowed_waves(cycles: float, points: int, size: int, orders: tuple[float, ...]
+                    ) -> tuple[FloatArray, FloatArray]:
+    """Return a window (size,) and cosine and sine of orders (order, 2, size)."""
+    turns = 2.0 * np.pi * cycles / points * np.arange(size)
+    return np.hanning(size + 1)[:-1], np.array(
+        [[np.cos(order * turns), np.sin(order * turns)] for order in orders])
+
+
+def row_medians(values: FloatArray) -> FloatArray:
+    """
+    Return the medians (row,) of finite `values` (row, value), several times as fast as numpy.
+
+    >>> row_medians(np.array([[3.0, 1.0, 2.0, 10.0], [0.0, 1.0, 4.0, 4.0]])).tolist()
+    [2.5, 2.5]
+    """
+    middle = values.shape[1] // 2
+    ordered = np.partition(values, middle, axis=1)
+    if values.shape[1] % 2:
+        return np.asarray(ordered[:, middle])
+    return np.asarray(0.5 * (ordered[:, :middle].max(axis=1) + ordered[:, middle]))
 
 
 def _without_lines(power: FloatArray) -> FloatArray:
     """Return the mean of exponentially distributed values (row, value) without outliers."""
-    floor = np.median(power, axis=1) / np.log(2.0)
+    floor = row_medians(power) / np.log(2.0)
     kept = 1.0 - _OUTLIER * np.exp(-_OUTLIER) / (1.0 - np.exp(-_OUTLIER))
+    before = np.zeros(power.shape, np.bool_)
     for _ in range(10):
         low = power < _OUTLIER * floor[:, None]
+        if np.array_equal(low, before):
+            break
+        before = low
         floor = np.sum(power, axis=1, where=low) / np.maximum(low.sum(axis=1), 1) / kept
     return np.asarray(floor)

@@ -29,14 +29,15 @@ it leaves, over angle (orders) and over time (tones): the sharper peak decides w
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.noise import row_medians
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len
-from scipy.linalg import (
-    cho_factor, cho_solve, cho_solve_banded, cholesky_banded, solveh_banded)
+from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.special import gammaincc, gammainccinv
 
 Array = NDArray[np.float64]
@@ -79,7 +80,6 @@ _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noi
 # errors, are, so that they are hardly shrunk; up to so many turns of the highest declared order.
 _WEAK, _MOST_TURNS = 3.0, 0.25
 _SAMPLED = 60  # variances of which the median stands for all
-_NEARBY = 12  # cycles on either side that determine a variance
 _LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
 _LEAST_KEPT = 1e-6  # of a bend by its prior, below which the vibration tells nothing of it
 _RIDGE = 1e-9
@@ -270,6 +270,7 @@ class _States:
         self.turn = np.exp(2j * np.pi * (self.cycle_length * cycle * self.orders % 1.0))
         self.turn *= self.whole[:, None]
         self.wave = np.exp(2j * np.pi * self.cycle_length * self.orders[:, None] * self.u)
+        self.reading = np.ascontiguousarray(self.wave.conj().T).view(np.float64).T
         self.in_time = np.exp(2j * np.pi * self.tones[:, None, None]
                               * (self.place - self.start_time)) * self.whole[:, None]
         straight = (self.turn.conj().T @ self.turn) * (self.wave.conj() @ self.wave.T)
@@ -286,14 +287,17 @@ class _States:
         self.normal = np.block([[0.5 * (straight + mirrored).real, -cross],
                                 [-cross.T, 0.5 * (straight - mirrored).real]])
 
-    def _signal(self, amplitudes: ComplexArray) -> Array:
-        """Return the sum (cycle, point) of the lines with amplitudes (line,)."""
+    def _signals(self, amplitudes: ComplexArray) -> Array:
+        """Return the sums (channel, cycle, point) of lines with amplitudes (channel, line)."""
         n = self.orders.size
-        part = amplitudes[:n] * self.turn
-        total = part.real @ self.wave.real - part.imag @ self.wave.imag
-        for amplitude, tone in zip(amplitudes[n:], self.in_time):
-            total += amplitude.real * tone.real - amplitude.imag * tone.imag
-        return np.asarray(total)
+        # each order turned, its real and imaginary part side by side
+        parts = np.multiply(amplitudes[:, None, :n], self.turn, order='C').view(np.float64)
+        found = (parts.reshape(-1, 2 * n) @ self.reading).reshape(
+            len(parts), -1, self.u.size)
+        for total, row in zip(found, amplitudes[:, n:]):
+            for amplitude, tone in zip(row, self.in_time):
+                total += amplitude.real * tone.real - amplitude.imag * tone.imag
+        return np.asarray(found)
 
     def _sums(self, values: Array, shapes: Array | None = None) -> ComplexArray:
         """
@@ -302,8 +306,8 @@ class _States:
         With `shapes` (shape, point), which multiply the values, they are (cycle, shape, line).
         """
         some = np.ones((1, self.u.size)) if shapes is None else shapes
-        wave = (some[:, None] * self.wave).reshape(-1, self.u.size)
-        found = (values @ wave.real.T + 1j * (values @ wave.imag.T)).reshape(
+        wave = np.ascontiguousarray((some[:, None] * self.wave).reshape(-1, self.u.size).T)
+        found = (values @ wave.view(np.float64)).view(np.complex128).reshape(
             len(values), len(some), -1)
         found *= self.turn[:, None]
         if self.tones.size:
@@ -312,9 +316,8 @@ class _States:
         return np.asarray(found if shapes is not None else found[:, 0])
 
     def _residual(self) -> Array:
-        gain = 1.0 + self.states[:-1, -1:]
-        return np.stack([seen - gain * self._signal(row)
-                         for seen, row in zip(self.vibration, self.amplitudes)])
+        return np.asarray(self.vibration - (1.0 + self.states[:-1, -1:]) * self._signals(
+            self.amplitudes))
 
     def fit_amplitudes(self) -> None:
         """Fit the amplitudes of all lines with the states as they are."""
@@ -332,14 +335,15 @@ class _States:
     def step(self, *, weak: float = 1.0, move: bool = True) -> float:
         """Do a Gauss-Newton step; return the RMS change of the pulse errors (s)."""
         self._make_tables()
-        residual = self._residual()
+        of_orders = np.arange(self.amplitudes.shape[1]) < self.orders.size
+        moving = self._signals(of_orders * self.amplitudes)
+        residual = self._residual() if self.tones.size else (
+            self.vibration - (1.0 + self.states[:-1, -1:]) * moving)
         points = self.whole.sum() * self.u.size
         self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
-        of_orders = np.arange(self.amplitudes.shape[1]) < self.orders.size
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
-        rate = np.stack([self.slope[:, None] * self._signal(turns * row)
-                         for row in self.amplitudes])
-        moving = np.stack([self._signal(of_orders * row) for row in self.amplitudes])
+        rate = self._signals(turns * self.amplitudes)
+        rate *= self.slope[:, None]
         solution = self._solve(residual, (rate, moving), weak)
         change, amplitudes = solution
         self.change = change[:, 0]
@@ -358,62 +362,79 @@ class _States:
                ) -> tuple[Array, ComplexArray]:
         """Return the changes of states (pulse, state) and amplitudes (channel, line)."""
         pulses, width = self.states.shape
-        count, channels = width * pulses, len(residual)
         by = [*[0] * (width - 1), 1, 0]  # which derivative a state goes with
-        square = {(i, j): np.einsum('c,ckp,ckp->kp', self.weight, derivative[i], derivative[j])
-                  for i, j in ((0, 0), (0, 1), (1, 1))}
-        right = [np.einsum('c,ckp,ckp->kp', self.weight, item, residual) for item in derivative]
-        band, down = np.zeros((width + 1, count)), np.zeros(count)
-        first = width * np.arange(pulses - 1)
-        for i, shape in enumerate(self.shapes):
-            down[first + i] += right[by[i]] @ shape
-            for j in range(i + 1):
-                both = square[min(by[i], by[j]), max(by[i], by[j])]
-                band[width - (i - j), first + i] += both @ (shape * self.shapes[j])
+        cells, down = np.zeros((pulses, width + 1, width + 1)), np.zeros((pulses, width + 1))
+        weighted = [self.weight[:, None, None] * item for item in derivative]
+        for m, own in enumerate(weighted):
+            states = [i for i, which in enumerate(by) if which == m]
+            right = np.einsum('ckp,ckp->kp', own, residual)
+            down[:-1, states] = right @ self.shapes[states].T
+            for n in range(m + 1):
+                others = [i for i, which in enumerate(by) if which == n]
+                products = self.shapes[states][:, None] * self.shapes[others]
+                found = (np.einsum('ckp,ckp->kp', own, derivative[n])
+                         @ products.reshape(-1, self.u.size).T).reshape(-1, *products.shape[:2])
+                cells[:-1, np.array(states)[:, None], others] = found
+                cells[:-1, np.array(others)[:, None], states] = np.moveaxis(found, 1, 2)
         size = self.size * np.append(weak, np.ones(width - 1))
         precision = np.tile(size**-2.0, (pulses, 1))
         precision[~self.measured, 0] /= _NOT_MEASURED**2
         expected = self.states.copy()
         expected[:, 0] -= self.slow
-        band[width] += precision.ravel()
-        down -= (precision * expected).ravel()
+        total = precision + np.einsum('kii->ki', cells)[:, :-1]
+        total[1:, 0] += cells[:-1, -1, -1]
+        down[1:, 0] += down[:-1, -1]
+        down = down[:, :-1] - precision * expected
         border, corner, below = self._border(residual, derivative, by)
-        scale = 1.0 / np.sqrt(band[width])  # seconds and gains together
-        for j in range(width + 1):
-            band[j, width - j:] *= scale[width - j:] * scale[:count - width + j]
-        border *= scale[:, None]
+        scale = 1.0 / np.sqrt(total)  # seconds and gains together
+        scales = np.hstack([scale, np.roll(scale[:, :1], -1)])
+        cells *= scales[:, :, None] * scales[:, None, :]
+        border *= scale[:, :, None]
         down *= scale
-        factor = (cholesky_banded(band), False)
-        inner = cho_solve_banded(factor, border)
-        schur = cho_factor(corner - border.T @ inner)
-        amplitudes = cho_solve(schur, below - inner.T @ down)
-        change = cho_solve_banded(factor, down - border @ amplitudes) * scale
-        self.solved, self.band = (factor, inner, schur, scale), band
-        cos, sin = np.split(amplitudes.reshape(channels, -1), 2, axis=1)
-        return change.reshape(pulses, width), cos + 1j * sin
+        self.solved = solved = _Solved.of(cells, border, corner, scale)
+        amplitudes = cho_solve(solved.schur, below - border.reshape(
+            down.size, -1).T @ solved.of_states(down).ravel())
+        change = solved.of_states(down - border @ amplitudes) * scale
+        cos, sin = np.split(amplitudes.reshape(len(residual), -1), 2, axis=1)
+        return change, cos + 1j * sin
 
     def _border(self, residual: Array, derivative: tuple[Array, Array], by: Sequence[int]
                 ) -> tuple[Array, Array, Array]:
         """Return border, corner and right-hand side of the amplitudes (cos, sin by channel)."""
         pulses, width = self.states.shape
         channels, lines = self.amplitudes.shape
-        border = np.zeros((width * pulses, channels, 2 * lines))
+        border = np.zeros((pulses, width, channels, 2, lines))
         corner = np.zeros((channels, 2 * lines, channels, 2 * lines))
         below = np.zeros((channels, 2 * lines))
-        first = width * np.arange(pulses - 1)
         for c, weight in enumerate(self.weight):
             for which, item in enumerate(derivative):
                 states = [i for i, own in enumerate(by) if own == which]
-                found = weight * self._sums(item[c], self.shapes[states])
+                found = self._sums_of(item[c], which, c, self.shapes[states])
+                found *= weight
                 for i, row in zip(states, np.moveaxis(found, 1, 0)):
-                    border[first + i, c, :lines] += row.real
-                    border[first + i, c, lines:] -= row.imag
+                    place = border[1:, 0, c] if i == width else border[:-1, i, c]
+                    place[:, 0] += row.real
+                    place[:, 1] -= row.imag
             total = weight * self._sums(residual[c]).sum(axis=0)
             below[c] = np.append(total.real, -total.imag)
             corner[c, :, c] = weight * self.normal
         flat = corner.reshape(below.size, -1)
         flat[np.diag_indices(len(flat))] *= 1.0 + _RIDGE
-        return border.reshape(len(border), -1), flat, below.ravel()
+        return border.reshape(pulses, width, -1), flat, below.ravel()
+
+    def _sums_of(self, values: Array, which: int, channel: int, shapes: Array) -> ComplexArray:
+        """Return `_sums` of a derivative (cycle, point) of a channel, from its lines if faster."""
+        n = self.orders.size
+        if self.tones.size or 2 * n >= self.u.size:
+            return self._sums(values, shapes)
+        part = self.amplitudes[channel] * (self.turn if which else (
+            2j * np.pi * self.slope[:, None] * self.orders * self.turn))
+        wave = (shapes[:, None] * self.wave).reshape(-1, self.u.size)
+        each = np.ascontiguousarray(self.reading @ wave.T).view(np.float64)
+        found = (part.view(np.float64) @ each).view(np.complex128).reshape(
+            len(part), len(shapes), n)
+        found *= self.turn[:, None]
+        return np.asarray(found)
 
     def _variances(self, state: int, most: int = 0) -> Array:
         """
@@ -421,37 +442,19 @@ class _States:
 
         Those of pulse errors are about their mean, which nothing tells.
         """
-        factor, inner, schur, scale = self.solved
-        pulses, width = self.states.shape
+        solved, pulses = self.solved, self.times.size
         chosen = np.arange(pulses)
         if most:
             chosen = np.unique(np.linspace(2, pulses - 3, most).astype(int))
-        row = width * chosen + state
-        through = cho_solve(schur, inner[row].T)
-        variance = (self._local(row) + np.sum(inner[row] * through.T, axis=1)) * scale[row]**2
+        local, inner = solved.of_state(state, chosen)
+        through = cho_solve(solved.schur, inner.T)
+        variance = (local + np.sum(inner * through.T, axis=1)) * solved.scale[chosen, state] ** 2
         if state:
             return np.asarray(variance)
-        mean = np.zeros(width * pulses)
-        mean[::width] = scale[::width] * self.measured / self.measured.sum()
-        shared = cho_solve_banded(factor, mean) + inner @ cho_solve(schur, inner.T @ mean)
-        return np.asarray(variance - 2.0 * shared[row] * scale[row] + mean @ shared)
-
-    def _local(self, rows: NDArray[np.intp]) -> Array:
-        """
-        Return diagonal elements of the inverse of the banded matrix.
-
-        The inverse decays by a factor of about four from cycle to cycle, so that the cycles nearby
-        determine them.
-        """
-        band, found = self.band, np.empty(rows.size)
-        width = len(band) - 1
-        for i, row in enumerate(rows.tolist()):
-            start = max(row - _NEARBY * width, 0)
-            part = band[:, start:row + _NEARBY * width]
-            unit = np.zeros(part.shape[1])
-            unit[row - start] = 1.0
-            found[i] = solveh_banded(part, unit, check_finite=False)[row - start]
-        return found
+        mean = solved.scale[:, 0] * self.measured / self.measured.sum()
+        shared = solved.of_errors(mean)
+        return np.asarray(variance - 2.0 * shared[chosen] * solved.scale[chosen, 0]
+                          + mean @ shared)
 
     def _estimate_sizes(self) -> None:
         """Estimate how large the states are from their values and variances."""
@@ -594,7 +597,7 @@ class _States:
 
     def _amplitude_variances(self) -> Array:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
-        schur = self.solved[2]
+        schur = self.solved.schur
         variance = np.diag(cho_solve(schur, np.eye(len(schur[0]))))
         return np.asarray(variance.reshape(len(self.amplitudes), 2, -1).mean(axis=1))
 
@@ -627,16 +630,14 @@ class _States:
 
     def _autocovariance(self) -> Array:
         """Return the mean posterior autocovariance of the pulse errors about their mean."""
-        factor, inner, schur, scale = self.solved
-        pulses, width = self.states.shape
+        solved, pulses = self.solved, self.times.size
         lags = min(_LAGS, pulses - 1)
         chosen = np.unique(np.linspace(0, pulses - 1 - lags, _SAMPLED).astype(int))
-        unit = np.zeros((width * pulses, chosen.size + 1))
-        unit[width * chosen, np.arange(chosen.size)] = scale[width * chosen]
-        unit[::width, -1] = scale[::width] * self.measured / self.measured.sum()
-        found = cho_solve_banded(factor, unit)
-        found += inner @ cho_solve(schur, inner.T @ unit)
-        found = (found * scale[:, None])[::width]
+        scale = solved.scale[:, 0]
+        unit = np.zeros((pulses, chosen.size + 1))
+        unit[chosen, np.arange(chosen.size)] = scale[chosen]
+        unit[:, -1] = scale * self.measured / self.measured.sum()
+        found = solved.of_errors(unit) * scale[:, None]
         shared = found[:, -1]
         mean = float(shared @ self.measured) / self.measured.sum()
         each = chosen[:, None] + np.arange(lags + 1)
@@ -664,18 +665,109 @@ class _States:
         near = np.arange(-_TRIED, _TRIED + 1) / _TRIED / float(np.ptp(middle))
         found = np.zeros(self.orders.size, np.bool_)
         found[:self.declared] = True
+        sums = [self._sums(item) for item in residual]
         for i in range(self.declared, self.orders.size):
-            alone = np.zeros(self.amplitudes.shape[1], np.complex128)
             turned, timed = 0.0, np.zeros(near.size)
+            wave, turn = self.wave[i], self.turn[:, i]
             tone = self.orders[i] * self.frequency + near
             beside = np.exp(2j * np.pi * (self.orders[i] * angle - tone[:, None] * middle))
             for c, row in enumerate(self.amplitudes):
-                alone[i] = row[i]
-                each = self._sums(residual[c] + self._signal(alone))[:, i].conj()
+                part = row[i] * turn
+                alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
+                each = (sums[c][:, i] + alone).conj()
                 turned += self.weight[c] * float(np.abs(each.sum()) ** 2)
                 timed += self.weight[c] * np.abs(beside @ each) ** 2
             found[i] = turned > _SHARPER * timed.max()
         return found
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """
+    The normal equations of a step, solved; states and right-hand sides times `scale`.
+
+    Bends and gain of a cycle meet those of others only through the errors of its two pulses. So
+    they are eliminated cycle by cycle, and what is left of the states is a tridiagonal matrix of
+    the errors, of which `factor` is the Cholesky factor. `root` (pulse, rest, rest) is the inverse
+    Cholesky factor of bends and gain, `through` (pulse, rest, 2) how they follow the errors of
+    the two pulses, `border` (pulse, state, amplitude) that of the amplitudes, `inner` (pulse,
+    amplitude) how the errors follow the amplitudes, `schur` the factor of what is left of these.
+    """
+
+    scale: Array
+    root: Array
+    through: Array
+    factor: tuple[Array, bool]
+    border: Array
+    inner: Array
+    schur: tuple[Array, bool]
+
+    @classmethod
+    def of(cls, cells: Array, border: Array, corner: Array, scale: Array) -> '_Solved':
+        """Solve for `cells` (pulse, state + 1, state + 1) of the states and the next error."""
+        own = cells[:, 1:-1, 1:-1].copy()
+        own[:, np.arange(own.shape[1]), np.arange(own.shape[1])] = 1.0  # with the precision
+        root = np.linalg.inv(np.linalg.cholesky(own))
+        coupling = root @ cells[:, 1:-1, [0, -1]]
+        less = np.moveaxis(coupling, 1, 2) @ coupling
+        band = np.zeros((2, len(cells)))
+        band[0, 1:] = (cells[:, 0, -1] - less[:, 0, 1])[:-1]
+        band[1] = 1.0 - less[:, 0, 0]
+        band[1, 1:] -= less[:-1, 1, 1]
+        through = np.moveaxis(root, 1, 2) @ coupling
+        factor = (cholesky_banded(band), False)
+        errors = _of_errors(through, border)
+        inner = cho_solve_banded(factor, errors)
+        rest = (root @ border[:, 1:]).reshape(-1, border.shape[2])
+        schur = cho_factor(corner - rest.T @ rest - errors.T @ inner)
+        return cls(scale, root, through, factor, border, inner, schur)
+
+    def of_states(self, right: Array) -> Array:
+        """Return the states (pulse, state) for a right-hand side with the amplitudes as 0."""
+        errors = cho_solve_banded(self.factor, _of_errors(self.through, right[..., None])[:, 0])
+        after = np.append(errors[1:], 0.0)
+        rest = np.einsum('kji,kjl,kl->ki', self.root, self.root, right[:, 1:])
+        rest -= self.through[:, :, 0] * errors[:, None] + self.through[:, :, 1] * after[:, None]
+        return np.column_stack([errors, rest])
+
+    def of_errors(self, right: Array) -> Array:
+        """Return the errors (pulse, ...) for a right-hand side of the errors, amplitudes free."""
+        return np.asarray(cho_solve_banded(self.factor, right)
+                          + self.inner @ cho_solve(self.schur, self.inner.T @ right))
+
+    def of_state(self, state: int, chosen: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Return variances (chosen,) with the amplitudes as 0, and how it follows these."""
+        variance, beside = self._variances
+        if not state:
+            return variance[chosen], self.inner[chosen]
+        i, after = state - 1, chosen + 1
+        one, other = self.through[chosen, i].T
+        own = np.einsum('kj,kjl->kl', self.root[chosen, :, i], self.root[chosen])
+        local = own[:, i] + one**2 * variance[chosen] + other**2 * variance[after] + (
+            2.0 * one * other * beside[chosen])
+        inner = np.einsum('kl,kla->ka', own, self.border[chosen, 1:])
+        inner -= one[:, None] * self.inner[chosen] + other[:, None] * self.inner[after]
+        return local, inner
+
+    @cached_property
+    def _variances(self) -> tuple[Array, Array]:
+        """Return diagonal and next diagonal of the inverse of the tridiagonal matrix."""
+        beside, diagonal = self.factor[0]
+        ratio = np.append(beside[1:] / diagonal[:-1], 0.0)
+        found, last = np.empty(diagonal.size), 0.0
+        for k, (own, step) in enumerate(zip((diagonal**-2.0)[::-1].tolist(),
+                                            (ratio**2)[::-1].tolist())):
+            found[k] = last = own + step * last
+        found = found[::-1]
+        return found, -ratio[:-1] * found[1:]
+
+
+def _of_errors(through: Array, right: Array) -> Array:
+    """Return right-hand sides (pulse, ...) of errors for those of states (pulse, state, ...)."""
+    each = np.moveaxis(through, 1, 2) @ right[:, 1:]
+    found = right[:, 0] - each[:, 0]
+    found[1:] -= each[:-1, 1]
+    return np.asarray(found)
 
 
 def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
@@ -700,7 +792,7 @@ def _medians(power: Array, reach: int) -> Array:
     size = min(2 * reach, len(power))
     starts = np.arange(0, len(power) - size + 1, max(1, reach // 2))
     windows = np.lib.stride_tricks.sliding_window_view(power, size)[starts]
-    return np.interp(np.arange(len(power)), starts + size // 2, np.median(windows, axis=1))
+    return np.interp(np.arange(len(power)), starts + size // 2, row_medians(windows))
 
 
 def _between(values: Array) -> float:
