@@ -59,8 +59,8 @@ class CycleSamples:
     are two numbers because their sum rounds by 0.1 us where times count from 1970. `pulses` (s)
     are those that the angle law uses; the `count` cycles begin at `pulses[first]`. With a speed
     ripple inside the cycles the shaft passes the fraction u of one by `ripple` u (1 - u) s earlier
-    than the angle law says. The channels `lacking` (cycle,) samples in or beside a cycle have 0 in
-    their place; empty if there are none.
+    than the angle law says; `ripple` is that of all cycles or (cycle,). The channels `lacking`
+    (cycle,) samples in or beside a cycle have 0 in their place; empty if there are none.
     """
 
     samples: FloatArray
@@ -69,14 +69,14 @@ class CycleSamples:
     pulses: FloatArray
     first: int
     lead: float = 0.0
-    ripple: float = 0.0
+    ripple: float | FloatArray = 0.0
     count: int = 1
     lacking: tuple[tuple[int, ...], ...] = ()
 
     @classmethod
     def cut(cls, samples: FloatArray, *, start_time: float, rate: float, pulses: FloatArray,
-            first: int, margin: int, offset: int = 0, ripple: float = 0.0, count: int = 1
-            ) -> 'CycleSamples':
+            first: int, margin: int, offset: int = 0, ripple: float | FloatArray = 0.0,
+            count: int = 1) -> 'CycleSamples':
         """
         Cut the cycles that begin at `pulses[first]` out of `samples` (sample, channel).
 
@@ -115,7 +115,8 @@ class CycleSamples:
     def part(self, first: int, end: int) -> 'CycleSamples':
         """Return some of the cycles."""
         return replace(self, first=self.first + first, count=end - first,
-                       lacking=self.lacking[first:end])
+                       ripple=self.ripple[first:end] if isinstance(self.ripple, np.ndarray)
+                       else self.ripple, lacking=self.lacking[first:end])
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
            kept: NDArray[np.bool_] | None = None) -> FloatArray:
@@ -130,8 +131,8 @@ class CycleSamples:
         # the cycles that are resampled together.
         origins = np.floor(pulses[self.first:self.first + self.count]) - _AHEAD
         positions = run_times(law, pulses, self.first, origins, u)
-        if self.ripple:
-            positions -= self.rate * self.ripple * u * (1.0 - u)
+        if np.any(self.ripple):
+            positions -= self.rate * np.reshape(self.ripple, (-1, 1)) * u * (1.0 - u)
         index = positions.astype(np.int32)
         fraction = np.subtract(positions, index, out=positions)
         index += (origins - self.first_index).astype(np.int32)[:, None]
@@ -169,7 +170,7 @@ def joined(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
 def _continues(run: CycleSamples, following: CycleSamples) -> bool:
     begin = run.first_index
     return (run.start_time == following.start_time and run.rate == following.rate
-            and not run.ripple and not following.ripple
+            and not np.any(run.ripple) and not np.any(following.ripple)
             and run.samples.shape[1] == following.samples.shape[1]
             and run.edges[-1] == following.edges[0]
             and begin <= following.first_index <= begin + len(run.samples))
@@ -201,7 +202,8 @@ def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = L
     longest = max(cycle.periods.max() for cycle in cycles) if period is None else period
     points = next_fast_len(int(grid_points(longest, cycles[0].rate)), real=True)
     u = np.arange(points) / points
-    return np.stack([cycle.at(law, u, method=method) for cycle in cycles])
+    return np.concatenate([cycle.at(law, u, method=method).reshape(cycle.count, points, -1)
+                           for cycle in cycles])
 
 
 def grid_points(periods: FloatArray | float, rate: float) -> IntArray:

@@ -150,6 +150,26 @@ class ShaftAverager:
         Raises `SignalError`, and takes nothing, if the shaft frequency is not below half the
         sampling rate.
         """
+        self._take(cycles)
+        if self._taken < self.settings.trigger_cycles:
+            if self._waiting_size >= TOGETHER:
+                self._average_waiting()
+            return None
+        self._average_waiting()
+        self._slide()
+        average = self._result()
+        if self.settings.averaging == 'block':
+            self._start()
+        return average
+
+    def amplitudes(self, cycles: CycleSamples) -> ComplexArray:
+        """Return the amplitudes (cycle, channel, order) after more cycles; raises as `update`."""
+        self._take(cycles)
+        self._average_waiting()
+        return self._window()
+
+    def _take(self, cycles: CycleSamples) -> None:
+        """Let cycles wait; raise `SignalError`."""
         periods = cycles.periods
         if not periods.min() > self.shortest(cycles.rate):
             raise SignalError(
@@ -163,16 +183,6 @@ class ShaftAverager:
         self._taken += cycles.count
         # Not their samples, which depend on how the cycles were handed over.
         self._waiting_size += float(cycles.periods.sum() * cycles.rate * cycles.samples.shape[1])
-        if self._taken < self.settings.trigger_cycles:
-            if self._waiting_size >= TOGETHER:
-                self._average_waiting()
-            return None
-        self._average_waiting()
-        self._slide()
-        average = self._result()
-        if self.settings.averaging == 'block':
-            self._start()
-        return average
 
     def shortest(self, rate: float) -> float:
         """Return the period (s) of a trigger cycle that is too short for samples at `rate` Hz."""

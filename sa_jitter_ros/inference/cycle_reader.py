@@ -8,16 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Trigger cycles of a recording, and their average."""
+"""Trigger cycles of a recording, and their amplitudes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.average import Average, AverageSettings
+from sa_jitter_ros.averaging.average import AverageSettings
 from sa_jitter_ros.averaging.cycle import CycleSamples
-from sa_jitter_ros.averaging.shaft import average_cycles
+from sa_jitter_ros.averaging.shaft import ShaftAverager
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW
 from sa_jitter_ros.pulses.resampling import margin
@@ -46,26 +45,25 @@ class CycleReader:
         return bool(position[0] >= reach and position[1] <= len(self.samples) - 1 - reach)
 
     def cycles(self, pulses: FloatArray, *, law: AngleLaw = LINEAR_LAW,
-               ripple: FloatArray | None = None) -> list[CycleSamples]:
+               ripple: FloatArray | None = None) -> CycleSamples:
         """
         Return the trigger cycles between pulses.
 
         `pulses` (s) are those of the cycles and the others that the `law` uses; `ripple` (s) is
         the speed ripple in each cycle.
         """
-        return [
-            CycleSamples.cut(
-                self.samples, start_time=self.start_time, rate=self.rate, pulses=pulses,
-                first=first, margin=MARGIN, ripple=0.0 if ripple is None else float(ripple[k]))
-            for k, first in enumerate(range(law.before, len(pulses) - 1 - law.after))]
+        return CycleSamples.cut(
+            self.samples, start_time=self.start_time, rate=self.rate, pulses=pulses,
+            first=law.before, margin=MARGIN, ripple=0.0 if ripple is None else ripple,
+            count=len(pulses) - 1 - law.before - law.after)
 
-    def average(self, cycles: Sequence[CycleSamples], model: DeclaredModel, orders: FloatArray,
-                law: AngleLaw = LINEAR_LAW) -> Average:
-        """Return the synchronous average of cycles, the first of which begins at angle 0."""
-        return average_cycles(cycles, AverageSettings(
-            cycle_length=model.cycle_length, trigger_cycles=len(cycles),
+    def amplitudes(self, cycles: CycleSamples, model: DeclaredModel, orders: FloatArray,
+                   law: AngleLaw = LINEAR_LAW) -> ComplexArray:
+        """Return the amplitudes (cycle, channel, order) as the averager takes them, from 0."""
+        return ShaftAverager(AverageSettings(
+            cycle_length=model.cycle_length, trigger_cycles=cycles.count,
             orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
-            revolutions_per_trigger=model.trigger_revolutions))
+            revolutions_per_trigger=model.trigger_revolutions)).amplitudes(cycles)
 
 
 def kept_apart(cycle_length: float, orders: FloatArray) -> bool:

@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import cycle_grid
-from sa_jitter_ros.averaging.noise import attenuation, noise_floor, without_leakage
+from sa_jitter_ros.averaging.noise import (
+    attenuation, noise_floor, radial_noise, without_leakage)
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
@@ -327,19 +328,18 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     ripple_is_clear = not reason and np.mean(ripple**2) > _RIPPLE * (
         recovery.ripple_standard_error**2)  # false with a missing pulse
     corrected_ripple = ripple if pulses.reference is None and ripple_is_clear else None
-    raw = reader.average(reader.cycles(pulses.times[used], law=law), model, sources, law)
+    raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
-    corrected = reader.average(cycles, model, sources, corrected_law)
     clean_cycles = without_leakage(
-        corrected.cycle_amplitudes, tuple(sources.tolist()), model.cycle_length,
-        model.cycle_length * np.arange(len(cycles)))
-    floor = noise_floor(cycle_grid(cycles, method=reader.method, law=corrected_law,
+        reader.amplitudes(cycles, model, sources, corrected_law), tuple(sources.tolist()),
+        model.cycle_length, model.cycle_length * np.arange(cycles.count))
+    floor = noise_floor(cycle_grid([cycles], method=reader.method, law=corrected_law,
                                    period=float(np.diff(bridged).max())),
                         model.cycle_length, sources[:len(model.orders)],
                         _FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
-        first, times, missing, bridged, errors, standard_errors, raw.cycle_amplitudes,
-        clean_cycles, corrected.noise, floor, ripple, recovery.ripple_standard_error, not reason,
+        first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
+        radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,
         reason)
 
 
