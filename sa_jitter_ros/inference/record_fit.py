@@ -28,6 +28,7 @@ it leaves, over angle (orders) and over time (tones): the sharper peak decides w
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 import math
@@ -143,21 +144,42 @@ def fit_record(samples: Array, sample_rate: float, start_time: float, times: Arr
     beyond the highest order, or in a band that is `wider` by this factor. `known` are undeclared
     orders, and tones (Hz), of an earlier fit; then none is looked for.
     """
-    period = float(np.diff(times).mean())
-    top = min(wider * (max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)),
-              max(max(orders), _FULL_BAND * sample_rate * period / cycle_length))
-    band, rate = _low_passed(samples, sample_rate, top * cycle_length / period)
-    states = _States(band, rate, start_time, times, measured, cycle_length, np.array(orders), top,
-                     jitter_std)
-    states.follow_trend()
-    if known is not None:
-        states.add(*known)
-    states.fit_amplitudes()
-    _search(states, known is None)
-    for _ in range(_LAST_STEPS):
-        if states.step() < _CONVERGED * jitter_std:
-            break
-    return states.result()
+    return OpenRecord(samples, sample_rate, start_time, times, measured=measured,
+                      cycle_length=cycle_length, orders=orders, jitter_std=jitter_std,
+                      top=band_end(times, sample_rate, cycle_length, orders, wider)).fit(known)
+
+
+def band_end(times: Array, sample_rate: float, cycle_length: float, orders: Sequence[float],
+             wider: float) -> float:
+    """Return the order at which the band of `fit_record` ends."""
+    return min(wider * (max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)), max(
+        max(orders), _FULL_BAND * sample_rate * float(np.diff(times).mean()) / cycle_length))
+
+
+class OpenRecord:
+    """What all fits of a stretch of a recording have in common: its band, and where they begin."""
+
+    def __init__(self, samples: Array, sample_rate: float, start_time: float, times: Array, *,
+                 measured: BoolArray, cycle_length: float, orders: Sequence[float],
+                 jitter_std: float, top: float) -> None:
+        """Read the band that ends at order `top`; the others are those of `fit_record`."""
+        band, rate = _low_passed(
+            samples, sample_rate, top * cycle_length / float(np.diff(times).mean()))
+        self._begin = _States(band, rate, start_time, times, measured, cycle_length,
+                              np.array(orders), top, jitter_std)
+        self._begin.follow_trend()
+
+    def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
+        """Fit the stretch, as `fit_record`."""
+        states = copy(self._begin)
+        states.size = states.size.copy()
+        states.add(*(known or ((), ())))
+        states.fit_amplitudes()
+        _search(states, known is None)
+        for _ in range(_LAST_STEPS):
+            if states.step() < _CONVERGED * states.jitter_std:
+                break
+        return states.result()
 
 
 def _search(states: '_States', look: bool) -> None:

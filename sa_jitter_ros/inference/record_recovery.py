@@ -21,11 +21,13 @@ a shaft, which turns smoothly, plus what the errors are wrong by.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.inference.beat import METHODS
-from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
+from sa_jitter_ros.inference.record_fit import band_end, OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.resampling import gain
@@ -126,12 +128,21 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     (Hz) that are `known`, no other is looked for. Nothing is refused: where the vibration tells
     nothing, standard errors are as large as the errors expected, or NaN.
     """
+    @lru_cache(maxsize=1)
+    def opened(i: int, top: float) -> OpenRecord | None:
+        return _opened(samples, start_time, rate, pulses, stretches[i], model, top)
+
+    def ends(wider: float) -> list[float]:
+        return [band_end(pulses.bridged[item], rate, model.cycle_length, model.orders, wider)
+                for item in stretches]
+
     def fits(lines: tuple[FloatArray, FloatArray] | None, wider: float) -> list[RecordFit | None]:
+        top = ends(wider)
         found: list[RecordFit | None] = [None] * len(stretches)
         for i in sorted(range(len(stretches)), key=lambda i: stretches[i].start
                         - stretches[i].stop):
-            found[i] = fit = _fitted(samples, start_time, rate, pulses, stretches[i], model, lines,
-                                     wider)
+            found[i] = fit = _fitted(
+                opened(i, top[i]), pulses.bridged[stretches[i]], model, lines)
             if lines is None and fit is not None:
                 lines = fit.orders[len(model.orders):], fit.tones
         return found
@@ -140,7 +151,9 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     wider = 1.0
     recovery = _joined(pulses, stretches, fits(known, wider))
     if not recovery.resolved:
-        for more in _WIDER:
+        for before, more in pairwise((wider, *_WIDER)):
+            if ends(more) == ends(before):  # the whole band of the samples
+                break
             found = _joined(pulses, stretches, fits(known, more))
             if found.resolved:  # orders that shafts must have tell how long the cycles are
                 lines = _made_exact(found.undeclared[0], model), found.undeclared[1]
@@ -171,17 +184,12 @@ def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> l
             if b - a >= _FEWEST and inside[a]]
 
 
-def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
-            stretch: slice, model: DeclaredModel,
-            known: tuple[FloatArray, FloatArray] | None, wider: float) -> RecordFit | None:
-    """Return the fit of a stretch by its live channels; None where none tells anything."""
+def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
+            stretch: slice, model: DeclaredModel, top: float) -> OpenRecord | None:
+    """Return a stretch of the live channels up to order `top`; None where none is alive."""
     times = pulses.bridged[stretch]
     measured = np.zeros(pulses.bridged.size, np.bool_)
     measured[pulses.number[~pulses.doubtful]] = True
-    if known is not None:
-        span = model.cycle_length * (times.size - 1)
-        known = (_apart(known[0], model.orders, _APART / span),
-                 _apart(known[1], (), _APART / float(np.ptp(times))))
     first = max(int((times[0] - start_time) * rate) - _EDGE, 0)
     last = int((times[-1] - start_time) * rate) + _EDGE
     part = samples[first:last + 1]
@@ -189,12 +197,23 @@ def _fitted(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
         _DEAD * np.abs(part).max(axis=0), LEAST_RANGE)]
     if not part.size:
         return None
+    return OpenRecord(
+        part, rate, start_time + first / rate, times,
+        measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
+        jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER), top=top)
+
+
+def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,
+            known: tuple[FloatArray, FloatArray] | None) -> RecordFit | None:
+    """Return the fit of a stretch with pulses at `times`; None where nothing tells anything."""
+    if record is None:
+        return None
+    if known is not None:
+        span = model.cycle_length * (times.size - 1)
+        known = (_apart(known[0], model.orders, _APART / span),
+                 _apart(known[1], (), _APART / float(np.ptp(times))))
     try:
-        return fit_record(
-            part, rate, start_time + first / rate, times,
-            measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-            jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER),
-            wider=wider, known=known)
+        return record.fit(known)
     except np.linalg.LinAlgError:
         return None
 
