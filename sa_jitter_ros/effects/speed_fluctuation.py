@@ -12,6 +12,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -53,20 +54,10 @@ class SpeedFluctuation(Effect):
                       'trigger speeds', 'the shaft would stop; lower it, or use more '
                       'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
-        covariance = _error_covariance(model.weights, variance)
-        known: dict[tuple[object, ...], Array] = {}  # all orders ask for the same places
-
-        def faded(u: Array, v: Array, lag: int) -> Array:
-            key = u.shape, u.tobytes(), v.shape, v.tobytes(), lag
-            if key not in known:
-                if len(known) >= _MOST_KEPT:
-                    known.clear()
-                known[key] = covariance(u, v, lag) * fading(
-                    lag + v - u, model.trigger_cycles, ACCELERATION_BAND)
-            return known[key]
-
+        unit = _unit_covariance(model.weights, model.trigger_cycles)
         return (GaussianAngleError(
-            faded, slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
+            lambda u, v, lag: np.asarray(variance * unit(u, v, lag)),
+            slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
 
     @classmethod
     def of_ripple(cls, size: float, model: DeclaredModel) -> 'SpeedFluctuation':
@@ -75,13 +66,15 @@ class SpeedFluctuation(Effect):
                    / _cycles(model, 1.0) / model.trigger_period)
 
 
-def _error_covariance(weights: PulseWeights, variance: float) -> Covariance:
+@lru_cache(maxsize=4)
+def _unit_covariance(weights: PulseWeights, cycles: int) -> Covariance:
     """
-    Return the covariance of the error that the angle law makes of accelerations of `variance`.
+    Return the covariance of the error that the angle law makes of accelerations of variance 1.
 
     It is an integral over the spectrum. Of a motion of f cycles a trigger cycle the law follows
     what its weights make of the values at the pulses; the acceleration is (2 pi f)^2 times the
-    motion.
+    motion. All orders at all speeds ask for the same places, so that it is kept for these. It
+    fades over an average of so many `cycles`.
     """
     low, high = ACCELERATION_BAND
     turn = 2j * np.pi * (low + (high - low) * _FREQUENCIES)
@@ -92,9 +85,17 @@ def _error_covariance(weights: PulseWeights, variance: float) -> Covariance:
         return np.asarray(np.moveaxis(
             np.exp(np.multiply.outer(turn, u)) - followed, 0, -1) / turn**2)
 
+    known: dict[tuple[object, ...], Array] = {}
+
     def covariance(u: Array, v: Array, lag: int) -> Array:
-        later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
-        return np.asarray(variance * np.einsum('...f,...f', missed(u).conj(), later).real)
+        key = u.shape, u.tobytes(), v.shape, v.tobytes(), lag
+        if key not in known:
+            if len(known) >= _MOST_KEPT:
+                known.clear()
+            later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
+            known[key] = np.einsum('...f,...f', missed(u).conj(), later).real * fading(
+                lag + v - u, cycles, ACCELERATION_BAND)
+        return known[key]
 
     return covariance
 
