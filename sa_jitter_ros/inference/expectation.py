@@ -386,11 +386,13 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     offset = model.weights.path(e, places, count)
     cycle = np.arange(count)[:, None]
     table = np.zeros((len(e), observation.orders.size, sources.size), complex)
+    first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
+    turn = 2j * np.pi * r
+    first = first * np.exp(turn * sources[:, None] * u)
+    back = np.exp(-turn * observation.orders * u[:, None])
     for s, source in enumerate(sources):
-        first = joint_characteristic(processes, [np.array([source])], [u], [0]) * w
-        shift = 2j * np.pi * r * (source - observation.orders)
-        inside, between = np.exp(shift * u[:, None]) * first[:, None], np.exp(shift * cycle)
-        inside = gathered @ inside
+        inside = gathered @ (first[s, :, None] * back)
+        between = np.exp(turn * (source - observation.orders) * cycle)
         for a, row in enumerate(offset):
             wave = np.exp(2j * np.pi * source * row)
             table[a, :, s] = np.mean((wave @ inside) * between, axis=0)
