@@ -163,7 +163,7 @@ class ShaftAverager:
         return average
 
     def amplitudes(self, cycles: CycleSamples) -> ComplexArray:
-        """Return the amplitudes (cycle, channel, order) after more cycles; raises as `update`."""
+        """Take cycles as `update` does; return what all make, (cycle, channel, order)."""
         self._take(cycles)
         self._average_waiting()
         return self._window()

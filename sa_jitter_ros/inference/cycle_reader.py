@@ -59,7 +59,7 @@ class CycleReader:
 
     def amplitudes(self, cycles: CycleSamples, model: DeclaredModel, orders: FloatArray,
                    law: AngleLaw = LINEAR_LAW) -> ComplexArray:
-        """Return the amplitudes (cycle, channel, order) as the averager takes them, from 0."""
+        """Return what the averager makes of cycles from angle 0: (cycle, channel, order)."""
         return ShaftAverager(AverageSettings(
             cycle_length=model.cycle_length, trigger_cycles=cycles.count,
             orders=tuple(orders.tolist()), angle_law=law.name, interpolation=self.method,
