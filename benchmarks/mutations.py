@@ -1,0 +1,176 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Which numbers of the inference no published result depends on.
+
+`python benchmarks/mutations.py` moves each number in the constants of `inference` and `effects` by
+a factor of ten, up or else down, in a copy of the package, and looks whether one of the published
+results (`published_results.py`) notices. What noticed is kept in `mutations.json` beside this
+file, so that the next run asks it first, and the tests ask some of it.
+"""
+
+import argparse
+import ast
+from collections.abc import Iterator, Sequence
+import compileall
+from dataclasses import dataclass
+from functools import cache
+import json
+import os
+from pathlib import Path
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+
+from published_results import CASES
+
+NOTICED = Path(__file__).with_suffix('.json')
+_ROOT = Path(__file__).resolve().parents[1]
+_PACKAGE = 'sa_jitter_ros'
+_ROOMS = 'inference', 'effects'
+_FACTOR = 10
+_LONGEST = 600.0  # s, of a case: a search that does not end is noticed
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number in a constant: its name, its file, and where it stands in the line."""
+
+    name: str
+    path: str
+    line: int
+    start: int
+    end: int
+    value: float
+
+    def moved(self, up: bool) -> str | None:
+        """Return the number ten times larger or smaller as source; None where it is the same."""
+        if isinstance(self.value, int):
+            value: float = self.value * _FACTOR if up else self.value // _FACTOR
+        else:
+            value = self.value * _FACTOR if up else self.value / _FACTOR
+        return None if value == self.value or (value == 0 and isinstance(value, int)) else repr(
+            value)
+
+
+def numbers() -> Iterator[Number]:
+    """Yield every number of a constant at the level of a module, but the seeds."""
+    for room in _ROOMS:
+        for path in sorted((_ROOT / _PACKAGE / room).glob('*.py')):
+            for node in ast.parse(path.read_text()).body:
+                if isinstance(node, ast.Assign):
+                    targets, value = node.targets[0], node.value
+                elif isinstance(node, ast.AnnAssign) and node.value is not None:
+                    targets, value = node.target, node.value
+                else:
+                    continue
+                names = [item.id for item in ast.walk(targets) if isinstance(item, ast.Name)]
+                if not all(name.lstrip('_').isupper() for name in names):
+                    continue
+                values = value.elts if isinstance(value, ast.Tuple) else [value]
+                if len(names) == 1 < len(values):
+                    names = [f'{names[0]}[{index}]' for index in range(len(values))]
+                elif len(names) == 1:
+                    values = [value]
+                for name, item in zip(names, values):
+                    found = [leaf for leaf in ast.walk(item) if isinstance(leaf, ast.Constant)
+                             and isinstance(leaf.value, (int, float))
+                             and not isinstance(leaf.value, bool) and leaf.value]
+                    for index, leaf in enumerate(found):
+                        if 'SEED' not in name and leaf.end_col_offset is not None:
+                            yield Number(
+                                f'{room}.{path.stem}.{name}' + f'#{index}' * (len(found) > 1),
+                                str(path.relative_to(_ROOT)), leaf.lineno, leaf.col_offset,
+                                leaf.end_col_offset, leaf.value)
+
+
+def noticed(number: Number, up: bool, cases: Sequence[str]) -> str:
+    """Return the first case whose result differs with the moved number; '' if none does."""
+    moved = number.moved(up)
+    if moved is None:
+        return ''
+    path = Path(_copy().name, number.path)
+    before = path.read_text()
+    lines = before.splitlines(keepends=True)
+    line = lines[number.line - 1]
+    lines[number.line - 1] = line[:number.start] + moved + line[number.end:]
+    path.write_text(''.join(lines))
+    try:
+        return next((case for case in cases if differs(case)), '')
+    finally:
+        path.write_text(before)
+
+
+@cache
+def _copy() -> 'tempfile.TemporaryDirectory[str]':
+    """Return a compiled copy of the package, whose files are moved one after the other."""
+    copy = tempfile.TemporaryDirectory()
+    shutil.copytree(_ROOT / _PACKAGE, Path(copy.name, _PACKAGE))
+    compileall.compile_dir(copy.name, quiet=1)
+    return copy
+
+
+def differs(case: str) -> bool:
+    """Return whether the copy has another result; a search that does not end has one, too."""
+    command = [sys.executable, str(_ROOT / 'benchmarks' / 'published_results.py'), '--first',
+               '--cases', case]
+    environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONDONTWRITEBYTECODE': '1'}
+    try:
+        return subprocess.run(command, capture_output=True, timeout=_LONGEST,
+                              env=environment).returncode != 0
+    except subprocess.TimeoutExpired:
+        return True
+
+
+def kept() -> dict[str, list[str]]:
+    """Return which way each number was moved before, and the case that noticed it, '' for none."""
+    return json.loads(NOTICED.read_text()) if NOTICED.exists() else {}
+
+
+def sample(count: int, seed: int) -> list[tuple[Number, str, str]]:
+    """Draw numbers that a result noticed before: the number, which way it moved, and the case."""
+    known = kept()
+    every = [(number, *known[number.name]) for number in numbers()
+             if known.get(number.name, ['', ''])[1]]
+    return random.Random(seed).sample(every, min(count, len(every)))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Move the numbers, and print what notices each; 1 if nothing notices some."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--only', default='', help='only names with this text')
+    parser.add_argument('--new', action='store_true', help='only numbers that nothing noticed yet')
+    parser.add_argument('--cases', nargs='+', default=CASES, help='the results that are asked')
+    options = parser.parse_args(arguments)
+    known = kept()
+    for number in numbers():
+        last, before = known.get(number.name, ['', ''])
+        if options.only not in number.name or (options.new and before):
+            continue
+        found = ['', '']
+        for way in sorted(('up', 'down'), key=lambda item: item != last):
+            case = noticed(number, way == 'up', sorted(
+                options.cases, key=lambda item: item != before))
+            if case:
+                found = [way, case]
+                break
+        known[number.name] = found
+        print(f'{number.name} {number.value}: {" ".join(found)}', flush=True)
+        NOTICED.write_text(json.dumps(known, indent=1, sort_keys=True) + '\n')
+    missed = [number.name for number in numbers() if not known.get(number.name, ['', ''])[1]]
+    print(f'{len(missed)} of {len(list(numbers()))} are noticed by nothing: {", ".join(missed)}')
+    return int(bool(missed))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

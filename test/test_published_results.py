@@ -1,0 +1,38 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Results of the loop stay what was published, on machines whose truth is known.
+
+After a change that is meant to change results: `python benchmarks/published_results.py --write`.
+"""
+
+import json
+
+from published_results import CASES, differences, result, RESULTS
+import pytest
+
+pytestmark = pytest.mark.machines
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_result_is_the_published_one(case):
+    published = json.loads(RESULTS.read_text())[case]
+    assert list(differences(json.loads(json.dumps(result(case))), published)) == []
+
+
+@pytest.mark.parametrize('case', CASES)
+def test_published_result_is_right(case):
+    published = json.loads(RESULTS.read_text())[case]
+    name = case.split(' ')[0]
+    verdict = {'none': 'none', 'two_paths': 'unexplained', 'resonance': 'unexplained'}.get(
+        name, 'traced')
+    found = [item['name'] for item in published['missing_effects']]
+    assert (published['verdict'], found) == (verdict, [name] if verdict == 'traced' else [])
