@@ -292,7 +292,7 @@ def malformed():
     yield 'huge size', changed(size=2**32 - 1), 'does not fit 203 elements'
     yield 'empty', changed(size=0), 'layout 2x0'
     yield 'offset', changed(offset=2), 'data_offset 2 received, 3 expected'
-    yield 'offset beyond', changed(offset=2**32 - 1), 'data_offset'
+    yield 'offset beyond', changed(offset=2**32 - 1), 'behind 4294967295 header elements'
     yield 'time', changed(header={0: math.nan}), 'header time nan s'
     yield 'endless time', changed(header={0: math.inf}), 'header time inf s'
     yield 'rate', changed(header={1: 0.0}), 'rate 0.0 Hz'
