@@ -257,11 +257,11 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         else:
             reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
+    final = tuple(_on_all(bench, timing, [*chosen, *present]))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        tuple(_on_all(bench, timing, chosen)), tuple(_on_all(bench, timing, present)),
-        tuple(candidates), before, after, at_first, moves,
-        attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
+        final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
+        moves, attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
         rows, _undecided(partial(bench.change, chosen=_few(bench)), effects, rows),
