@@ -343,6 +343,15 @@ def test_gear_pulses_of_a_slow_clock_are_all_accepted(shared_data):
     assert accepted_alone(slower.keyphasor_pulses(interpolate=False))
 
 
+def test_a_tick_that_shows_every_two_hundred_pulses_costs_the_first_cycle_only():
+    """The first may be a step of the time; no displaced pulse comes again with the same size."""
+    pulses = np.ceil(13.995 * np.arange(2000.0)) / 7600.0
+    validator = PulseValidator()
+    validator.update(pulses)
+    validator.flush()
+    assert validator.finish() == PulseCounts(accepted=2000, late=1, cycles_discarded=1)
+
+
 def test_a_stray_on_the_grid_of_the_clock_is_dropped():
     """Also where it is a whole number of ticks from the pulses, which others are not."""
     clock = 5000.0

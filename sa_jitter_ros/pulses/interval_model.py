@@ -63,6 +63,9 @@ _FLOOR, _HARMLESS, _SAME = 1e-3, 1e-3, 3e-3
 # Of a trigger cycle: longest tick that a single step of equal intervals shows, and that a longer
 # interval beside a shorter one shows. These two may differ by _OPPOSITE of their deviation.
 _LONE_STEP, _LONE_PAIR, _OPPOSITE = 0.015, 0.006, 0.2
+# A longer step is a tick if it comes again, so many intervals later, with the same size: no
+# displaced pulse does that. By how much of it the two sizes may differ.
+_APART, _AS_LARGE = 3.0, 1e-3
 
 
 class IntervalModel:
@@ -106,6 +109,7 @@ class IntervalModel:
         self._settling = _REACH
         self._intervals = deque(intervals, maxlen=self._window)
         self._tick = self._latest = 0.0  # relative to the interval; and when it was seen (s)
+        self._lone = -math.inf, 0.0  # time and size (s) of the latest step that is in doubt
         self._number = 0  # of intervals
         self._refused: list[tuple[int, float]] = []
         self._set_tolerance()
@@ -212,7 +216,9 @@ class IntervalModel:
         lone = not clock_tick(np.array(self._intervals), latest)
         opposite = _is_displacement(intervals / length - widths)
         if lone and tick > (_LONE_PAIR if opposite else _LONE_STEP) * self._cycle:
-            return False
+            known, self._lone = self._lone, (latest, tick * length)
+            if opposite or not _is_repeated(known, self._lone, least=length):
+                return False
         before, self._tick, self._latest = self.tolerance, tick, latest
         self._set_tolerance()
         return self.tolerance > before
@@ -251,6 +257,12 @@ class IntervalModel:
 def _is_displacement(deviations: FloatArray) -> bool:
     """Tell whether of these intervals (n,) one is longer by as much as another is shorter."""
     return bool(abs(deviations.sum()) < _OPPOSITE * np.abs(deviations).max())
+
+
+def _is_repeated(step: tuple[float, float], other: tuple[float, float], *, least: float) -> bool:
+    """Tell whether of two steps (time, size in s) the other is later and as large."""
+    return (other[0] - step[0] > _APART * least
+            and abs(other[1] - step[1]) < _AS_LARGE * other[1])
 
 
 def _expected(weights: tuple[float, ...], levels: list[float], place: int) -> float:
