@@ -184,14 +184,15 @@ def test_orders_beside_scatter_by_jitter_too(correlated, rng):
 
 
 @pytest.mark.parametrize('law', ['linear', 'quadratic', 'spline'])
-@pytest.mark.parametrize('size', [1e-4, 1e-2])
-def test_leakage_from_few_places_is_that_of_all(law, size, rng):
-    """The wave that errors turn is a polynomial between few places; so is its mean."""
+@pytest.mark.parametrize(('size', 'lost'), [(1e-4, 0.0), (1e-2, 0.0), (1e-4, 1.0)])
+def test_leakage_from_few_places_is_that_of_all(law, size, lost, rng):
+    """The wave that errors turn is a polynomial between few places, but across lost pulses."""
     weights, count, r = angle_law(law).weights, 10, 1.0
     orders, sources = np.array([1.0, 40.0]), np.array([1.0, 40.0, 41.0, 117.3])
     model = SimpleNamespace(cycle_length=r, trigger_cycles=count, fundamental_frequency=1.0,
                             weights=weights)
     errors = size * rng.standard_normal((2, count - 1 + weights.pulses))
+    errors[0, 6:] += lost
     found = _leakage(SimpleNamespace(model=model, orders=orders, sources=sources), (), errors)
     u = (np.arange(20000) + 0.5) / 20000  # r (source - order) is no whole number for 117.3
     path, cycle = weights.path(errors, u, count), np.arange(count)[:, None]

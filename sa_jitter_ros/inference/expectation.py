@@ -50,6 +50,8 @@ RESOLUTION = 5e-4
 _NODES, _IN_PANEL = 32, 64  # of an integral over a cycle, and of each panel of a longer one
 _A_TURN = 4.5  # nodes
 _PLACES = 12  # in a cycle, where errors turn hardly
+_CALM = 10.0  # rad by which errors turn a wave within a cycle; more than that takes all nodes
+_WITHIN = np.linspace(0.0, 1.0, 9)  # where in a cycle this is looked at
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
@@ -382,8 +384,14 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     u, w = _nodes(math.ceil(_NODES + _A_TURN * turns))
     # errors turn a wave by little within a cycle: a polynomial through few places is exact
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
-    places, gathered = _few_places(u, degree, 2.0 * np.pi * sources.max() * np.abs(e).max())
-    offset = model.weights.path(e, places, count)
+    start = model.weights.path(e, np.zeros(1), count)  # (acquisition, cycle, 1)
+    most = 2.0 * np.pi * sources.max() * np.abs(
+        model.weights.path(e, _WITHIN, count) - start).max(axis=2)
+    wild = most > _CALM  # across missing pulses
+    places, gathered = _few_places(u, degree, float(most[~wild].max(initial=0.0)))
+    offset = model.weights.path(e, places, count) - start
+    all_offsets = [(model.weights.path(row, u, count) - first)[here]
+                   for row, first, here in zip(e, start, wild)]
     cycle = np.arange(count)[:, None]
     table = np.zeros((len(e), observation.orders.size, sources.size), complex)
     first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
@@ -391,11 +399,14 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     first = first * np.exp(turn * sources[:, None] * u)
     back = np.exp(-turn * observation.orders * u[:, None])
     for s, source in enumerate(sources):
-        inside = gathered @ (first[s, :, None] * back)
+        whole = first[s, :, None] * back
+        inside = gathered @ whole
         between = np.exp(turn * (source - observation.orders) * cycle)
         for a, row in enumerate(offset):
-            wave = np.exp(2j * np.pi * source * row)
-            table[a, :, s] = np.mean((wave @ inside) * between, axis=0)
+            each = np.exp(2j * np.pi * source * row) @ inside
+            each[wild[a]] = np.exp(2j * np.pi * source * all_offsets[a]) @ whole
+            table[a, :, s] = np.mean(
+                each * np.exp(2j * np.pi * source * start[a]) * between, axis=0)
     return table
 
 
