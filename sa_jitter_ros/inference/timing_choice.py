@@ -192,8 +192,19 @@ class Chooser:
         if not math.isfinite(fit.value):
             return -_RARE
         shape = max(self.of_shape(fit, power) for power in self._powers(fit))
-        return fit.value + shape - prior - 0.5 * fit.count * math.log(
-            self.data.cycles) - _ODDS * len(names)
+        return fit.value + shape - prior - self._gained_by_chance(fit) - _ODDS * len(names)
+
+    def _gained_by_chance(self, fit: TimingFit) -> float:
+        """
+        Return what the free parameters gain in likelihood without being real (Schwarz).
+
+        Each size of a pattern, as that of one mark, is seen in its share of the cycles only.
+        """
+        cycles, sizes = self.data.cycles, [place.stop - place.start
+                                           for place in fit.columns.values()]
+        others = fit.count - sum(sizes)
+        return float(0.5 * others * math.log(cycles)
+                     + 0.5 * sum(size * math.log1p(cycles / size) for size in sizes))
 
     def of_shape(self, fit: TimingFit, power: float) -> float:
         """Return what the distribution of single errors adds to the likelihood of a fit."""

@@ -63,7 +63,6 @@ _UNDECIDED = 1e-2  # change of an average by what may be there
 _AGAINST, _PRIOR = 148.4, 0.0067  # odds against an effect (e^5), and its probability before
 _REMAINS = 0.005  # p value of what is unexplained
 _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
-_PLAIN = 1e-12  # p value of a pattern that no other error can make
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
@@ -354,8 +353,7 @@ def _absorbs(finding: Finding) -> bool:
     """Return whether an effect may absorb a part of what is none of it."""
     effect = finding.effect
     return effect is not None and (effect.random or (
-        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times
-        and finding.p_value > _PLAIN))
+        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times))
 
 
 def _few(bench: Bench) -> list[int]:
