@@ -491,9 +491,12 @@ class _States:
         if self.all_free:
             least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
             for i, limit in enumerate(least, 1):
-                power = np.mean(self.states[2:-2, i] ** 2) + np.median(
-                    self._variances(i, _SAMPLED))
-                self.size[i] = max(np.sqrt(power), limit)
+                before, variance = self.size[i]**2, np.median(self._variances(i, _SAMPLED))
+                gained = np.mean(self.states[2:-2, i] ** 2) + variance - before
+                # EM grows from small sizes too slowly, by a factor of what the vibration tells;
+                # it shrinks as slowly, so that errors have room for lines that were not found
+                told = max(1.0 - variance / before, _LEAST_KEPT) if gained > 0.0 else 1.0
+                self.size[i] = max(np.sqrt(before + gained / told), limit)
 
     def free_all(self) -> None:
         """Let bends and gains free."""
