@@ -18,6 +18,7 @@ direction, sinusoids, and errors that are not normal.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 from typing import Any
 
@@ -56,14 +57,18 @@ class Timing:
     """
     The effects that pulse times and recovered errors show, `findings`, whatever their size.
 
-    `probabilities` are those of all effects that they could show; `checks` test what is left.
+    `probabilities` are those of all effects that they could show.
     """
 
     findings: tuple[Finding, ...]
     probabilities: Mapping[str, float]
     chooser: Chooser = field(repr=False)
     choice: Choice = field(repr=False)
-    checks: tuple[Check, ...]
+
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """Return the tests of what is left."""
+        return check_timing(self.chooser, self.choice)
 
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
@@ -191,8 +196,7 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
         chooser.fit(names)
         choice = chooser.choice(names)
     findings = tuple(_findings(chooser, choice))
-    checks = check_timing(chooser, choice) if names is None else ()
-    return Timing(findings, _probabilities(choice, findings), chooser, choice, checks)
+    return Timing(findings, _probabilities(choice, findings), chooser, choice)
 
 
 def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect]) -> Timing:
@@ -210,7 +214,7 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
     findings = tuple(_findings(chooser, choice))
     if [item.name for item in findings] != [item.name for item in timing.findings]:
         return timing
-    return replace(timing, findings=findings)
+    return Timing(findings, timing.probabilities, chooser, choice)
 
 
 def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:

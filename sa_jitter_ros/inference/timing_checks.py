@@ -165,17 +165,19 @@ def _minimum_phase(log_power: Array) -> Array:
 def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
     """Return the p value of skewness and kurtosis of errors through a filter."""
     data = chooser.data
-    p_values: list[list[float]] = [[] for _ in _kinds(choice)]
-    for item in data.stretches:
-        if item.errors.size < _FEWEST:
-            continue
-        seen = _moments(_filtered(chooser.left(choice.fit, item), gain, data))
-        for found, scaled in zip(p_values, _kinds(choice)):
-            null = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
-            for value, draws in zip(seen, null):
-                middle = np.median(draws)
-                found.append(_chance(abs(float(value - middle)), np.abs(draws - middle)))
-    return max(min(1.0, len(found) * min(found)) if found else 1.0 for found in p_values)
+    p_values = []
+    items = [item for item in data.stretches if item.errors.size >= _FEWEST]
+    for scaled in _kinds(choice) if items else ():
+        seen, null = np.zeros(2), np.zeros((2, _DRAWS))
+        for item in items:
+            draws = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
+            middle = np.median(draws, axis=1)
+            seen += item.errors.size * (
+                _moments(_filtered(chooser.left(choice.fit, item), gain, data)) - middle)
+            null += item.errors.size * (draws - middle[:, None])
+        p_values.append(min(1.0, len(seen) * min(
+            _chance(abs(value), np.abs(draws)) for value, draws in zip(seen, null))))
+    return max(p_values, default=1.0)
 
 
 def _steadiness(chooser: Chooser, choice: Choice) -> Check:
@@ -236,11 +238,11 @@ def _filtered(values: Array, gain: Array, data: TimingData) -> Array:
     return through(values, gain, data)[..., EDGE:-EDGE]
 
 
-def _moments(values: Array) -> tuple[Array, Array]:
+def _moments(values: Array) -> Array:
     """Return skewness and logarithm of kurtosis of each row."""
     z = values - values.mean(axis=-1, keepdims=True)
     z = z / np.sqrt(np.mean(z**2, axis=-1, keepdims=True))
-    return np.asarray(np.mean(z**3, axis=-1)), np.asarray(np.log(np.mean(z**4, axis=-1)))
+    return np.array([np.mean(z**3, axis=-1), np.log(np.mean(z**4, axis=-1))])
 
 
 def _chance(value: float, draws: Array) -> float:

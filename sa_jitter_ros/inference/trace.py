@@ -232,7 +232,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     before = bench.score((), unsteadiness=own) if chosen else first
     after = bench.score(effects, chosen, unsteadiness=own) if chosen else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
-    left = _unexplained(bench, timing, chosen)
+    on_all = _refitted(bench, timing)
+    left = _unexplained(bench, on_all, chosen)
     unexplained = remains(after, moves) or left is not None
     of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
         unexplained) else ''
@@ -256,7 +257,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         else:
             reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
-    final = tuple(_on_all(bench, timing, [*chosen, *present]))
+    final = tuple(_on_all(bench, on_all, [*chosen, *present]))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
@@ -314,11 +315,17 @@ def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
     return more, tried, evidence
 
 
-def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) -> list[Finding]:
-    """Return findings with parameters that fit all acquisitions, as all scores are known."""
+def _refitted(bench: Bench, timing: Timing | None) -> Timing | None:
+    """Return the timing with parameters that fit all acquisitions; the effects are as chosen."""
     everything = range(len(bench.observation.acquisitions))
-    of_timing = {} if timing is None else {item.name: item for item in refitted(
-        timing, stretches(bench.observation, everything, bench.clock), bench.declared).findings}
+    return timing and refitted(
+        timing, stretches(bench.observation, everything, bench.clock), bench.declared)
+
+
+def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings with parameters that fit all acquisitions; `timing` is that of all."""
+    everything = range(len(bench.observation.acquisitions))
+    of_timing = {} if timing is None else {item.name: item for item in timing.findings}
     found: list[Finding] = []
     for finding in findings:
         kind = EFFECTS[finding.name]
