@@ -13,7 +13,7 @@
 import numpy as np
 import pytest
 from sa_jitter_ros.pulses.interval_model import IntervalModel
-from sa_jitter_ros.pulses.mark_pattern import steady_pattern
+from sa_jitter_ros.pulses.mark_pattern import repeating, steady_pattern
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 from sa_jitter_ros.recordings import read
@@ -422,6 +422,16 @@ def test_uneven_marks_are_matched_again_behind_a_step_of_the_time(marks):
         assert (counts.accepted, counts.late) == (pulses.size, 1)
         turned = np.diff(np.searchsorted(pulses, found.times))[~found.starts_run[1:]]
         assert np.all(turned == marks)
+
+
+def test_many_missing_pulses_of_two_marks_cause_no_warning():
+    """Where most pairs of revolutions lack pulses, the others tell the scatter."""
+    rng = np.random.default_rng(57)
+    pulses = 0.02 * np.arange(60) + rng.normal(0.0, 1e-5, 60)
+    there = pulses[rng.uniform(size=60) > 0.3][:24]
+    begin, pattern = repeating(np.log(np.diff(there)), 2)
+    assert begin == 12
+    assert 5e-4 < pattern.scatter < 5e-3  # the intervals scatter by 7e-4
 
 
 def test_every_other_pulse_that_stays_away_is_named():

@@ -183,8 +183,9 @@ def repeating(levels: FloatArray, count: int) -> tuple[int, MarkPattern] | None:
     widths = two.mean(axis=0)
     # Of large jitter some repeat by chance, which tell too small a scatter.
     usual = _RANGE.get(count, 1.0)
+    all_pairs = apart[near & np.isfinite(apart)]
     typical = max(float(np.median(apart[fits])) / 4.0,
-                  min(float(np.quantile(apart[near], _CLEAN)) / 3.0, tolerance)) / usual
+                  min(float(np.quantile(all_pairs, _CLEAN)) / 3.0, tolerance)) / usual
     # The widths are those of two revolutions, as uncertain as one of these by a root of two.
     scatter = math.sqrt(1.5) * (float(np.std(two[1] - two[0])) + typical)
     return begin, MarkPattern(widths - widths.mean(), np.ones(count, np.bool_), scatter)
