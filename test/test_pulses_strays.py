@@ -318,6 +318,16 @@ def test_a_slow_clock_drops_no_pulse(clock, per_revolution, drift):
         assert accepted_alone(pulses, pulses_per_revolution=per_revolution), seed
 
 
+@pytest.mark.parametrize(('marks', 'seed'), [(2, 232), (2, 243), (3, 26), (3, 62), (4, 35)])
+def test_pulses_are_no_strays_beside_the_first_few_that_scatter_less(marks, seed):
+    """Nor is a pulse missing where one came, that happened to be a stray so near to its place."""
+    rng = np.random.default_rng(seed)
+    pulses = 1.0 + np.arange(40 * marks) / 25.0 / marks
+    errors = rng.uniform(-0.5, 0.5, pulses.size)
+    pulses += 0.004 * rng.choice([1, 3, 8]) / 25.0 / marks * errors
+    assert accepted_alone(pulses, pulses_per_revolution=marks)
+
+
 @pytest.mark.parametrize(('shape', 'per_revolution'), [
     ('uniform', 1), ('uniform', 4), ('normal', 1), ('normal', 4), ('bimodal', 1)])
 def test_large_errors_are_no_strays(shape, per_revolution):

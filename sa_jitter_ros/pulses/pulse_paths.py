@@ -33,6 +33,8 @@ IntArray = NDArray[np.int64]
 STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
 # More, of a speed that falls to a half, a third, ... at once: rather, pulses are missing.
 FRACTION, _WHOLE = 48.0, 0.03
+_CERTAIN = 1e6  # intervals that tell the scatter as surely as it can be
+_NEAREST = 1e-3  # intervals from its place at which no average shows that a pulse is displaced
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
 _DROPPED = 16.0
@@ -53,7 +55,7 @@ class Path(NamedTuple):
     The mark of a stray is 0. `last` (s) is the last true pulse, at `slot` and `passed` teeth from
     where the path began, `level` and `before` those of the last two intervals (None: not known).
     With `jumped` the speed is no longer that of earlier intervals. `deviations` are those of the
-    intervals of true pulses, 0 for strays; `levels` likewise.
+    intervals of true pulses, 0 for strays; `levels` likewise. `stray_at` (s) is the latest stray.
     """
 
     cost: float
@@ -66,10 +68,11 @@ class Path(NamedTuple):
     marks: tuple[int, ...] = ()
     deviations: tuple[float, ...] = ()
     levels: tuple[float, ...] = ()
+    stray_at: float = -math.inf
 
-    def stray(self, cost: float) -> 'Path':
-        """Return the path that takes the next pulse for a stray."""
-        return self._replace(cost=self.cost + cost, marks=(*self.marks, 0),
+    def stray(self, pulse: float, cost: float) -> 'Path':
+        """Return the path that takes the next pulse (s) for a stray."""
+        return self._replace(cost=self.cost + cost, marks=(*self.marks, 0), stray_at=pulse,
                              deviations=(*self.deviations, 0.0), levels=(*self.levels, math.nan))
 
 
@@ -82,7 +85,8 @@ class PathRules:
     is known of uneven marks. `scatter` is that of the intervals, relative to 1; deviations within
     `given` (slot,) are believed. Up to `maximum_missing` pulses may be missing. `expected` is the
     level that earlier intervals predict (None: not known), and the clock moves a pulse by up to a
-    `tick` of the interval. A stray costs `stray`, any interval `each`; `most` paths are kept.
+    `tick` of the interval. So many intervals as are `known` tell the scatter (Student's t: of a
+    few, it may be too small). A stray costs `stray`, any interval `each`; `most` paths are kept.
     """
 
     steps: Sequence[int]
@@ -92,6 +96,7 @@ class PathRules:
     maximum_missing: int
     expected: float | None
     tick: float = 0.0
+    known: float = _CERTAIN
     stray: float = STRAY
     each: float = 0.0
     most: int = _MOST_PATHS
@@ -100,7 +105,7 @@ class PathRules:
         """Return the paths with one more pulse, the most likely first."""
         found = []
         for path in paths:
-            found.append(path.stray(self.stray))
+            found.append(path.stray(pulse, self.stray))
             found += self._true(path, pulse)
         found.sort(key=itemgetter(0))
         most = found[0].cost + _DROPPED
@@ -119,7 +124,8 @@ class PathRules:
             level = math.log(gap / width)
             off = self._deviation(path, level, mark)
             beyond = max(abs(off) - self.tick / mark, 0.0)
-            cost = min(0.5 * (beyond / self.scatter)**2, JUMP)
+            cost = min(0.5 * (self.known + 1.0) * math.log1p(
+                (beyond / self.scatter)**2 / self.known), JUMP)
             if self._believed(path, level, off):
                 cost = min(cost, BELIEVED)
             if mark > 1:
@@ -127,7 +133,7 @@ class PathRules:
                     if off < 0.0:
                         break
                     continue
-                cost += MISSING + MORE_MISSING * (mark - 2)
+                cost += MISSING + MORE_MISSING * (mark - 2) + self._by_chance(path, gap / width)
             if cost == JUMP:
                 # The angle jumps, and the speed stays as it was; or the speed jumps.
                 found.append(path._replace(
@@ -143,6 +149,13 @@ class PathRules:
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
         return found
+
+    def _by_chance(self, path: Path, interval: float) -> float:
+        """Return how unlikely it is that a stray comes so near to where a pulse is missing."""
+        if path.stray_at <= path.last:
+            return 0.0
+        off = (path.stray_at - path.last) / interval
+        return max(-math.log(2.0 * max(abs(off - max(round(off), 1)), _NEAREST)), 0.0)
 
     def _believed(self, path: Path, level: float, off: float) -> bool:
         """Whether the deviation from what the intervals before all paths let expect is given."""
