@@ -266,7 +266,7 @@ class IntervalJudge:
             self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
             np.maximum(self._lock.believed, self._options.tolerance).tolist(),
             self._options.maximum_missing, self._model.expected, self._model.tick,
-            max(self._model.known, 1))
+            self._model.told)
 
     def _decide(self, final: bool) -> bool:
         """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""

@@ -28,6 +28,7 @@ from operator import mul
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
+from sa_jitter_ros.pulses.pulse_paths import CERTAIN
 
 FloatArray = NDArray[np.float64]
 
@@ -105,6 +106,8 @@ class IntervalModel:
         self._levels = [level] * _REACH
         self._variance = np.full(len(_WEIGHTS), scatter**2)
         self._count = float(count)
+        #: so many intervals tell the scatter, at least one
+        self.told = max(self._count, 1.0)
         self._chosen = 0
         self._settling = _REACH
         self._intervals = deque(intervals, maxlen=self._window)
@@ -190,6 +193,7 @@ class IntervalModel:
         if len(self._refused) >= _SEVERAL:
             scatter = _WIDER * max(size for _, size in self._refused) / _WIDTH
             self._variance = np.maximum(self._variance, scatter**2)
+            self.told = CERTAIN  # it is wide on purpose
             self._refused = []
             self._set_tolerance()
 
@@ -229,7 +233,7 @@ class IntervalModel:
         off = np.expm1(every[_REACH:] - _ALL_WEIGHTS @ every[self._before])
         square = _robust_square(np.minimum(off * off, self.tolerance**2))
         self._variance += weight * (square - self._variance)
-        self._count = min(self._count + self.block, _MEMORY)
+        self._count = self.told = min(self._count + self.block, _MEMORY)
         self._chosen = int(np.argmin(self._variance))
         del self._levels[:-_REACH]
         if self._tick:  # the smallest so far; others may show that it is a fraction of that

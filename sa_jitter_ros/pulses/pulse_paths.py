@@ -33,7 +33,8 @@ IntArray = NDArray[np.int64]
 STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
 # More, of a speed that falls to a half, a third, ... at once: rather, pulses are missing.
 FRACTION, _WHOLE = 48.0, 0.03
-_CERTAIN = 1e6  # intervals that tell the scatter as surely as it can be
+#: intervals that tell the scatter as surely as it can be
+CERTAIN = 1e6
 _NEAREST = 1e-3  # intervals from its place at which no average shows that a pulse is displaced
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
@@ -96,7 +97,7 @@ class PathRules:
     maximum_missing: int
     expected: float | None
     tick: float = 0.0
-    known: float = _CERTAIN
+    known: float = CERTAIN
     stray: float = STRAY
     each: float = 0.0
     most: int = _MOST_PATHS
