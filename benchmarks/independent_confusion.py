@@ -39,6 +39,7 @@ from sa_jitter_ros.errors import SaJitterError
 
 PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('excess_jitter', 'amplitude_modulation'),
          ('speed_fluctuation', 'additive_noise'), ('phase_wander', 'interfering_tone'))
+_OF_PULSES, _SAMPLED = ('excess_jitter', 'correlated_jitter'), 0.5  # sample periods, 12^-0.5 RMS
 _SCATTER = ('additive_noise', 'amplitude_modulation', 'interfering_tone')
 
 
@@ -48,7 +49,8 @@ class Run:
     What the loop reported of one machine.
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
-    right. Effects that are `present` change no average. `before` and `after` are RMS residuals
+    right. `sampling` are errors of the pulses, among those `found`, that a tach waveform has by
+    itself: of its sampling. Effects that are `present` change no average. `before` and `after` are RMS residuals
     less their standard errors, in quadrature; `errors` are those of the parameters in stated
     standard errors.
     """
@@ -64,6 +66,7 @@ class Run:
     found: tuple[str, ...]
     present: tuple[str, ...]
     rivals: tuple[str, ...]
+    sampling: tuple[str, ...]
     before: float
     after: float
     chi2_before: float
@@ -75,7 +78,8 @@ class Run:
         """Tell whether the loop named what happened, or said that it knows none of it."""
         if set(self.effects) & set(UNKNOWN):
             return self.verdict == 'unexplained' and not self.found
-        found = set(self.found) - ({'additive_noise'} if self.noisy else set())
+        found = set(self.found) - set(self.sampling) - (
+            {'additive_noise'} if self.noisy else set())
         if 'jitter_scale' in self.effects and 'jitter_scale' in self.rivals:
             found = {'jitter_scale' if name == 'excess_jitter' else name for name in found}
         return self.status == 0 and found <= set(self.effects) <= found | set(self.present) and (
@@ -120,7 +124,7 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
     if status:
         nan = float('nan')
         return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', False, (),
-                   (), (), nan, nan, nan, nan, {})
+                   (), (), (), nan, nan, nan, nan, {})
     found = report['missing_effects']
     chi2 = [float('nan') if value is None else value for value in (
         report[when]['chi2_per_dof'] for when in ('error_before', 'error_after'))]
@@ -129,6 +133,8 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
         item.noise_colour > 0.0, tuple(one['name'] for one in found),
         tuple(one['name'] for one in report['present']),
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
+        tuple(one['name'] for one in found if item.waveform and one['name'] in _OF_PULSES
+              and one['parameters']['std']['value'] < _SAMPLED / item.sample_rate),
         _rms(report['error_before']), _rms(report['error_after']),
         *chi2,
         {f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
