@@ -152,8 +152,12 @@ class PathRules:
         return found
 
     def _by_chance(self, path: Path, interval: float) -> float:
-        """Return how unlikely it is that a stray comes so near to where a pulse is missing."""
-        if path.stray_at <= path.last:
+        """
+        Return how unlikely it is that a stray comes so near to where a pulse is missing.
+
+        Before the interval is known, a displaced pulse looks like that, and the others tell it.
+        """
+        if self.expected is None or path.stray_at <= path.last:
             return 0.0
         off = (path.stray_at - path.last) / interval
         return max(-math.log(2.0 * max(abs(off - max(round(off), 1)), _NEAREST)), 0.0)
