@@ -49,15 +49,16 @@ class Run:
     What the loop reported of one machine.
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
-    right. `sampling` are errors of the pulses, among those `found`, that a tach waveform has by
-    itself: of its sampling. Effects that are `present` change no average. `before` and `after` are RMS residuals
-    less their standard errors, in quadrature; `errors` are those of the parameters in stated
-    standard errors.
+    right. `sampling` are errors of the pulses, among those `found`, that the sampling of a tach
+    waveform makes. Effects that are `present` change no average. `before` and `after` are RMS
+    residuals less their standard errors, in quadrature; `errors` are those of the parameters in
+    stated standard errors.
     """
 
     effects: tuple[str, ...]
     seed: int
     machine: str
+    cycle_length: float
     seconds: float
     status: int
     message: str
@@ -123,13 +124,14 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
             f'{", reference" * item.reference}{", waveform" * item.waveform}')
     if status:
         nan = float('nan')
-        return Run(effects, seed, text, seconds, status, error.getvalue().strip(), '', False, (),
-                   (), (), (), nan, nan, nan, nan, {})
+        return Run(effects, seed, text, item.cycle_length, seconds, status,
+                   error.getvalue().strip(), '', False, (), (), (), (), nan, nan, nan, nan, {})
     found = report['missing_effects']
     chi2 = [float('nan') if value is None else value for value in (
         report[when]['chi2_per_dof'] for when in ('error_before', 'error_after'))]
     return Run(
-        effects, seed, text, seconds, status, error.getvalue().strip(), report['verdict'],
+        effects, seed, text, item.cycle_length, seconds, status, error.getvalue().strip(),
+        report['verdict'],
         item.noise_colour > 0.0, tuple(one['name'] for one in found),
         tuple(one['name'] for one in report['present']),
         tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
@@ -199,6 +201,22 @@ def table(runs: Sequence[Run]) -> str:
     return '\n'.join(lines)
 
 
+def summary(runs: Sequence[Run]) -> str:
+    """Return how many runs of each kind are right, and how many parameters."""
+    kinds = {'as declared': [run for run in runs if not run.effects],
+             'with effects': [run for run in runs if run.effects],
+             'with effects in no module': [run for run in runs if set(run.effects) & set(UNKNOWN)],
+             'with known effects, trigger cycles of a fundamental cycle or more': [
+                 run for run in runs if run.effects and not set(run.effects) & set(UNKNOWN)
+                 and run.cycle_length >= 1.0]}
+    errors = [z for run in runs for z in run.errors.values() if np.isfinite(z)]
+    return '\n'.join([
+        *(f'{sum(run.right for run in rows)} of {len(rows)} machines {kind} are right'
+          for kind, rows in kinds.items() if rows),
+        f'{sum(abs(z) < 3 for z in errors)} of {len(errors)} parameters are within 3 standard '
+        'errors'])
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the campaign."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -234,6 +252,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
     print(table(runs))
+    print(summary(runs))
     return 0
 
 

@@ -27,6 +27,6 @@ def test_without_a_move_nothing_changes():
 
 @pytest.mark.machines
 @pytest.mark.parametrize(('number', 'way', 'case'), [
-    pytest.param(*item, id=item[0].name) for item in sample(10, seed=1)])
+    pytest.param(*item, id=item[0].name) for item in sample(20, seed=1)])
 def test_moving_a_number_tenfold_changes_a_published_result(number, way, case):
     assert noticed(number, way == 'up', [case])
