@@ -81,6 +81,12 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
         validated(np.sort(np.append(true, true[10::12] + 0.01 / marks)), marks)
 
 
+@pytest.mark.parametrize('count', [250, 2500])
+def test_pulses_at_random_are_no_shaft_of_another_speed(rng, count):
+    with pytest.raises(RecordingError, match='at no interval that a shaft could have'):
+        validated(np.sort(rng.uniform(0.0, 10.0, count)), 1)
+
+
 def test_trigger_pulses_of_a_wheel_with_gaps_stay_on_its_teeth():
     """The first pulse is not the index, and a fourth of the teeth is missing."""
     teeth = np.arange(5, 2000)

@@ -26,6 +26,7 @@ BoolArray = NDArray[np.bool_]
 
 _SPEED_TOLERANCE = 0.1  # of the declared speed, relative
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
+_MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
 _SAME_RATE = 0.01  # relative difference of a declared rate
@@ -123,6 +124,11 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if spurious > _MOST_SPURIOUS * measured.size:
         raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
                              f'{_MOST_SPURIOUS:.0%}: give the trigger more hysteresis')
+    dropped = spurious + counts.unlocked
+    if dropped > _MOST_DROPPED * measured.size:
+        raise RecordingError(f'{dropped} of {measured.size} pulses follow each other at no '
+                             'interval that a shaft could have: see what check_keyphasor finds in '
+                             'them')
     found = pulses.every(step)
     if found.times.size < _FEWEST or not np.any(found.missing == 0):
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
