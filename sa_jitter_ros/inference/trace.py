@@ -232,8 +232,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     before = bench.score((), unsteadiness=own) if chosen else first
     after = bench.score(effects, chosen, unsteadiness=own) if chosen else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
-    on_all = _refitted(bench, timing)
-    left = _unexplained(bench, on_all, chosen)
+    whole = _refitted(bench, timing)
+    left = _unexplained(bench, whole, chosen)
     unexplained = remains(after, moves) or left is not None
     of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
         unexplained) else ''
@@ -257,7 +257,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         else:
             reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
-    final = tuple(_on_all(bench, on_all, [*chosen, *present]))
+    final = tuple(_on_all(bench, whole, [*chosen, *present]))
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
