@@ -19,8 +19,8 @@ from sa_jitter_ros.inference.record_fit import _States, fit_record
 
 @pytest.mark.machines
 @pytest.mark.parametrize(('names', 'seed'), [
-    ((), 203), (('target_geometry',), 200), (('speed_fluctuation',), 201),
-    (('missing_pulses',), 201)])
+    ((), 203), (('target_geometry',), 200), (('interfering_tone',), 200),
+    (('missing_pulses',), 201), (('speed_fluctuation',), 201)])
 def test_errors_are_as_wrong_as_their_standard_errors_say(names, seed):
     run = fitted(names, seed)
     inner = slice(2, -2)  # half as much vibration tells the outermost pulses

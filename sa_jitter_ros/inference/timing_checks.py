@@ -167,13 +167,13 @@ def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
     data = chooser.data
     p_values = []
     items = [item for item in data.stretches if item.errors.size >= _FEWEST]
+    found = [_moments(_filtered(chooser.left(choice.fit, item), gain, data)) for item in items]
     for scaled in _kinds(choice) if items else ():
         seen, null = np.zeros(2), np.zeros((2, _DRAWS))
-        for item in items:
+        for item, moments in zip(items, found):
             draws = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
             middle = np.median(draws, axis=1)
-            seen += item.errors.size * (
-                _moments(_filtered(chooser.left(choice.fit, item), gain, data)) - middle)
+            seen += item.errors.size * (moments - middle)
             null += item.errors.size * (draws - middle[:, None])
         p_values.append(min(1.0, len(seen) * min(
             _chance(abs(value), np.abs(draws)) for value, draws in zip(seen, null))))

@@ -86,8 +86,8 @@ class PathRules:
     is known of uneven marks. `scatter` is that of the intervals, relative to 1; deviations within
     `given` (slot,) are believed. Up to `maximum_missing` pulses may be missing. `expected` is the
     level that earlier intervals predict (None: not known), and the clock moves a pulse by up to a
-    `tick` of the interval. So many intervals as are `known` tell the scatter (Student's t: of a
-    few, it may be too small). A stray costs `stray`, any interval `each`; `most` paths are kept.
+    `tick` of the interval. As many intervals as `told` show the scatter (Student's t: of a few,
+    it may be too small). A stray costs `stray`, any interval `each`; `most` paths are kept.
     """
 
     steps: Sequence[int]
@@ -97,7 +97,7 @@ class PathRules:
     maximum_missing: int
     expected: float | None
     tick: float = 0.0
-    known: float = CERTAIN
+    told: float = CERTAIN
     stray: float = STRAY
     each: float = 0.0
     most: int = _MOST_PATHS
@@ -125,8 +125,8 @@ class PathRules:
             level = math.log(gap / width)
             off = self._deviation(path, level, mark)
             beyond = max(abs(off) - self.tick / mark, 0.0)
-            cost = min(0.5 * (self.known + 1.0) * math.log1p(
-                (beyond / self.scatter)**2 / self.known), JUMP)
+            cost = min(0.5 * (self.told + 1.0) * math.log1p(
+                (beyond / self.scatter)**2 / self.told), JUMP)
             if self._believed(path, level, off):
                 cost = min(cost, BELIEVED)
             if mark > 1:
