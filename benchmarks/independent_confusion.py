@@ -88,14 +88,15 @@ class Run:
 
 
 def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: bool = False,
-          pictures: bool = False, scale: float = 1.0) -> Run:
+          pictures: bool = False, scale: float = 1.0, share: float = 1.0) -> Run:
     """
     Draw a case, run `close_loop` on it in `folder` and read its report.
 
-    The true jitter is `scale` times the declared one, which adds `jitter_scale` to the effects.
+    The true jitter is `scale` times the declared one, which adds `jitter_scale` to the effects,
+    which are `share` times as large as drawn.
     Without `pictures`, which take most of its time, the command stops short of drawing them.
     """
-    case = draw_case(effects, seed, only_declared=only_declared)
+    case = draw_case(effects, seed, only_declared=only_declared, share=share)
     declaration, truth = case.machine, dict(case.truth)
     if scale != 1.0:
         declaration = replace(declaration, keyphasor_rate=scale * declaration.keyphasor_rate)
@@ -226,6 +227,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--pairs', type=int, default=3, help='machines a pair of effects')
     parser.add_argument('--scales', type=float, nargs='*', default=(),
                         help='true jitter over the declared one, each for so many --seeds')
+    parser.add_argument('--share', type=float, default=1.0,
+                        help='size of the effects over the drawn one')
     parser.add_argument('--first', type=int, default=0, help='first seed')
     parser.add_argument('--only', help='one case, effects joined by +')
     parser.add_argument('--only-declared', action='store_true', help='no undeclared orders')
@@ -248,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     folder = options.keep / f'{"+".join(effects) or "none"}_{seed}'
                     folder.mkdir(parents=True, exist_ok=True)
                 run = judge(effects, seed, folder, only_declared=options.only_declared,
-                            pictures=options.pictures, scale=scale)
+                            pictures=options.pictures, scale=scale, share=options.share)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
     print(table(runs))

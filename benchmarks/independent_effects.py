@@ -217,11 +217,13 @@ UNKNOWN = ('following_level', 'late_recovery', 'two_paths', 'resonance')
 _MAKERS = {item.__name__: item for item in MEAN + AS_THEY_ARE + SCATTER}
 
 
-def draw_case(names: tuple[str, ...], seed: int, *, only_declared: bool = False) -> Case:
+def draw_case(names: tuple[str, ...], seed: int, *, only_declared: bool = False,
+              share: float = 1.0) -> Case:
     """
     Draw a machine and what of `names` happens to it; no name: the declared model is right.
 
-    A machine of `only_declared` orders has neither sidebands nor other shafts.
+    A machine of `only_declared` orders has neither sidebands nor other shafts. Effects that have
+    a size are `share` times as large as drawn.
     """
     for attempt in range(200):
         rng = np.random.default_rng([seed, attempt, *(ord(c) for c in '+'.join(names))])
@@ -231,7 +233,7 @@ def draw_case(names: tuple[str, ...], seed: int, *, only_declared: bool = False)
             machine = replace(machine, components=machine.orders, peaks=machine.peaks[:, :count])
         what, truth = Disturbance(), {}
         for name in names:
-            one = _sized(rng, name, machine)
+            one = _sized(rng, name, machine, share)
             if one is None:
                 break
             what = replace(what, **{item.name: getattr(one[0], item.name) for item in fields(what)
@@ -262,7 +264,7 @@ def _machine(rng: Generator, names: tuple[str, ...]) -> Machine:
     return machine
 
 
-def _sized(rng: Generator, name: str, machine: Machine
+def _sized(rng: Generator, name: str, machine: Machine, share: float
            ) -> tuple[Disturbance, Mapping[str, Any]] | None:
     """Return an effect of a size that matters, None where the machine does not let it."""
     make = _MAKERS[name](rng, machine)
@@ -283,7 +285,7 @@ def _sized(rng: Generator, name: str, machine: Machine
         noise = 2.0 * machine.noise_std**2 / machine.sample_rate / machine.average
         before = float(np.median(np.sqrt(timing + noise / machine.levels**2)))
         size = before * np.sqrt(times**2 - 1.0)
-        what, truth = make(size)
+        what, truth = make(share * size)
         worst = max(float(np.sum(what.gain.size**2)), what.tone[1] / machine.levels.max() / 3.0,
                     what.noise**2 / np.sum(machine.levels**2, axis=1).max() / 10.0)
         return (what, truth) if worst < 0.25 else None
@@ -294,5 +296,5 @@ def _sized(rng: Generator, name: str, machine: Machine
         size *= 1.15
         change = mean(make(size)[0]) - base
         if np.sqrt(np.mean(change**2)) > target:
-            return make(size)
+            return make(share * size)
     return None
