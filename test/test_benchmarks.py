@@ -106,7 +106,7 @@ def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, 
 @pytest.mark.machines
 @pytest.mark.parametrize('cycles', [5, 10])
 def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
-    coverage, trials = benchmark('coverage'), 1200
+    coverage, trials = benchmark('interval_coverage'), 1200
     raw, _ = coverage.coverage(coverage.Case(cycles, 40.0, 0.8, correct=False), trials, seed=1)
     # of few cycles in so large a jitter they are too safe, by up to 10 points (docs/theory.md)
     for width, wanted, safe in ((1.0, 0.683, 0.1), (1.96, 0.95, 0.03)):
@@ -118,7 +118,7 @@ def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
 
 @pytest.mark.parametrize(('uniform', 'distribution'), [(True, 'uniform'), (False, 'normal')])
 def test_drawn_strong_amplitudes_are_those_that_are_predicted(benchmark, uniform, distribution):
-    drawn = benchmark('coverage').strong_amplitudes(5, 0.8, uniform, 20000, seed=1)
+    drawn = benchmark('interval_coverage').strong_amplitudes(5, 0.8, uniform, 20000, seed=1)
     std = 0.8 / (2.0 * np.pi * 16.0 * 25.0)
     wanted = sa.predict(keyphasor_rate=1.0 / (np.sqrt(12.0) * std), trigger_speed=25.0,
                         trigger_cycles=5, orders=[16.0], jitter_distribution=distribution,

@@ -90,8 +90,9 @@ _FIRST_NOMINAL, _NOMINAL = 8, 3.0
 # Averages over which the variance by the jackknife is smoothed: one alone has two degrees of
 # freedom.
 _SMOOTHED = 8
-# Standard deviation of an indicator over that by the jackknife, measured (benchmarks/coverage.py):
-# three parts exaggerate that of a maximum and of a moment of noise.
+# Standard deviation of an indicator over that by the jackknife, measured
+# (benchmarks/interval_coverage.py): three parts exaggerate that of a maximum and of a moment of
+# noise.
 _JACKKNIFE = np.array([{
     'peak': 0.9, 'crest_factor': 0.9, 'kurtosis': 0.95, 'fm0': 0.89, 'fm4': 0.9, 'm6a': 0.91,
     'm8a': 0.96, 'nb4': 1.13}.get(name, 1.0) for name in INDICATORS])

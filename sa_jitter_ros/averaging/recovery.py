@@ -19,20 +19,23 @@ number of pulses.
 
 Only orders above the noise are used, each channel and order with the weight of its noise. An order
 whose phase the errors may turn by half a cycle is used only after lower orders have limited the
-errors. The size of the errors is estimated with them. Where the vibration tells less of a pulse,
-its expected error is smaller, so that noise is not aligned to itself. A delay common to all pulses
-cannot be recovered: the errors have mean zero.
+errors. An order of another shaft beside one that is used would pass for errors: it is found by
+what it does to the length of that order, and fitted with it (`orders_beside`). The size of the
+errors is estimated with them. Where the vibration tells less of a pulse, its expected error is
+smaller, so that noise is not aligned to itself. A delay common to all pulses cannot be recovered:
+the errors have mean zero.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
-from sa_jitter_ros.averaging.synchronous_orders import (GridCycles, LineSearch,
+from sa_jitter_ros.averaging.synchronous_orders import (GridCycles, LineSearch, orders_beside,
                                                         significant_orders)
 from sa_jitter_ros.errors import ParameterError, SignalError
 
@@ -102,6 +105,20 @@ class PulseErrorRecovery:
     ripple: FloatArray
 
 
+class _Attempt(NamedTuple):
+    """
+    A fit, or why there is none.
+
+    `clear` are orders far above those around, `beside` the orders of other shafts that
+    `orders_beside` finds.
+    """
+
+    fit: PulseErrorFit | None
+    reason: str
+    clear: FloatArray
+    beside: FloatArray
+
+
 def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length: float,
                          declared_standard_deviation: float, first_angle: float = 0.0,
                          orders: Sequence[float] = (), additional_orders: Sequence[float] = (),
@@ -141,11 +158,12 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
         _staged_fit, grid, cycle_length=cycle_length, first_angle=first_angle, orders=orders,
         additional_orders=additional_orders, most_orders=most_orders, declared=declared,
         with_ripple=with_ripple)
-    fit, gain, reason = attempt(expected=declared)
-    if fit is not None and (_may_be_aside(fit, declared) or fit.evidence < _CONVINCING):
-        other = attempt(expected=declared * (_WIDER if fit.std > declared else 1.0 / _WIDER))
-        if other[0] is not None and other[0].evidence > fit.evidence + _UNLIKELY:
-            fit, gain, reason = other
+    found = _likeliest(attempt, declared)
+    fit, reason = found.fit, found.reason
+    if fit is not None and found.beside.size:
+        again = _likeliest(partial(
+            attempt, orders=np.union1d(fit.orders, found.beside)), declared).fit
+        fit = fit if again is None else again
     if fit is None:
         count, _, channels = grid.cycles.shape
         return PulseErrorRecovery(
@@ -162,7 +180,8 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
     expected -= expected.mean()
     errors = fit.errors * seconds
     errors -= errors.mean()
-    reason = _refusal(fit, expected, periods, declared_standard_deviation, gain)
+    reason = _refusal(fit, expected, periods, declared_standard_deviation,
+                      LineSearch.of(grid, cycle_length).gain(fit.expected, found.clear))
     if reason:
         errors, expected = np.zeros_like(errors), np.zeros_like(errors)
     # of the orders that determine the errors, each with its weight
@@ -173,6 +192,17 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
         2.0 * np.pi * order * fit.standard_errors < _AMBIGUOUS, fit.std * float(seconds.mean()),
         fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, fit.aligned.T, fit.noise.T,
         fit.ripple * periods / cycle_length)
+
+
+def _likeliest(attempt: Callable[..., _Attempt], declared: float) -> _Attempt:
+    """Return the likelier of the fits from the declared jitter on and from another size on."""
+    found = attempt(expected=declared)
+    fit = found.fit
+    if fit is not None and (_may_be_aside(fit, declared) or fit.evidence < _CONVINCING):
+        other = attempt(expected=declared * (_WIDER if fit.std > declared else 1.0 / _WIDER))
+        if other.fit is not None and other.fit.evidence > fit.evidence + _UNLIKELY:
+            return other
+    return found
 
 
 def _may_be_aside(fit: PulseErrorFit, declared: float) -> bool:
@@ -219,16 +249,12 @@ def _refusal(fit: PulseErrorFit, errors: FloatArray, periods: FloatArray, declar
 
 def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
                 orders: Sequence[float], additional_orders: Sequence[float], most_orders: int,
-                declared: float, expected: float, with_ripple: bool
-                ) -> tuple[PulseErrorFit | None, float, str]:
+                declared: float, expected: float, with_ripple: bool) -> _Attempt:
     """
     Fit low orders first, then higher ones as the errors become better known.
 
     `declared` is the standard deviation of the errors that is likeliest beforehand, `expected`
     the one whose turns of the orders decide which are safe to use.
-
-    Returns the fit, the power of the orders without the errors over that with them, and why
-    nothing can be fitted.
     """
     samples, count = grid.samples, len(grid.cycles)
     given = np.unique([g for g in orders if 0.0 < g * cycle_length <= 0.5 * len(samples)])
@@ -270,14 +296,15 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
             errors = problem.scan(width)
         fit = problem.solve(errors, declared=declared)
         errors = fit.expected
-        complete = known[-1] * width <= _SAFE_TURNS
+        complete = search is not None and known[-1] * width <= _SAFE_TURNS
         width = min(width, _CERTAIN * float(np.sqrt(np.max(fit.covariance[0]))))
         spread = max(1.2 * float(np.max(np.abs(np.diff(errors)))), width)
         if complete:
             break
     if problem is None:
-        return None, 1.0, (
+        return _Attempt(None, (
             f'no synchronous order up to {_MOST_TURNS / width:.4g} stands above the noise, and '
             'above it the declared jitter makes phases ambiguous: declare the orders of a gear '
-            'mesh, or use a quieter channel')
-    return fit, 1.0 if search is None else search.gain(fit.expected, clear), ''
+            'mesh, or use a quieter channel'), clear, np.empty(0))
+    return _Attempt(fit, '', clear, orders_beside(
+        problem.model, fit.expected, problem.chosen, problem.significant, cycle_length))

@@ -22,7 +22,7 @@ as coherent from cycle to cycle as the order, and passes the test more often tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import pi
 
 import numpy as np
@@ -31,6 +31,7 @@ from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviation
                                                      least_squares, real_parts)
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
+from scipy.special import betainc
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -47,6 +48,9 @@ _SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
 _POLE = 1e-8  # lines that are no nearer to a bin: there the lobe is a quotient of two zeros
+# Cycles from which on a tone in them can be told, and its least amplitude over that of the order:
+# a weaker one moves the errors so little that amplitudes at three times the order change by 0.2 %.
+_LEAST_CYCLES, _LEAST_TONE = 8, 0.02
 _CLEAR = 100.0  # times the power of the orders around
 # Candidates, over those wanted, whose lines are separated, and how far apart they must be.
 _TOGETHER, _APART = 2, 0.02
@@ -251,6 +255,69 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     limit = _significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
+
+
+def orders_beside(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.intp],
+                  significant: NDArray[np.bool_], cycle_length: float) -> FloatArray:
+    """
+    Return where an order of another shaft may lie beside the `chosen` ones, empty if nowhere.
+
+    Pulse `errors` turn an order from cycle to cycle and hardly change its length. An order beside
+    it does both, at the rate of their distance. An F test thus looks for a tone in the lengths
+    that are left of each order, in the channels where it is `significant` (order, channel).
+    Whole turns and the sign of the rate do not show: of the largest tone, the four nearest orders
+    are returned.
+    """
+    count, orders = len(model.coefficients), model.orders[chosen]
+    if count < _LEAST_CYCLES:
+        return np.empty(0)
+    signal = model.response(errors, np.zeros(count), chosen).signal
+    amplitudes = least_squares(signal, model.coefficients)
+    deviation = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
+    lengths = (deviation * np.exp(-1j * np.angle(amplitudes))).real
+    rates, waves = _waves(count)
+    level, largest, found = _FALSE_ALARM / (count * orders.size), 0.0, np.empty(0)
+    for order, told, series, size in zip(orders, significant, lengths.transpose(1, 0, 2),
+                                         np.abs(amplitudes)):
+        series, channels = series[:, told], int(told.sum())
+        shares = _shares(series, waves)
+        place = int(np.argmax(shares))
+        power = shares[place] * np.sum(series**2)
+        # of 2 and count - 3 degrees of freedom in each channel
+        chance = betainc(0.5 * channels * (count - 3), channels, 1.0 - shares[place])
+        least = 0.5 * count * np.sum((_LEAST_TONE * size[told]) ** 2)
+        if chance < level and power > max(largest, least):
+            near = rates[place] + np.linspace(-1.0, 1.0, 21) * rates[0]
+            near = near[(near > 0.0) & (near < 0.5)]
+            rate = near[int(np.argmax(_shares(series, _tones(near, count))))]
+            if rate > 0.5 - rates[0]:  # the cycles do not tell it from half a turn
+                rate = 0.5
+            largest = power
+            found = order + np.array((rate - 1.0, -rate, rate, 1.0 - rate)) / cycle_length
+    return found
+
+
+@lru_cache(maxsize=16)
+def _waves(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return rates (turns a cycle), a quarter of a turn of all cycles apart, and their tones."""
+    rates = np.arange(1, 2 * count) / (4.0 * count)
+    return rates, _tones(rates, count)
+
+
+def _tones(rates: FloatArray, count: int) -> FloatArray:
+    """Return an orthonormal basis (rate, 2, cycle) of the tones without their means."""
+    turns = 2.0 * pi * np.multiply.outer(rates, np.arange(count))
+    waves = np.stack((np.cos(turns), np.sin(turns)), axis=1)
+    waves -= waves.mean(axis=2, keepdims=True)
+    return np.asarray(np.linalg.svd(waves, full_matrices=False)[2])
+
+
+def _shares(series: FloatArray, tones: FloatArray) -> FloatArray:
+    """Return the share (rate,) of `series` (cycle, channel) that tones have, channels alike."""
+    series = series - series.mean(axis=0)
+    power = np.maximum(np.sum(series**2, axis=0), np.finfo(float).tiny)
+    return np.asarray(np.minimum(np.mean(np.sum((tones @ series) ** 2, axis=1) / power, axis=1),
+                                 1.0))
 
 
 def _significance(tests: int, cycles: int) -> float:

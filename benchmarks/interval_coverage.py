@@ -11,7 +11,7 @@
 """
 Shares of published intervals that contain the truth of a simulation.
 
-`python benchmarks/coverage.py` prints the tables of `docs/theory.md` and
+`python benchmarks/interval_coverage.py` prints the tables of `docs/theory.md` and
 `docs/condition_indicators.md`.
 The simulation knows no formula of the package: it adds cosines of known amplitude and white noise,
 and moves known pulse times by uniform errors.
