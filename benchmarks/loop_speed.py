@@ -29,8 +29,8 @@ import time
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
-from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.simulation import Gearbox, Keyphasor, make_effects, mesh

@@ -12,10 +12,10 @@
 
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_error_fit import (
     _CHANCES, _SIZES, estimated_size, Tridiagonal)
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
-from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.errors import ParameterError, SignalError
 from scipy.signal import lfilter
 

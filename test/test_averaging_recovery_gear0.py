@@ -12,8 +12,8 @@
 
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.recovery import recover_pulse_errors
-from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.pulses.resampling import interpolate
 
 POINTS = 1024

@@ -25,11 +25,11 @@ from sa_jitter_ros.averaging.channel_gaps import ChannelGaps, telling
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.noise import attenuation, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
-from sa_jitter_ros.averaging.synchronous_orders import GridCycles
 from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]

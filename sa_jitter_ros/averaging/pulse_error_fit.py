@@ -37,15 +37,13 @@ from math import factorial, pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from scipy.linalg import lapack, qr, solve_triangular
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _NODE_ERROR = 1e-4
-# A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
-# of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
-_PANEL_CYCLES, _PANEL_DEGREES, _LEAST_GAIN = 6.0, 44, 2
 # Smallest over largest part of a column beside those in front of it, for a Cholesky factor.
 _APART = 1e-4
 _MOST_NODES = 20
@@ -150,27 +148,24 @@ class CompressedCycles:
         return Response(out[0], out[1], out[2], out[-1])
 
 
-def compress(samples: FloatArray, *, cycle_length: float, first_angle: float, orders: FloatArray,
+def compress(grid: GridCycles, *, cycle_length: float, first_angle: float, orders: FloatArray,
              spread: float) -> CompressedCycles:
     """
-    Compress `samples` (sample, cycle, channel) of trigger cycles; sample i is at u = i / samples.
+    Compress the trigger cycles of `grid`; sample i is at u = i / samples.
 
     `spread` is the largest difference between the errors of neighbouring pulses, in fundamental
     cycles, that the nodes must represent. The mean of every cycle, with offset and drift, is
     removed.
     """
-    _, count, channels = samples.shape
-    u = np.arange(len(samples)) / len(samples)
+    length, count, channels = grid.samples.shape
+    u = np.arange(length) / length
     nodes, columns = [], [np.ones((len(u), 1))]
     for g in orders:
         x, through_nodes = _through_nodes(nodes_for(g * spread), u)
         wave = np.exp(2j * pi * g * cycle_length * u)[:, None] * through_nodes
         nodes.append(x)
         columns += [wave.real, -wave.imag]
-    rows, flat = np.concatenate(columns, axis=1), samples.reshape(len(u), -1)
-    panels = _panels(len(u), cycle_length * float(orders.max()))
-    if panels is not None:
-        rows, flat = _projected(rows, panels), _projected(flat, panels)
+    rows, flat = grid.compact(np.concatenate(columns, axis=1), cycle_length * float(orders.max()))
     inside, triangle = _orthonormal(rows, flat)
     inside, triangle = inside[1:], triangle[1:, 1:]  # the part orthogonal to a constant
     widths = np.array([len(x) for x in nodes])
@@ -197,32 +192,6 @@ def _orthonormal(rows: FloatArray, flat: FloatArray) -> tuple[FloatArray, FloatA
         return np.asarray(basis.T @ flat), triangle
     return np.asarray(solve_triangular(triangle, rows.T @ flat, trans='T', check_finite=False)
                       ), triangle
-
-
-def _panels(samples: int, cycles: float) -> FloatArray | None:
-    """
-    Return an orthonormal basis (sample, degree) of polynomials in a panel of a trigger cycle.
-
-    It holds orders up to `cycles` in the trigger cycle, with all that varies slowly, to rounding.
-    None where `samples` are too few for a basis that is much smaller.
-    """
-    length = int(_PANEL_CYCLES * samples / (cycles + _PANEL_CYCLES))
-    if length < _LEAST_GAIN * _PANEL_DEGREES:
-        return None
-    x = np.linspace(-1.0, 1.0, length)
-    return np.asarray(np.linalg.qr(legendre.legvander(x, _PANEL_DEGREES - 1))[0])
-
-
-def _projected(rows: FloatArray, panels: FloatArray) -> FloatArray:
-    """
-    Return rows (sample, column) in the basis of the panels, the last ones as they are.
-
-    Products of columns stay as they are, of all that the panels hold.
-    """
-    length, degrees = panels.shape
-    whole = len(rows) // length
-    inside = np.matmul(panels.T, rows[:whole * length].reshape(whole, length, -1))
-    return np.concatenate((inside.reshape(whole * degrees, -1), rows[whole * length:]))
 
 
 def _through_nodes(count: int, u: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -33,9 +33,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
-from sa_jitter_ros.averaging.synchronous_orders import (GridCycles, LineSearch, orders_beside,
+from sa_jitter_ros.averaging.synchronous_orders import (LineSearch, orders_beside,
                                                         significant_orders)
 from sa_jitter_ros.errors import ParameterError, SignalError
 
@@ -280,9 +281,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         candidates = np.sort(candidates[room])
         if not len(candidates):
             break
-        model = compress(samples, cycle_length=cycle_length, first_angle=first_angle,
-                         orders=candidates,
-                         spread=spread)
+        model = compress(grid, cycle_length=cycle_length, first_angle=first_angle,
+                         orders=candidates, spread=spread)
         significant = significant_orders(model, errors, tests=len(known), least=rounding)
         found = np.flatnonzero(significant.any(axis=1))
         chosen = found[candidates[found] * width <= _SAFE_TURNS]

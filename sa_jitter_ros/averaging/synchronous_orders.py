@@ -22,14 +22,14 @@ as coherent from cycle to cycle as the order, and passes the test more often tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.grid_cycles import GridCycles, taper
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, real_parts)
-from scipy.fft import rfft
 from scipy.ndimage import median_filter
 from scipy.special import betainc
 
@@ -43,8 +43,6 @@ _FALSE_ALARM = 1e-3
 _FAR_BELOW = 0.3
 # Share of an order's power that must be coherent from cycle to cycle.
 _COHERENCE = 0.15
-# Orders that need more cycles than these to be found are too weak to show the error of a pulse.
-_SEARCHED_CYCLES = 32
 _NEIGHBOURHOOD = 41
 _MAIN_LOBE = 3
 _POLE = 1e-8  # lines that are no nearer to a bin: there the lobe is a quotient of two zeros
@@ -54,46 +52,6 @@ _LEAST_CYCLES, _LEAST_TONE = 8, 0.02
 _CLEAR = 100.0  # times the power of the orders around
 # Candidates, over those wanted, whose lines are separated, and how far apart they must be.
 _TOGETHER, _APART = 2, 0.02
-
-
-class GridCycles:
-    """
-    Trigger cycles at equal steps of angle, `cycles`, as (cycle, sample, channel).
-
-    What is computed of them depends on no shaft, so that several shafts share it.
-    """
-
-    def __init__(self, cycles: FloatArray) -> None:
-        self.cycles = np.asarray(cycles, np.float64)
-
-    @cached_property
-    def samples(self) -> FloatArray:
-        """Return the cycles as (sample, cycle, channel), in one piece."""
-        return np.ascontiguousarray(self.cycles.transpose(1, 0, 2))
-
-    @cached_property
-    def size(self) -> FloatArray:
-        """Return the root of the mean square of each channel (channel,)."""
-        flat = self.cycles.reshape(-1, self.cycles.shape[2])
-        return np.asarray(np.sqrt(np.einsum('nc,nc->c', flat, flat) / len(flat)))
-
-    @cached_property
-    def first(self) -> int:
-        """Return the number of the first cycle in `spectra`."""
-        return max(len(self.cycles) - _SEARCHED_CYCLES, 0) // 2
-
-    @cached_property
-    def spectra(self) -> ComplexArray:
-        """Return the spectra, with a Hann window, of some cycles as (line, cycle, channel)."""
-        part = self.cycles[self.first:self.first + _SEARCHED_CYCLES]
-        count, points, channels = part.shape
-        mean = part.reshape(-1, channels).mean(axis=0)
-        window = np.sin(pi * np.arange(points) / points) ** 2
-        spectra = np.empty((points // 2 + 1, count, channels), np.complex128)
-        # A taper over the cycles keeps strong orders from showing at their neighbours.
-        for number, share in enumerate(_taper(count)):
-            spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
-        return spectra
 
 
 @dataclass(frozen=True)
@@ -176,11 +134,11 @@ class LineSearch:
         start = self.cycle_length * (self.first + np.arange(count)) + errors[
             self.first:self.first + count]
         apart = g - g[:, None]
-        turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ _taper(count)
+        turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ taper(count)
         x = apart * self.cycle_length
         lobe = sum(share * (np.sinc(x - shift) + np.sinc(x + shift))
                    for shift, share in enumerate((0.5, 2.0 / 3.0, 1.0 / 6.0)))
-        return np.asarray(turns / _taper(count).sum() * np.exp(1j * pi * x) * lobe)
+        return np.asarray(turns / taper(count).sum() * np.exp(1j * pi * x) * lobe)
 
     def gain(self, errors: FloatArray, orders: FloatArray) -> float:
         """
@@ -218,17 +176,13 @@ class LineSearch:
         # gives to both cancel.
         common = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + x)) * np.sin(pi * x) / (2.0 * pi)
         if not tapered:
-            common = common / _taper(count)
+            common = common / taper(count)
         x = x[:, None] - np.arange(-_MAIN_LOBE, _MAIN_LOBE + 1)[:, None]
         weights = common[:, None] / (x * (1.0 - x) * (1.0 + x))
         for near, weight in zip(nearest.tolist(), weights):
             begin, end = max(near - _MAIN_LOBE, 0), min(near + _MAIN_LOBE + 1, lines)
             shift = _MAIN_LOBE - near
             yield weight[begin + shift:max(end, begin) + shift], self.spectra[begin:end]
-
-
-def _taper(count: int) -> FloatArray:
-    return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
 
 
 def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: int,

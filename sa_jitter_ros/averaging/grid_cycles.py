@@ -1,0 +1,111 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Trigger cycles at equal steps of angle, and what several fits of them share.
+
+All shafts that are corrected together, and all steps of a correction, see the same cycles. Their
+spectra, and their few numbers in which orders up to some highest one are whole, are computed once.
+"""
+
+from functools import cached_property, lru_cache
+from math import pi
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+# Orders that need more cycles than these to be found are too weak to show the error of a pulse.
+_SEARCHED_CYCLES = 32
+# A trigger cycle is cut into panels with so many cycles of the highest order, in which polynomials
+# of so many degrees hold all orders to rounding; worth it from so many samples per degree on.
+# Lengths of panels are this factor apart, so that fits up to similar orders share them.
+_PANEL_CYCLES, _PANEL_DEGREES, _LEAST_GAIN, _LENGTHS = 6.0, 44, 2, 2.0**0.125
+
+
+class GridCycles:
+    """
+    Trigger cycles at equal steps of angle, `cycles`, as (cycle, sample, channel).
+
+    What is kept of them depends on no shaft.
+    """
+
+    def __init__(self, cycles: FloatArray) -> None:
+        self.cycles = np.asarray(cycles, np.float64)
+        self._compact: dict[int, FloatArray] = {}
+
+    @cached_property
+    def samples(self) -> FloatArray:
+        """Return the cycles as (sample, cycle, channel), in one piece."""
+        return np.ascontiguousarray(self.cycles.transpose(1, 0, 2))
+
+    @cached_property
+    def size(self) -> FloatArray:
+        """Return the root of the mean square of each channel (channel,)."""
+        flat = self.cycles.reshape(-1, self.cycles.shape[2])
+        return np.asarray(np.sqrt(np.einsum('nc,nc->c', flat, flat) / len(flat)))
+
+    @cached_property
+    def first(self) -> int:
+        """Return the number of the first cycle in `spectra`."""
+        return max(len(self.cycles) - _SEARCHED_CYCLES, 0) // 2
+
+    @cached_property
+    def spectra(self) -> ComplexArray:
+        """Return the spectra, with a Hann window, of some cycles as (line, cycle, channel)."""
+        part = self.cycles[self.first:self.first + _SEARCHED_CYCLES]
+        count, points, channels = part.shape
+        mean = part.reshape(-1, channels).mean(axis=0)
+        window = np.sin(pi * np.arange(points) / points) ** 2
+        spectra = np.empty((points // 2 + 1, count, channels), np.complex128)
+        # A taper over the cycles keeps strong orders from showing at their neighbours.
+        for number, share in enumerate(taper(count)):
+            spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
+        return spectra
+
+    def compact(self, rows: FloatArray, cycles: float) -> tuple[FloatArray, FloatArray]:
+        """
+        Return `rows` (sample, column) and samples (sample, cycle and channel) in fewer numbers.
+
+        They keep the products of rows and samples, for rows that have no orders above `cycles` in
+        a trigger cycle and vary slowly besides. Where that gains little both are as they were.
+        """
+        flat = self.samples.reshape(len(self.samples), -1)
+        length = _PANEL_CYCLES * len(flat) / (cycles + _PANEL_CYCLES)
+        length = int(_LENGTHS ** np.floor(np.log(length) / np.log(_LENGTHS)))
+        if length < _LEAST_GAIN * _PANEL_DEGREES:
+            return rows, flat
+        if length not in self._compact:
+            self._compact[length] = _in_panels(flat, length)
+        return _in_panels(rows, length), self._compact[length]
+
+
+def taper(count: int) -> FloatArray:
+    """Return the weights of cycles with which strong orders do not show at their neighbours."""
+    return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
+
+
+def _in_panels(rows: FloatArray, length: int) -> FloatArray:
+    """Return rows (sample, column) in the basis of panels, the last ones as they are."""
+    panels = _panels(length)
+    whole = len(rows) // length
+    inside = np.matmul(panels.T, rows[:whole * length].reshape(whole, length, -1))
+    return np.concatenate((inside.reshape(whole * _PANEL_DEGREES, -1), rows[whole * length:]))
+
+
+@lru_cache(maxsize=32)
+def _panels(length: int) -> FloatArray:
+    """Return an orthonormal basis (sample, degree) of polynomials in a panel."""
+    x = np.linspace(-1.0, 1.0, length)
+    return np.asarray(np.linalg.qr(legendre.legvander(x, _PANEL_DEGREES - 1))[0])
