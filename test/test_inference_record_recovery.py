@@ -26,8 +26,8 @@ RATE, SPEED, CYCLES, ACQUISITIONS = 5000.0, 25.0, 20, 8
 TONE = 560.0  # Hz
 
 
-def sources(rng, ratio, orders, *, drift, tone=0.0):
-    """Return the sources found beside order 8, amplitudes of `orders` by order."""
+def sources(rng, ratio, orders, *, drift, tone=0.0, declared=(8.0,)):
+    """Return the sources found beside `declared` orders, amplitudes of `orders` by order."""
     time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
     turns = SPEED * (time + 0.5 * drift * time**2 / time[-1])
     vibration = sum(size * np.cos(2.0 * np.pi * order * ratio * turns)
@@ -37,9 +37,9 @@ def sources(rng, ratio, orders, *, drift, tone=0.0):
     pulses = np.interp(np.arange(0.5, turns[-1]), turns, time)
     pulses = pulses + rng.uniform(-0.5, 0.5, pulses.size) / 10000.0
     model = DeclaredModel(keyphasor_rate=10000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
-                          ratio=ratio, orders=(8.0,), sample_rate=RATE)
+                          ratio=ratio, orders=declared, sample_rate=RATE)
     return observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model
-                   ).sources[1:]
+                   ).sources[len(declared):]
 
 
 def test_orders_of_other_shafts_are_found_and_tones_are_not(rng):
@@ -54,6 +54,16 @@ def test_orders_of_other_shafts_are_found_and_tones_are_not(rng):
 def test_a_steady_machine_tells_only_orders_that_its_shafts_have(rng, other, count):
     found = sources(rng, 3.0, {8.0: 1.0, other: 0.2}, drift=0.0)
     assert found.size == count
+
+
+def test_sidebands_of_a_shaft_are_no_tones_on_a_steady_machine(rng):
+    gears = {8.0: 1.0, 16.0: 0.7}
+    beside = {7.63: 0.2, 8.37: -0.1, 15.63: -0.15, 16.37: 0.05}  # in phase with neither line
+    found = sources(rng, 2.4, {**gears, **beside}, drift=0.0, declared=(8.0, 16.0))
+    np.testing.assert_allclose(np.sort(found), list(beside), atol=0.01)
+    for one, size in beside.items():
+        alone = sources(rng, 2.4, {**gears, one: size}, drift=0.0, declared=(8.0, 16.0))
+        assert not alone.size
 
 
 def machine(rng, *, ratio=2.4, clock=0.0, gap=False):

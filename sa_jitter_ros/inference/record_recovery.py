@@ -19,7 +19,7 @@ from one with declared lines only is decided by the pulses: measured times less 
 a shaft, which turns smoothly, plus what the errors are wrong by.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -301,11 +301,44 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
 
 
 def doubtful_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
-    """Tell which orders, and tones after them (line,), may be those of no shaft."""
+    """
+    Tell which orders, and tones after them (line,), may be those of no shaft.
+
+    On a steady machine no line shows whether it turns. A shaft is then known by its sidebands:
+    several lines as far from declared ones, and one at that distance from 0.
+    """
     found = ~modulating_lines(fit, model)
     exact = np.array([_exact(float(order), model) is not None for order in fit.orders])
     found[:fit.orders.size] &= ~(exact | fit.turning)
+    orders, near, offsets = _places(fit, model)
+    for beside, distance in _sidebands(fit, model, near, offsets):
+        found[beside] = False
+        found[np.abs(orders - distance) < _resolved(fit, model)] = False
     return found
+
+
+def _resolved(fit: RecordFit, model: DeclaredModel) -> float:
+    """Return how far apart orders of a fit must be to differ."""
+    return _SMEARED / (model.cycle_length * (fit.errors.size - 1))
+
+
+def _places(fit: RecordFit, model: DeclaredModel
+            ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+    """Return the orders of all lines, their nearest declared lines, and how far behind these."""
+    orders = np.append(fit.orders, fit.tones / model.fundamental_frequency)
+    apart = orders[:, None] - orders[:fit.declared]
+    near = np.argmin(np.abs(apart), axis=1)
+    return orders, near, apart[np.arange(near.size), near]
+
+
+def _sidebands(fit: RecordFit, model: DeclaredModel, near: NDArray[np.intp], offsets: FloatArray
+               ) -> Iterator[tuple[NDArray[np.intp], float]]:
+    """Iterate over lines that are as far from declared ones on several sides, and how far."""
+    for distance in np.unique(np.abs(offsets[fit.declared:])).tolist():
+        beside = np.flatnonzero(np.abs(np.abs(offsets) - distance) < _resolved(fit, model))
+        beside = beside[beside >= fit.declared]
+        if len({(near[i], offsets[i] < 0.0) for i in beside}) >= _FEWEST_SIDES:
+            yield beside, distance
 
 
 def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
@@ -317,13 +350,9 @@ def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
     varies makes sidebands of one size. In both cases one phase goes with all of them. What turns
     the lines alike was taken for pulse errors, so that the sum of both sides is compared.
     """
-    orders = np.append(fit.orders, fit.tones / model.fundamental_frequency)
+    orders, near, offsets = _places(fit, model)
     amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
-    declared = orders[:fit.declared]
-    least = _SMEARED / (model.cycle_length * (fit.errors.size - 1))
-    apart = orders[:, None] - declared
-    near = np.argmin(np.abs(apart), axis=1)
-    offsets = apart[np.arange(near.size), near]
+    declared, least = orders[:fit.declared], _resolved(fit, model)
     relative = declared * model.fundamental_frequency / model.sample_rate
     shapes = [(np.ones(declared.size), np.inf)]
     for method in METHODS:
@@ -331,11 +360,7 @@ def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
         shapes.append((np.abs(images / gain(method, relative)).sum(axis=0), _OTHER_SIZE))
     found = np.zeros(orders.size, np.bool_)
     level = np.abs(amplitudes[:, :fit.declared])
-    for distance in np.unique(np.abs(offsets[fit.declared:])):
-        beside = np.flatnonzero(np.abs(np.abs(offsets) - distance) < least)
-        beside = beside[beside >= fit.declared]
-        if len({(near[i], offsets[i] < 0.0) for i in beside}) < _FEWEST_SIDES:
-            continue
+    for beside, distance in _sidebands(fit, model, near, offsets):
         sides = np.zeros(level.shape, np.complex128)
         for i in beside:
             side = amplitudes[:, i] / amplitudes[:, near[i]]
