@@ -49,7 +49,8 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
     except OSError as error:
-        raise ParameterError(f'{path}: {error.strerror or error}') from error
+        raise ParameterError(f'{path}: {error.strerror or error}: give the path of a parameter '
+                             'file that can be read') from error
     except Exception as error:  # malformed tags raise exceptions of many types
         raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
     sections = [section for name, section in _sections(content, '')

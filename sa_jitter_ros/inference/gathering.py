@@ -97,8 +97,8 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     again = [None if motion is None or smooth is None else _unskewed(
         observation.acquisitions, motion, smooth) for motion in again]
     spread = [motion for motion in again if motion is not None]
-    error_std = [0.0 if motion is None else _uncertainty(observation, motion, spread)
-                 for motion in again]
+    error_std = [0.0 if motion is None or smooth is None else _uncertainty(
+        observation, motion, spread, smooth) for motion in again]
     missed = (0.0, 0.0) if smooth is None else _missed(observation, smooth, clock)
     known = []
     for a, item in enumerate(observation.acquisitions):
@@ -228,16 +228,18 @@ def _cycles(observation: Observation) -> Array:
                      for item in observation.acquisitions])
 
 
-def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array]) -> float:
+def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array], smooth: Array
+                 ) -> float:
     """
-    Return the standard error of recovered errors (acquisition, pulse) in s.
+    Return the standard error of recovered errors (acquisition, pulse) without skew, in s.
 
-    With a reference keyphasor it is their difference from it, whose errors are included. Otherwise
-    it is that of the delete-a-group jackknife over recoveries that leave out one group of channels
-    each.
+    With a reference keyphasor it is their difference from it, whose errors are included, also
+    without the skew beside the `smooth` motion on the grid. Otherwise it is that of the
+    delete-a-group jackknife over recoveries that leave out one group of channels each.
     """
     if observation.against_reference:
-        apart = motion - observation.stacked('errors')
+        apart = motion - _unskewed(
+            observation.acquisitions, observation.stacked('errors'), smooth)
         variance = np.var(apart, axis=1, ddof=1)
     else:
         variance = (len(others) - 1) * np.var(others, axis=0, ddof=min(1, len(others) - 1))

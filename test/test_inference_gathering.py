@@ -1,0 +1,37 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What is known of the errors of pulses on the grid of a clock."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sa_jitter_ros.inference.gathering import _uncertainty, _unskewed
+
+PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
+
+
+@pytest.mark.parametrize('skew', [0.0, SKEW])
+def test_recovered_errors_are_as_sure_as_the_reference_shows_with_a_skew_too(rng, skew):
+    """The skew moves the pulses of an acquisition by 17 times what the errors are wrong by."""
+    smooth = rng.uniform(-0.5, 0.5, 12 * PULSES) * TICK
+    items = [SimpleNamespace(first=first, times=(first + np.arange(PULSES)) * PERIOD)
+             for first in range(0, smooth.size, PULSES)]
+    on_grid = np.array([smooth[item.first:item.first + PULSES] for item in items])
+    slope = skew * np.array([item.times - item.times.mean() for item in items])
+    reference = on_grid + slope + 0.01 * TICK * rng.standard_normal(slope.shape)
+    wrong = 0.1 * TICK
+    motion = _unskewed(items, reference + wrong * rng.standard_normal(reference.shape), smooth)
+    observation = SimpleNamespace(against_reference=True, acquisitions=items,
+                                  stacked=lambda _: reference)
+    # of 12 variances with 23 degrees of freedom
+    assert _uncertainty(observation, motion, [motion], smooth) == pytest.approx(
+        wrong, rel=4.0 / np.sqrt(2.0 * 12 * 23))
