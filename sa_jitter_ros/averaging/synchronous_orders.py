@@ -22,7 +22,6 @@ as coherent from cycle to cycle as the order, and passes the test more often tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from math import pi
 
 import numpy as np
@@ -30,6 +29,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles, taper
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, real_parts)
+from scipy.fft import rfft
 from scipy.ndimage import median_filter
 from scipy.special import betainc
 
@@ -229,12 +229,13 @@ def orders_beside(model: CompressedCycles, errors: FloatArray, chosen: NDArray[n
     amplitudes = least_squares(signal, model.coefficients)
     deviation = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
     lengths = (deviation * np.exp(-1j * np.angle(amplitudes))).real
-    rates, waves = _waves(count)
+    rates = np.arange(1, 2 * count) / (4.0 * count)  # a quarter of a turn of all cycles apart
     level, largest, found = _FALSE_ALARM / (count * orders.size), 0.0, np.empty(0)
     for order, told, series, size in zip(orders, significant, lengths.transpose(1, 0, 2),
                                          np.abs(amplitudes)):
         series, channels = series[:, told], int(told.sum())
-        shares = _shares(series, waves)
+        series = series - series.mean(axis=0)
+        shares = _shares(series, rates, rfft(series, 4 * count, axis=0)[1:-1])
         place = int(np.argmax(shares))
         power = shares[place] * np.sum(series**2)
         # of 2 and count - 3 degrees of freedom in each channel
@@ -242,8 +243,9 @@ def orders_beside(model: CompressedCycles, errors: FloatArray, chosen: NDArray[n
         least = 0.5 * count * np.sum((_LEAST_TONE * size[told]) ** 2)
         if chance < level and power > max(largest, least):
             near = rates[place] + np.linspace(-1.0, 1.0, 21) * rates[0]
-            near = near[(near > 0.0) & (near < 0.5)]
-            rate = near[int(np.argmax(_shares(series, _tones(near, count))))]
+            near = near[(near > 0.5 * rates[0]) & (near < 0.5 - 0.5 * rates[0])]
+            waves = np.exp(-2j * pi * np.multiply.outer(near, np.arange(count)))
+            rate = near[int(np.argmax(_shares(series, near, waves @ series)))]
             if rate > 0.5 - rates[0]:  # the cycles do not tell it from half a turn
                 rate = 0.5
             largest = power
@@ -251,27 +253,29 @@ def orders_beside(model: CompressedCycles, errors: FloatArray, chosen: NDArray[n
     return found
 
 
-@lru_cache(maxsize=16)
-def _waves(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return rates (turns a cycle), a quarter of a turn of all cycles apart, and their tones."""
-    rates = np.arange(1, 2 * count) / (4.0 * count)
-    return rates, _tones(rates, count)
+def _shares(series: FloatArray, rates: FloatArray, lines: ComplexArray) -> FloatArray:
+    """
+    Return the share (rate,) of `series` (cycle, channel) that tones have, all channels alike.
 
+    The series have no mean; `lines` (rate, channel) are their Fourier sums at these `rates` (turns
+    a cycle). A tone is any sum of a cosine and a sine without their means.
+    """
+    count = len(series)
 
-def _tones(rates: FloatArray, count: int) -> FloatArray:
-    """Return an orthonormal basis (rate, 2, cycle) of the tones without their means."""
-    turns = 2.0 * pi * np.multiply.outer(rates, np.arange(count))
-    waves = np.stack((np.cos(turns), np.sin(turns)), axis=1)
-    waves -= waves.mean(axis=2, keepdims=True)
-    return np.asarray(np.linalg.svd(waves, full_matrices=False)[2])
+    def geometric(rate: FloatArray) -> ComplexArray:
+        """Return the sum of exp(j 2 pi rate k) over the cycles k."""
+        return np.asarray(np.exp(1j * pi * rate * (count - 1)) * np.sin(pi * rate * count)
+                          / np.sin(pi * rate))
 
-
-def _shares(series: FloatArray, tones: FloatArray) -> FloatArray:
-    """Return the share (rate,) of `series` (cycle, channel) that tones have, channels alike."""
-    series = series - series.mean(axis=0)
-    power = np.maximum(np.sum(series**2, axis=0), np.finfo(float).tiny)
-    return np.asarray(np.minimum(np.mean(np.sum((tones @ series) ** 2, axis=1) / power, axis=1),
-                                 1.0))
+    once, twice = geometric(rates), geometric(2.0 * rates)
+    cosines = 0.5 * (count + twice.real) - once.real**2 / count
+    sines = 0.5 * (count - twice.real) - once.imag**2 / count
+    both = 0.5 * twice.imag - once.real * once.imag / count
+    along, across = lines.real, -lines.imag
+    power = (sines[:, None] * along**2 + cosines[:, None] * across**2
+             - 2.0 * both[:, None] * along * across) / (cosines * sines - both**2)[:, None]
+    whole = np.maximum(np.sum(series**2, axis=0), np.finfo(float).tiny)
+    return np.asarray(np.clip(np.mean(power / whole, axis=1), 0.0, 1.0))
 
 
 def _significance(tests: int, cycles: int) -> float:
