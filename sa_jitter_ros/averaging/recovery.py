@@ -29,7 +29,6 @@ the errors have mean zero.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,18 +105,18 @@ class PulseErrorRecovery:
     ripple: FloatArray
 
 
-class _Attempt(NamedTuple):
+@dataclass(frozen=True)
+class _Attempt:
     """
-    A fit, or why there is none.
+    A fit of a problem, or why there is none.
 
-    `clear` are orders far above those around, `beside` the orders of other shafts that
-    `orders_beside` finds.
+    `clear` are orders far above those around.
     """
 
+    problem: PulseErrorProblem | None
     fit: PulseErrorFit | None
-    reason: str
     clear: FloatArray
-    beside: FloatArray
+    reason: str = ''
 
 
 def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length: float,
@@ -161,10 +160,12 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
         with_ripple=with_ripple)
     found = _likeliest(attempt, declared)
     fit, reason = found.fit, found.reason
-    if fit is not None and found.beside.size:
-        again = _likeliest(partial(
-            attempt, orders=np.union1d(fit.orders, found.beside)), declared).fit
-        fit = fit if again is None else again
+    if found.problem is not None and fit is not None:
+        beside = orders_beside(found.problem, fit.expected, cycle_length)
+        if beside.size:
+            again = _likeliest(partial(
+                attempt, orders=np.union1d(fit.orders, beside)), declared).fit
+            fit = fit if again is None else again
     if fit is None:
         count, _, channels = grid.cycles.shape
         return PulseErrorRecovery(
@@ -302,9 +303,8 @@ def _staged_fit(grid: GridCycles, *, cycle_length: float, first_angle: float,
         if complete:
             break
     if problem is None:
-        return _Attempt(None, (
+        return _Attempt(None, None, clear, (
             f'no synchronous order up to {_MOST_TURNS / width:.4g} stands above the noise, and '
             'above it the declared jitter makes phases ambiguous: declare the orders of a gear '
-            'mesh, or use a quieter channel'), clear, np.empty(0))
-    return _Attempt(fit, '', clear, orders_beside(
-        problem.model, fit.expected, problem.chosen, problem.significant, cycle_length))
+            'mesh, or use a quieter channel'))
+    return _Attempt(problem, fit, clear)

@@ -28,7 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles, taper
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
-                                                     least_squares, real_parts)
+                                                     least_squares, PulseErrorProblem,
+                                                     real_parts)
 from scipy.fft import rfft
 from scipy.ndimage import median_filter
 from scipy.special import betainc
@@ -197,42 +198,47 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     with the mean, where pulse errors, which may be correlated too, have no effect to first order.
     """
     count, _, channels = model.coefficients.shape
-    everything = np.arange(len(model.orders))
-    signal = model.response(errors, np.zeros(count), everything).signal
-    amplitudes = least_squares(signal, model.coefficients)
-    residual = model.coefficients - signal @ real_parts(amplitudes)
+    amplitudes, deviation, in_phase = _deviations(model, errors, np.arange(len(model.orders)))
     power = np.abs(amplitudes) ** 2
-    deviation = deviations(signal, residual)
     scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
-    in_phase = (deviation * np.exp(-1j * np.angle(amplitudes))).real
     ringing = np.maximum(scatter, 2.0 * _long_run_variance(in_phase))
     limit = _significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
 
 
-def orders_beside(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.intp],
-                  significant: NDArray[np.bool_], cycle_length: float) -> FloatArray:
+def _deviations(model: CompressedCycles, errors: FloatArray, chosen: NDArray[np.intp]
+                ) -> tuple[ComplexArray, ComplexArray, FloatArray]:
     """
-    Return where an order of another shaft may lie beside the `chosen` ones, empty if nowhere.
+    Return amplitudes (order, channel) without pulse `errors`, and how single cycles deviate.
+
+    The deviations (cycle, order, channel) are also given in phase with the amplitudes.
+    """
+    signal = model.response(errors, np.zeros(len(model.coefficients)), chosen).signal
+    amplitudes = least_squares(signal, model.coefficients)
+    found = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
+    return amplitudes, found, (found * np.exp(-1j * np.angle(amplitudes))).real
+
+
+def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: float
+                  ) -> FloatArray:
+    """
+    Return where an order of another shaft may lie beside those of a fit, empty if nowhere.
 
     Pulse `errors` turn an order from cycle to cycle and hardly change its length. An order beside
     it does both, at the rate of their distance. An F test thus looks for a tone in the lengths
-    that are left of each order, in the channels where it is `significant` (order, channel).
-    Whole turns and the sign of the rate do not show: of the largest tone, the four nearest orders
-    are returned.
+    that are left of each order, in the channels where it is significant. Whole turns and the sign
+    of the rate do not show: of the largest tone, the four nearest orders are returned.
     """
+    model, chosen = problem.model, problem.chosen
     count, orders = len(model.coefficients), model.orders[chosen]
     if count < _LEAST_CYCLES:
         return np.empty(0)
-    signal = model.response(errors, np.zeros(count), chosen).signal
-    amplitudes = least_squares(signal, model.coefficients)
-    deviation = deviations(signal, model.coefficients - signal @ real_parts(amplitudes))
-    lengths = (deviation * np.exp(-1j * np.angle(amplitudes))).real
+    amplitudes, _, lengths = _deviations(model, errors, chosen)
     rates = np.arange(1, 2 * count) / (4.0 * count)  # a quarter of a turn of all cycles apart
     level, largest, found = _FALSE_ALARM / (count * orders.size), 0.0, np.empty(0)
-    for order, told, series, size in zip(orders, significant, lengths.transpose(1, 0, 2),
-                                         np.abs(amplitudes)):
+    for order, told, series, size in zip(orders, problem.significant,
+                                         lengths.transpose(1, 0, 2), np.abs(amplitudes)):
         series, channels = series[:, told], int(told.sum())
         series = series - series.mean(axis=0)
         shares = _shares(series, rates, rfft(series, 4 * count, axis=0)[1:-1])
