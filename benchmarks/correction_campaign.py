@@ -20,6 +20,7 @@ cycle, the jitter the standard deviation of its phase in rad.
 import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 import warnings
 
 import numpy as np
@@ -36,7 +37,7 @@ LINES = {1: {16.0: 1.0}, 3: {8.0: 0.5, 16.0: 1.0, 32.0: 0.3},
 STRONGEST = 16.0
 SNRS = (-10.0, 0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)
 JITTERS = (0.1, 0.3, 0.6)
-_SPARE = 3  # pulses that the validation may take to learn the interval
+SPARE = 3  # pulses that the validation may take to learn the interval
 #: dB of an order above the noise of the average from which its bias counts.
 CLEAR = 20.0
 
@@ -102,6 +103,24 @@ class Outcome:
         return float(mean[worst]), float(error[worst])
 
 
+def averaged(samples: FloatArray, rate: float, pulses: FloatArray, late: FloatArray, *,
+             declared: float, **settings: Any) -> tuple[sa.Average, sa.Average, int]:
+    """
+    Return the corrected average between `late` pulses, and the one between the true `pulses`.
+
+    `declared` is the standard deviation (s) of the declared jitter. The third result is the number
+    of the first pulse.
+    """
+    settings = {**settings, 'interval_tolerance': 0.45}
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        average, *_ = sa.average(samples, rate, late, correct_jitter=True,
+                                 keyphasor_rate=1.0 / (np.sqrt(12.0) * declared), **settings)
+        first = int(np.argmin(np.abs(late - average.pulses[0])))
+        exact, *_ = sa.average(samples, rate, pulses[first:], **settings)
+    return average, exact, first
+
+
 def trials(case: Case, count: int, seed: int) -> Outcome:
     """Return the amplitudes of `count` averages."""
     rng = np.random.default_rng(seed)
@@ -109,27 +128,20 @@ def trials(case: Case, count: int, seed: int) -> Outcome:
     orders, size = np.array(list(lines)), np.array(list(lines.values()))
     speed, rate = case.ratio / PERIOD, case.points / PERIOD
     std = case.jitter / (2.0 * np.pi * STRONGEST * speed)
-    length = (case.cycles + 4 + _SPARE) * PERIOD
+    length = (case.cycles + 4 + SPARE) * PERIOD
     times = np.arange(round(length * rate)) / rate
     found: dict[str, list[NDArray[np.complex128]]] = {'raw': [], 'corrected': [], 'true': []}
     accepted = 0
-    pulses = 2.0 * PERIOD + PERIOD * np.arange(case.cycles + 1.0 + _SPARE)
+    pulses = 2.0 * PERIOD + PERIOD * np.arange(case.cycles + 1.0 + SPARE)
     wave = np.exp(2j * np.pi * np.outer(orders, speed * (times - pulses[0])))
     for _ in range(count):
         phase = np.exp(2j * np.pi * rng.uniform(size=orders.size))
         vibration = (size * phase) @ wave
         samples = vibration.real + case.noise * rng.standard_normal(times.size)
         late = pulses + rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0) * std
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            average, *_ = sa.average(
-                samples, rate, late, ratio=case.ratio, orders=orders, trigger_cycles=case.cycles,
-                correct_jitter=True, keyphasor_rate=case.scale / (np.sqrt(12.0) * std),
-                interval_tolerance=0.45)
-            first = int(np.argmin(np.abs(late - average.pulses[0])))
-            exact, *_ = sa.average(
-                samples, rate, pulses[first:], ratio=case.ratio, orders=orders,
-                trigger_cycles=case.cycles, interval_tolerance=0.45)
+        average, exact, first = averaged(
+            samples, rate, pulses, late, declared=std / case.scale, ratio=case.ratio,
+            orders=orders, trigger_cycles=case.cycles)
         assert average.correction is not None
         accepted += average.correction.accepted
         raw, corrected = average.amplitudes[0], average.correction.amplitudes[0]

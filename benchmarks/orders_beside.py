@@ -19,17 +19,14 @@ the true pulses by more than three of its standard errors and 0.5 %.
 
 import argparse
 from dataclasses import dataclass, replace
-import warnings
 
+from correction_campaign import averaged, PERIOD, SAMPLES, SPARE
 import numpy as np
 from numpy.typing import NDArray
 from page import table
-import sa_jitter_ros as sa
 
 FloatArray = NDArray[np.float64]
 
-PERIOD = 0.04  # s, of a trigger cycle
-_SPARE = 3  # pulses that the validation may take to learn the interval
 KINDS = ('no other order', 'an order 0.02 to 1.5 orders beside', 'an order half an order beside',
          'the order modulated instead')
 
@@ -77,7 +74,7 @@ def draw(seed: int, kind: str) -> Scene:
     size[:, target] = 10.0 ** (-rng.uniform(0.0, 10.0, channels) / 20.0)
     phase = np.exp(rng.uniform(np.log(0.05), np.log(0.6)))  # rad of the target
     level = rng.uniform(-20.0, 10.0) + rng.uniform(-6.0, 6.0, channels)
-    points = round(160 * max(ratio, 1.0))
+    points = round(SAMPLES * max(ratio, 1.0))
     scene = Scene(
         seed, ratio, cycles, orders.astype(np.float64), size, target,
         jitter=min(phase / orders[target], 1.5 / orders[-1]) / (2.0 * np.pi),
@@ -99,10 +96,10 @@ def judge(scene: Scene) -> tuple[bool, bool]:
     """Return whether the correction is accepted, and whether it is and is wrong."""
     rng = np.random.default_rng([scene.seed, 78])
     channels, orders = len(scene.size), scene.orders
-    rate = round(160 * max(scene.ratio, 1.0)) / PERIOD
+    rate = round(SAMPLES * max(scene.ratio, 1.0)) / PERIOD
     speed = scene.ratio / PERIOD
-    pulses = PERIOD * (2.0 + np.arange(scene.cycles + 1 + _SPARE))
-    times = np.arange(round((scene.cycles + 4 + _SPARE) * PERIOD * rate)) / rate
+    pulses = PERIOD * (2.0 + np.arange(scene.cycles + 1 + SPARE))
+    times = np.arange(round((scene.cycles + 4 + SPARE) * PERIOD * rate)) / rate
     angle = speed * (times - pulses[0])
     phases = np.exp(2j * np.pi * rng.uniform(size=(channels, orders.size + 1)))
     waves = np.exp(2j * np.pi * np.outer(orders, angle))
@@ -116,14 +113,9 @@ def judge(scene: Scene) -> tuple[bool, bool]:
     std = scene.jitter / speed
     late = pulses + std * (rng.standard_normal(pulses.size) if scene.normal
                            else np.sqrt(3.0) * rng.uniform(-1.0, 1.0, pulses.size))
-    settings = {'ratio': scene.ratio, 'orders': orders, 'trigger_cycles': scene.cycles,
-                'interval_tolerance': 0.45}
-    with warnings.catch_warnings():
-        warnings.simplefilter('ignore')
-        average, *_ = sa.average(samples, rate, late, correct_jitter=True,
-                                 keyphasor_rate=scene.scale / (np.sqrt(12.0) * std), **settings)
-        first = int(np.argmin(np.abs(late - average.pulses[0])))
-        exact, *_ = sa.average(samples, rate, pulses[first:], **settings)
+    average, exact, _ = averaged(
+        samples, rate, pulses, late, declared=std / scene.scale, ratio=scene.ratio, orders=orders,
+        trigger_cycles=scene.cycles)
     found = average.correction
     assert found is not None
     if not found.accepted:
