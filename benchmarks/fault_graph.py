@@ -265,7 +265,11 @@ class Graph:
         for life in self.lives.values():
             if life.process.poll() is None:
                 life.process.send_signal(signal.SIGINT)
-        statuses = {role: life.process.wait(timeout=60.0) for role, life in self.lives.items()}
+        try:
+            statuses = {role: life.process.wait(timeout=60.0) for role, life in self.lives.items()}
+        finally:  # a node that does not end fails the campaign, and must not keep a core busy
+            for life in self.lives.values():
+                life.process.kill()
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()

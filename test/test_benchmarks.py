@@ -241,6 +241,7 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
          tmp_path / 'faults.json', '--page', page, '--figures', tmp_path], capture_output=True,
         env={**process_environment, 'OMP_NUM_THREADS': '1', 'PYTHONPATH': str(ROOT)}, text=True,
         check=False)
+    assert (tmp_path / 'faults.json').is_file(), done.stdout + done.stderr
     found = json.loads((tmp_path / 'faults.json').read_text())
     # on a machine that has other things to do averages come late, and are missed
     late = [item for item in found['wrong'] if 'no average after' in item]
