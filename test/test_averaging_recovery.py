@@ -311,6 +311,14 @@ def test_an_unknown_order_of_another_shaft_beside_an_order_does_not_pass_for_err
     assert np.mean(z_scores(recovery, errors) ** 2) < 1.0 + 4.0 * np.sqrt(2.0 / errors.size)
 
 
+@pytest.mark.parametrize(('share', 'fitted'), [(0.007, False), (0.07, True)])
+def test_an_order_of_another_shaft_is_fitted_where_it_matters(rng, share, fitted):
+    errors = jitter(rng, 0.1, count=40, speed=1.0 / PERIOD)
+    cycles, pulses = simulate(rng, errors, {**MESH, 38.3: [0.5 * share]}, ratio=1.0, noise=0.01)
+    recovery = recover(cycles, pulses, declared=declared(0.1, 1.0 / PERIOD), ratio=1.0)
+    assert bool(np.any(np.abs(recovery.orders - 38.3) < 0.01)) == fitted
+
+
 def test_speed_ripple_inside_the_cycle_is_separated_from_pulse_errors(rng):
     errors = jitter(rng, 0.2)
     ripple = 4.0 * declared(0.2) * rng.standard_normal(100)
