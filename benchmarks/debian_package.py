@@ -16,8 +16,8 @@ Build the Debian package of a ROS 2 distribution as its build farm does, and loo
 bloom makes `debian/` of package.xml, dpkg-buildpackage builds it. rosdep is given the keys of
 package.xml alone, so that nothing is downloaded: a key `python3-...` is the Debian package of that
 name, any other is a package of the distribution. Needs bloom (pip), what `design` imports, and of
-Debian 12 or Ubuntu 24.04 dpkg-dev, debhelper, dh-python, python3-all and python3-setuptools. ROS 2
-need not be installed. Exit status 2, after one line: a tool is missing.
+Debian 12 or Ubuntu 24.04 dpkg-dev, debhelper, dh-python, python3-all-dev and python3-setuptools.
+ROS 2 need not be installed. Exit status 2, after one line: a tool is missing.
 """
 
 import argparse
@@ -32,7 +32,7 @@ NAME = 'sa_jitter_ros'
 SERIES = {'jazzy': 'noble', 'kilted': 'noble'}
 TOOLS = {'bloom-generate': 'pip install bloom', 'rosdep': 'pip install bloom',
          'dpkg-buildpackage': 'apt install dpkg-dev', 'dh': 'apt install debhelper',
-         'pybuild': 'apt install dh-python python3-all python3-setuptools'}
+         'pybuild': 'apt install dh-python python3-all-dev python3-setuptools'}
 
 
 def run(*command, **options):
@@ -81,7 +81,7 @@ def build(folder, distro):
     """Build the package in a folder and return the path of the .deb."""
     source = folder / NAME
     shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(
-        '.*', '__pycache__', 'build', 'install', 'log', 'out'))
+        '.*', '__pycache__', '*.so', 'build', 'install', 'log', 'out'))
     environment = local_rosdep(folder / 'rosdep', distro)
     run('bloom-generate', 'rosdebian', '--os-name', 'ubuntu', '--os-version', SERIES[distro],
         '--ros-distro', distro, cwd=source, env=environment)

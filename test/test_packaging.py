@@ -34,8 +34,9 @@ PYPI_NAMES = {'yaml': 'PyYAML'}
 OPTIONAL = {'distributed': 'fleet', 'h5py': 'mat73', 'rosbags': 'bags'}  # package to extra
 # Keys of rosdep that are Debian packages of Ubuntu 24.04 or of ROS 2, no names of pip.
 ROSDEP_KEYS = {
-    'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-hypothesis',
-    'python3-matplotlib', 'python3-numpy', 'python3-pytest', 'python3-scipy', 'python3-yaml',
+    'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-dev',
+    'python3-hypothesis', 'python3-matplotlib', 'python3-numpy', 'python3-pytest',
+    'python3-scipy', 'python3-yaml',
     'rcl_interfaces', 'rclpy', 'sensor_msgs', 'std_msgs'}
 
 
@@ -108,7 +109,8 @@ def test_manifest_declares_what_is_imported(manifest, packages):
 
 
 def test_manifest_declares_nothing_that_apt_lacks(manifest):
-    assert {item.name for item in (*manifest.exec_depends, *manifest.test_depends)} <= ROSDEP_KEYS
+    needed = (*manifest.build_depends, *manifest.exec_depends, *manifest.test_depends)
+    assert {item.name for item in needed} <= ROSDEP_KEYS
     assert {url.type for url in manifest.urls} == {'bugtracker', 'repository', 'website'}
 
 
@@ -172,6 +174,31 @@ def test_pip_installed_the_tree_as_it_stands(setup):
 def modules_of(folder):
     """Return the text of every module in a folder, by its relative path."""
     return {path.relative_to(folder): path.read_text() for path in folder.rglob('*.py')}
+
+
+def test_c_is_compiled_where_there_is_a_compiler():
+    header = Path(sysconfig.get_path('include')) / 'Python.h'
+    if shutil.which('cc') is None or not header.is_file():
+        pytest.skip('no C compiler, or no header of Python: apt install gcc python3-dev')
+    assert find_spec(f'{NAME}.pulses._weighted_sums') is not None
+
+
+@pytest.mark.build
+@pytest.mark.parametrize('compiler', ['cc', 'false'])
+def test_pip_installs_with_and_without_a_c_compiler(tmp_path, compiler):
+    if shutil.which(compiler) is None:
+        pytest.skip(f'{compiler} is not installed')
+    source = tmp_path / 'source'
+    shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns('.*', '*.so', 'build', 'out'))
+    run(tmp_path, 'env', f'CC={shutil.which(compiler)}', sys.executable, '-m', 'pip', 'install',
+        '--no-build-isolation', '--no-deps', '--no-compile', '--target', tmp_path / 'home',
+        source)
+    made = list((tmp_path / 'home').glob(f'{NAME}/pulses/_weighted_sums.*.so'))
+    assert len(made) == (compiler == 'cc')
+    values = run(tmp_path / 'home', sys.executable, '-c', (
+        'import numpy as np; from sa_jitter_ros.pulses.resampling import interpolate; '
+        'print(interpolate(np.arange(40.0)[:, None], np.array([20.5]))[0, 0].round(9))'))
+    assert float(values) == 20.5
 
 
 @pytest.mark.build

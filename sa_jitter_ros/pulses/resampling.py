@@ -11,12 +11,11 @@
 """
 Resampling: values of a sampled signal between its samples.
 
-The value at a position is a weighted sum of the samples around it. The positions of some trigger
-cycles thus make a sparse matrix, which is applied to all channels at once. Between two samples
+The value at a position is a weighted sum of the samples around it. Between two samples
 each weight is a polynomial of the position (exact for linear and both cubic methods, to 2e-7 for
-the band-limited kernel), so that all weights are one matrix product. Positions that are further
-apart than the samples need an anti-alias filter. For every method this is the band-limited kernel,
-three times as long and stretched: flat to 0.8 of the cut-off, closed from the cut-off on.
+the band-limited kernel); `weighted_sums` makes weights and sums. Positions that are further apart
+than the samples need an anti-alias filter. For every method this is the band-limited kernel, three
+times as long and stretched: flat to 0.8 of the cut-off, closed from the cut-off on.
 
 `gain` is the gain of an interpolator at the frequency f. The loss of the default (Kaiser-windowed
 sinc) is below 0.001 dB up to 0.32 fs. Linear interpolation has the gain sinc^2(f/fs); for a
@@ -29,7 +28,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
-from scipy.sparse import _sparsetools
+
+try:
+    from sa_jitter_ros.pulses._weighted_sums import weighted_sums
+except ImportError:  # installed without a C compiler
+    from sa_jitter_ros.pulses.weighted_sums import weighted_sums
 
 FloatArray = NDArray[np.float64]
 
@@ -40,7 +43,6 @@ _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
 _DEGREE = {'band_limited': 7, 'linear': 1, 'cubic': 3, 'spline': 3}
 METHODS = tuple(_HALF_WIDTH)
 _KAISER_BETA = 9.0
-_PIECE = 1 << 11  # positions whose weights are in the cache at once
 
 
 def _kernel(method: str, x: FloatArray, half: int) -> FloatArray:
@@ -195,41 +197,7 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
     if first < 0 or last >= len(samples):
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
                         mode='reflect', reflect_type='odd')
-    return _weighted(np.ascontiguousarray(window), index - np.int32(first + half - 1), fraction,
-                     polynomials)
-
-
-@lru_cache(maxsize=8)
-def _steps(taps: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the steps from the first to every weight of `_PIECE` sums, and where each begins."""
-    return (np.tile(np.arange(taps, dtype=np.int32), _PIECE),
-            np.arange(0, taps * _PIECE + 1, taps, dtype=np.int32))
-
-
-def _weighted(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArray,
-              polynomials: FloatArray) -> FloatArray:
-    """Return the weighted sums of the samples from `begin` (m,) on, for each `fraction` (m,)."""
-    order, taps = polynomials.shape
-    channels, size = samples.shape[1], min(begin.size, _PIECE)
-    values = np.zeros((begin.size, channels))
-    powers, weights = np.ones((order, size)), np.empty((size, taps))
-    steps, rows = _steps(taps)
-    for start in range(0, begin.size, size):
-        count = min(size, begin.size - start)
-        power = powers[:, :count]
-        np.multiply(fraction[start:start + count], 2.0, out=power[1])
-        power[1] -= 1.0
-        for k in range(2, order):
-            np.multiply(power[k - 1], power[1], out=power[k])
-        np.matmul(power.T, polynomials, out=weights[:count])
-        columns = np.repeat(begin[start:start + count], taps)
-        columns += steps[:columns.size]
-        # What csr_matrix calls for a product, without its checks, which take as long here.
-        matrix = count, len(samples), rows[:count + 1], columns, weights.reshape(-1)
-        found = values[start:start + count].reshape(-1)
-        if channels == 1:
-            _sparsetools.csr_matvec(*matrix, samples.reshape(-1), found)
-        else:
-            _sparsetools.csr_matvecs(*matrix[:2], channels, *matrix[2:], samples.reshape(-1),
-                                     found)
+    values = np.empty((index.size, samples.shape[1]))
+    weighted_sums(np.ascontiguousarray(window), index - np.int32(first + half - 1), fraction,
+                  polynomials, values)
     return values
