@@ -34,7 +34,7 @@ AMPLITUDE = 5e-4  # of the largest value: error of an amplitude by band-limited 
 POINT = 4e-3  # the same of a point of the waveform with samples on one side only
 BELIEVED = 0.04  # of the pitch: pulses displaced by more must not be used
 LONGEST = 60  # trigger cycles of an exponential average that are computed
-MOST_DROPPED = 3  # teeth of an average that are dropped beside those with a fault
+MOST_DROPPED = 3  # faults within an average that cost other teeth than their own
 RUNS = 8  # latest runs among which the source of an average is looked for
 LIMIT = 6.0  # standard errors: two of a thousand million normal variables are farther out
 MEAN = 1e-12  # s that recovered errors may be off on average: rounding
@@ -157,22 +157,23 @@ class ShaftChecker:
     def _possible(self, run: Run, begin: int, end: int, values: Mapping[str, Any]
                   ) -> Iterator[tuple[set[int], set[int]]]:
         """
-        Iterate over what the validation may have made of faults: teeth dropped, and swapped used.
+        Iterate over what the validation may have made of faults: teeth dropped, late ones used.
 
-        The tooth behind a swapped one came before it, and waits: either is out of order. Of two
-        teeth, one of which is displaced or a stray, neither may be certain: where missing ones are
-        bridged, it matters that both are.
+        Teeth that came before a late one may wait for the next: either they are out of order, or
+        it is. Of two teeth, one of which is displaced or a stray, neither may be certain: where
+        missing ones are bridged, it matters that both are.
         """
-        options: list[tuple[int, bool]] = []
+        options: list[tuple[set[int], set[int]]] = []
         if self._delivered:
-            options += [(tooth + 1, True) for tooth in run.swapped if begin - 1 <= tooth <= end]
+            options += [(set(range(tooth + 1, tooth + 1 + later)), {tooth})
+                        for tooth, later in run.behind.items() if begin - later <= tooth <= end]
         if values['missing_pulses'] == 'bridge':
-            options += [(tooth + beside, False) for tooth in run.faults(begin - 1, end + 1)
+            options += [({tooth + beside}, set()) for tooth in run.faults(begin - 1, end + 1)
                         for beside in (-1, 0, 1)]
         for count in range(min(len(options), MOST_DROPPED) + 1):
             for chosen in combinations(options, count):
-                yield ({tooth for tooth, _ in chosen},
-                       {tooth - 1 for tooth, swapped in chosen if swapped})
+                yield (set().union(*(dropped for dropped, _ in chosen)),
+                       set().union(*(used for _, used in chosen)))
 
     def _pulses(self, run: Run, first: int, last: int, step: int, values: Mapping[str, Any],
                 longest: int, dropped: set[int], used: set[int]) -> FloatArray | str:

@@ -44,7 +44,7 @@ class Run:
     Sample i has the header time `clock` + i / `RATE` and the index `index` + i, tooth j passes at
     `first_tooth` + j / (`TEETH` `speed`). `components` are (order of the tach shaft, amplitude,
     phase); channel c holds c + 1 times as much. `jitter` (s) and `displaced` (s) are errors of
-    teeth, others are `missing`; of the `undelivered`, the `swapped` come behind the next one.
+    teeth, others are `missing`; of the `undelivered`, some come `behind` so many later ones.
     `strays` are pulses (tau) that no tooth made, `lost` spans (tau) without vibration.
     """
 
@@ -60,7 +60,7 @@ class Run:
     displaced: dict[int, float] = field(default_factory=dict)
     missing: set[int] = field(default_factory=set)
     undelivered: set[int] = field(default_factory=set)
-    swapped: set[int] = field(default_factory=set)
+    behind: dict[int, int] = field(default_factory=dict)
     strays: list[float] = field(default_factory=list)
     lost: list[tuple[float, float]] = field(default_factory=list)
 

@@ -298,9 +298,11 @@ class FaultySource:
                 run.undelivered.add(tooth)
                 del sent[at]
             if kind == 'late':
-                sent.append((tau + float(self.rng.uniform(2.2, 4.5)) * pitch, time, KEYPHASOR))
+                late = float(self.rng.uniform(2.2, 4.5))
+                run.behind[tooth] = int(late)
+                sent.append((tau + late * pitch, time, KEYPHASOR))
             elif kind == 'swapped':
-                run.swapped.add(tooth)
+                run.behind[tooth] = 1
                 sent.append((tau + 1.01 * pitch, time, KEYPHASOR))
             elif kind == 'repeated':
                 sent.append((tau + 1e-6, time, KEYPHASOR))

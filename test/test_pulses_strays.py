@@ -211,6 +211,42 @@ def test_two_displaced_pulses_do_not_hide_each_other(rng):
         assert np.abs(pattern.widths).max() < 5e-3
 
 
+@pytest.mark.parametrize('late', [0.3, 0.45, -0.45])
+@pytest.mark.parametrize('widths', [(0.0, 0.0), (0.2, -0.2)])
+def test_a_far_displaced_pulse_leaves_the_scatter_what_it_is(late, widths, rng):
+    """Its two levels together are lower, as logarithms are; this is no scatter."""
+    for _ in range(30):
+        places = np.arange(15) + np.where(np.arange(15) % 2, widths[0] / 2, widths[1] / 2)
+        places += rng.uniform(-4e-3, 4e-3, 15)
+        places[rng.integers(1, 14)] += late
+        pattern = steady_pattern(np.arange(14) % 2, np.log(np.diff(places)), 2)
+        assert 5e-4 < pattern.scatter < 0.015
+        assert abs(np.ptp(pattern.widths) - np.ptp(np.log1p(widths))) < 0.02
+
+
+def test_a_wrong_interval_alone_is_no_scatter(rng):
+    """As where a displaced pulse was taken for the true one, and the next one for a stray."""
+    for _ in range(30):
+        levels = np.log(1.0 + np.diff(rng.uniform(-4e-3, 4e-3, 21)))
+        levels[7:9] += np.log([1.42, 1.58])
+        assert 1e-3 < steady_pattern(np.arange(20) % 2, levels, 2).scatter < 0.01
+
+
+@pytest.mark.parametrize('place', range(5, 12))
+def test_displaced_pulses_in_the_first_revolutions_are_in_no_cycle(place, rng):
+    """Nor in those behind: the tolerance that they teach is that of the others."""
+    for _ in range(20):
+        errors = rng.uniform(-4e-3, 4e-3, 60)
+        errors[place] += rng.choice([-1.0, 1.0]) * rng.uniform(0.05, 0.45)
+        errors[place + 14] += rng.choice([-1.0, 1.0]) * rng.uniform(0.06, 0.2)
+        pulses = 0.018 * (np.arange(60) + errors)
+        validator = PulseValidator(pulses_per_revolution=2)
+        found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
+        for displaced in (place, place + 14):
+            assert pulses[displaced] not in found.times
+        assert found.times.size >= 20
+
+
 @pytest.mark.parametrize('clock', [0.0, 4000.0])
 @pytest.mark.parametrize('step', [1e-3, -1e-3])
 def test_a_step_of_the_time_among_equal_intervals_is_in_no_cycle(step, clock):

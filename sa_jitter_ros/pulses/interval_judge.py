@@ -54,6 +54,7 @@ _SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after 
 _KNOWN_WELL = 16  # intervals that tell the scatter better than the first ones behind a gap
 _REVOLUTIONS, _LONGEST = 5, 3.0  # and seconds in which the marks are learnt
 _FEW_MARKS = 12
+_LACKS_ONE = 1.6  # intervals that are as long as two with a pulse missing between them
 _LEAST_REGULAR = 5e-3  # tolerance of the first intervals
 _BELIEVED = 0.45  # unevenness of marks that are not known yet
 _LARGE_BLOCK = 32  # marks, with which the scatter is learnt from more intervals at once
@@ -603,20 +604,31 @@ class IntervalJudge:
         """
         size = lock.steps.size
         levels = np.log(np.diff(pulses))
-        found = repeating(levels, size)
-        if found is None:
+        two = repeating(levels, size)
+        if two is None:
             return None
-        begin, pattern = found
+        begin, pattern = two
         learnt = lock.with_pattern(pattern)
         learnt = self._from_earliest(replace(
             learnt, first=begin, slot=0,
             interval=math.exp(levels[begin]) / float(learnt.widths[0])), pulses)
         # All revolutions know angles and scatter better than these two.
         judge = self._rehearsal(_uneven(learnt), pulses[learnt.first:])
-        every = steady_pattern(np.array(judge._marks, np.int64), np.array(judge._levels), size)
-        if every is None:
+        # Before pulses that it could not judge, the last interval is doubtful, too.
+        count = len(judge._levels) - (judge.confirmed < pulses[-1])
+        tried = [(np.array(judge._marks[:count], np.int64), np.array(judge._levels[:count]))]
+        # It may be misled by a displaced pulse, which spoils two of otherwise whole revolutions.
+        marks = (learnt.slot + np.arange(pulses.size - 1 - learnt.first)) % size
+        lengths = np.diff(pulses[learnt.first:]) / learnt.widths[marks]
+        parts = lengths / np.median(lengths)
+        if parts.max() < _LACKS_ONE and abs(parts.sum() - parts.size) < 0.5:
+            tried.append((marks, np.log(lengths)))
+        found = [replace(learnt.with_pattern(every), known=levels.size - size)
+                 for marks, levels in tried
+                 if (every := steady_pattern(marks, levels, size)) is not None]
+        if not found:
             return learnt if doubtful else None
-        return replace(learnt.with_pattern(every), known=len(judge._levels) - size)
+        return min(found, key=lambda item: item.scatter)
 
     def _from_earliest(self, lock: Lock, pulses: FloatArray) -> Lock:
         """Return the lock from the earliest of the pulses (n,) on that fits, in reversed time."""

@@ -113,11 +113,13 @@ def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPatte
 
     `marks`, `levels` and `count` are those of `mark_pattern`. The speed changes along a line, and
     up to three pulses may be displaced: each makes an interval as much longer as the next is
-    shorter.
+    shorter. The two levels then differ, and together they are lower. Where a stray was taken for a
+    pulse, a single interval may be wrong.
 
     >>> late = np.tile([0.1, -0.1], 5) + 1e-3 * np.array([1, 0, -1, 2, 0, -2, 0, 1, -1, 0])
-    >>> displaced = 0.05 * np.eye(10)[3] - 0.05 * np.eye(10)[4]
-    >>> pattern = steady_pattern(np.arange(10) % 2, late + displaced, 2)
+    >>> pulses = np.append(0.0, np.cumsum(np.exp(late)))
+    >>> pulses[4] += 0.3  # displaced
+    >>> pattern = steady_pattern(np.arange(10) % 2, np.log(np.diff(pulses)), 2)
     >>> pattern.widths.round(2).tolist(), round(pattern.scatter, 4)
     ([0.1, -0.1], 0.0014)
     """
@@ -127,8 +129,8 @@ def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPatte
         return None
     levels = levels[place]
     design = np.column_stack((np.eye(count)[marks[place]], place - place.mean()))
-    pulses = np.eye(place.size, place.size + 1, 1) - np.eye(place.size, place.size + 1)
-    pulses = pulses[:, np.diff(place, prepend=place[0] - 1, append=place[-1] + 1) == 1]
+    single = np.eye(place.size)
+    pulses = np.column_stack(((single[:, :-1] - single[:, 1:])[:, np.diff(place) == 1], single))
     found, square = _fit(design, levels)
     for _ in range(max(1, min(_MOST_DISPLACED, free - _FREE_OF_SEVERAL))):
         fitted = np.linalg.qr(design).Q
@@ -137,6 +139,13 @@ def steady_pattern(marks: IntArray, levels: FloatArray, count: int) -> MarkPatte
         largest = int(np.argmax(told))
         design = np.column_stack((design, pulses[:, largest]))
         without = _fit(design, levels)
+        longer, shorter = pulses[:, largest] > 0.0, pulses[:, largest] < 0.0
+        if shorter.any():
+            half = without[0][-1]
+            first, second = np.exp(without[0][marks[place][longer | shorter]])
+            levels = levels + (longer | shorter) * np.log(
+                (first * np.exp(half) + second * np.exp(-half)) / (first + second))
+            without = _fit(design, levels)
         # Two of them hide each other: the last one that is significant tells how many.
         if told[largest] > _DISPLACED * without[1]:
             found, square = without
