@@ -126,7 +126,9 @@ def test_setup_requires_what_is_imported_from_pypi(setup, packages):
 def test_every_script_has_a_main(scripts):
     for name, module in scripts.items():
         assert name == module.rpartition('.')[2]
-        assert callable(importlib.import_module(module).main)
+        loaded = importlib.import_module(module)
+        assert callable(loaded.main)
+        assert "if __name__ == '__main__':" in Path(loaded.__file__).read_text()  # python -m
 
 
 def test_every_main_has_a_script(scripts):

@@ -355,3 +355,7 @@ def main(args: Sequence[str] | None = None) -> int:
         stop(children)
         context.try_shutdown()
     return 0
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())

@@ -222,3 +222,7 @@ def _some(lines: Sequence[str]) -> str:
 def main(args: Sequence[str] | None = None) -> int:
     """Run the node."""
     return run_node(ChangeMonitor, args)
+
+
+if __name__ == '__main__':
+    raise SystemExit(main())
