@@ -10,10 +10,12 @@
 
 """Order amplitudes of single trigger cycles against the integrals that define them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.average import AverageSettings
-from sa_jitter_ros.averaging.cycle import CycleSamples, on_grid
+from sa_jitter_ros.averaging.cycle import CycleSamples, joined, on_grid
 from sa_jitter_ros.averaging.shaft import average_cycles
 
 RATE, SPEED, CYCLES, START = 10e3, 10.0, 36, 0.0123
@@ -49,3 +51,19 @@ def test_amplitudes_of_a_cycle_are_integrals_over_it(ratio, tone):
     for amplitudes, order in zip(average.cycle_amplitudes[:, 0].T, orders):
         # The gain of the interpolator is 1 to 0.001 dB.
         np.testing.assert_allclose(amplitudes, integrals(order, tone, ratio), atol=1.2e-4)
+
+
+@pytest.mark.parametrize('layout', ['rows', 'channels', 'copies'])
+def test_cycles_are_joined_to_the_samples_that_they_were_cut_from(layout, rng):
+    samples = rng.standard_normal((500, 3))
+    if layout == 'channels':  # the array that they are cut from has other rows
+        samples = np.ascontiguousarray(samples.T).T
+    pulses = 0.0505 + 0.1 * np.arange(4)
+    runs = [CycleSamples.cut(samples, start_time=0.0, rate=1e3, pulses=pulses, first=k, margin=9)
+            for k in range(3)]
+    if layout == 'copies':
+        runs = [replace(run, samples=run.samples.copy()) for run in runs]
+    run, = joined(runs)
+    np.testing.assert_array_equal(run.samples, samples[41:361])
+    assert np.shares_memory(run.samples, samples) == (layout == 'rows')
+    assert run.count == 3

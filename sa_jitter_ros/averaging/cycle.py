@@ -180,16 +180,28 @@ def _join(runs: Sequence[CycleSamples]) -> CycleSamples:
     first, last = runs[0], runs[-1]
     if first is last:
         return first
-    parts, end = [first.samples], first.first_index + len(first.samples)
+    pulses = np.concatenate([
+        first.pulses[:first.first + 1], *(run.edges[1:] for run in runs),
+        last.pulses[last.first + last.count + 1:]])
+    return replace(first, samples=_joined_samples(runs), pulses=pulses,
+                   count=sum(run.count for run in runs))
+
+
+def _joined_samples(runs: Sequence[CycleSamples]) -> FloatArray:
+    """Return the samples of runs that continue, without a copy where they are of one array."""
+    every = runs[0].samples.base
+    if isinstance(every, np.ndarray) and all(
+            run.samples.base is every and run.samples.strides == every.strides for run in runs):
+        begin, end = (
+            (address - every.ctypes.data) // every.strides[0] for address in (
+                runs[0].samples.ctypes.data, runs[-1].samples.ctypes.data))
+        return every[begin:end + len(runs[-1].samples)]
+    parts, end = [runs[0].samples], runs[0].first_index + len(runs[0].samples)
     for run in runs[1:]:
         begin = run.first_index
         parts.append(run.samples[end - begin:])
         end = max(end, begin + len(run.samples))
-    pulses = np.concatenate([
-        first.pulses[:first.first + 1], *(run.edges[1:] for run in runs),
-        last.pulses[last.first + last.count + 1:]])
-    return replace(first, samples=np.concatenate(parts), pulses=pulses,
-                   count=sum(run.count for run in runs))
+    return np.concatenate(parts)
 
 
 def cycle_grid(cycles: Sequence[CycleSamples], *, method: str, law: AngleLaw = LINEAR_LAW,
