@@ -26,7 +26,8 @@ from itertools import combinations
 from typing import Any
 
 from fault_graph import Received
-from fault_machine import equal_weights, exponential_weights, FloatArray, Run, TEETH, Window
+from fault_machine import (AROUND, equal_weights, exponential_weights, FloatArray, Run, TEETH,
+                           Window)
 import numpy as np
 from sa_jitter_ros.nodes.messages import AverageMessage
 
@@ -146,7 +147,7 @@ class ShaftChecker:
         exponential = values['averaging'] == 'exponential'
         longest = LONGEST if exponential else count
         found: Place | str = ''
-        for dropped, used in self._possible(run, last - longest * step, last, values):
+        for dropped, used in self._possible(run, last - longest * step, last):
             pulses = self._pulses(run, first, last, step, values, longest, dropped, used)
             found = pulses if isinstance(pulses, str) else self._agrees(
                 Window(run, pulses, r, count), amplitude, waveform, values, first)
@@ -154,22 +155,16 @@ class ShaftChecker:
                 break
         return found
 
-    def _possible(self, run: Run, begin: int, end: int, values: Mapping[str, Any]
-                  ) -> Iterator[tuple[set[int], set[int]]]:
+    def _possible(self, run: Run, begin: int, end: int) -> Iterator[tuple[set[int], set[int]]]:
         """
         Iterate over what the validation may have made of faults: teeth dropped, late ones used.
 
         Teeth that came before a late one may wait for the next: either they are out of order, or
-        it is. Of two teeth, one of which is displaced or a stray, neither may be certain: where
-        missing ones are bridged, it matters that both are.
+        it is.
         """
-        options: list[tuple[set[int], set[int]]] = []
-        if self._delivered:
-            options += [(set(range(tooth + 1, tooth + 1 + later)), {tooth})
-                        for tooth, later in run.behind.items() if begin - later <= tooth <= end]
-        if values['missing_pulses'] == 'bridge':
-            options += [({tooth + beside}, set()) for tooth in run.faults(begin - 1, end + 1)
-                        for beside in (-1, 0, 1)]
+        options = [(set(range(tooth + 1, tooth + 1 + later)), {tooth})
+                   for tooth, later in run.behind.items()
+                   if self._delivered and begin - later <= tooth <= end]
         for count in range(min(len(options), MOST_DROPPED) + 1):
             for chosen in combinations(options, count):
                 yield (set().union(*(dropped for dropped, _ in chosen)),
@@ -212,26 +207,39 @@ class ShaftChecker:
         if np.ptp(measured.real, axis=0).max() > limit:
             return 'channels disagree'
         cycles = window.amplitudes(orders)
+        # Where pulses are bridged, teeth around a fault may be doubtful, and interpolated, too.
+        teeth = first + step * np.arange(count + 1 - len(window.pulses), count + 1)
+        doubtful = [number for number, tooth in enumerate(teeth.tolist())
+                    if values['missing_pulses'] == 'bridge'
+                    and run.faults(tooth - AROUND, tooth + AROUND)]
+        changes = window.uncertain(orders, doubtful)
         starts = np.arange(first // step + 1)  # trigger cycles since the angle was 0
         turn = np.exp(-2j * np.pi * window.cycles * np.outer(starts, orders))
         lengths = [count]
         if values['averaging'] == 'exponential':
             lengths = list(range(count, len(cycles) + 1))
-        best = np.inf
+        best, zeros = np.inf, set[int]()
         for length in lengths:
             weights = (exponential_weights(length, count) if values['averaging'] == 'exponential'
                        else equal_weights(length))
-            error = np.abs(measured[0] - weights @ cycles[-length:] * turn).max(axis=1)
+            allowed = sum(np.abs(weights @ change[-length:]) for change in changes)
+            error = np.abs(measured[0] - weights @ cycles[-length:] * turn) - allowed
+            error = error.max(axis=1)
             best = min(best, error.min())
             fits = [int(start) for start in starts[error < limit] if start >= length - count]
             # the waveform knows the angle but for whole turns
             turns = {start: round(start * window.cycles % 1.0, 9) % 1.0 for start in fits}
             agrees = {turn: waveform_agrees(
-                window.latest(length), start - (length - count), waveform, values, gain)
+                window.latest(length), start - (length - count), waveform, values, gain,
+                run.steepest * run.most * min(2.0 * len(doubtful) / length, 1.0))
                 for turn, start in {turn: start for start, turn in turns.items()}.items()}
-            zeros = frozenset(first - start * step for start in fits if agrees[turns[start]])
-            if zeros:
-                return self._follows(Place(run, first, first + count * step, zeros, values), step)
+            # Of an order that is not there, other lengths and angles fit by chance: all are kept.
+            zeros |= {first - start * step for start in fits if agrees[turns[start]]}
+        if zeros:
+            if doubtful:  # the angle of the others is known well enough to be compared
+                zeros = {first - start * step for start in starts.tolist()}
+            return self._follows(
+                Place(run, first, first + count * step, frozenset(zeros), values), step)
         return f'amplitudes off by {best:.3g} (limit {limit:.3g}), or the waveform is'
 
     def _follows(self, place: Place, step: int) -> Place | str:

@@ -16,6 +16,7 @@ changes slowly, so that no two intervals are alike; and teeth, some of them miss
 The expected average is the integral of the cosines between the pulses as they were sent.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -31,6 +32,7 @@ TEETH = 2  # pulses in a revolution
 SWELL_RATE = 0.11  # Hz
 EDGE = 4.0 / RATE  # s that an edge of the tach waveform takes
 WIDTH = 10.0 / RATE  # s of a pulse at half its height
+AROUND = 10  # teeth beside a fault that the validation may find doubtful
 MESH = 30.0  # order of the tach shaft that shows the pulse errors
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(160)
 NODES, WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
@@ -68,6 +70,12 @@ class Run:
     def scale(self) -> float:
         """Return the largest value that channel 0 can have."""
         return 1.3 * sum(amplitude for _, amplitude, _ in self.components)
+
+    @property
+    def steepest(self) -> float:
+        """Return the largest change of channel 0 in a second."""
+        return 1.3 * 2.0 * np.pi * self.speed * sum(
+            order * amplitude for order, amplitude, _ in self.components)
 
     def at(self, tau: FloatArray) -> FloatArray:
         """Return the vibration of channel 0."""
@@ -115,19 +123,23 @@ class Run:
         """
         Return the tooth whose pulse has this header time (s), or None.
 
-        That of one beside a fault may be interpolated between the pulses around it.
+        That of one beside a fault may be interpolated between pulses around it.
         """
         tau = time - self.clock
         tooth = round((tau - self.first_tooth) * TEETH * self.speed)
         if tooth < 0:
             return None
-        before, last, exact, following, after = self.times(np.arange(tooth - 2, tooth + 3))
-        times = [exact]
-        if self.faults(tooth - 2, tooth + 2):
-            times += [0.5 * (last + following), (2.0 * last + after) / 3.0,
-                      (before + 2.0 * following) / 3.0]
+        shown = float(self.times(np.array([tooth]))[0])
+        if self.faults(tooth - AROUND, tooth + AROUND) and abs(
+                tau - self.first_tooth - tooth / (TEETH * self.speed)) <= self.most:
+            return tooth
         # to the nanosecond in messages, and as absolute times round
-        return tooth if min(abs(item - tau) for item in times) < 3e-9 + 2e-15 * abs(time) else None
+        return tooth if abs(shown - tau) < 3e-9 + 2e-15 * abs(time) else None
+
+    @property
+    def most(self) -> float:
+        """Return by how much (s) an interpolated pulse may be off the one that is shown."""
+        return 2.0 * max(map(abs, self.jitter.values()), default=0.0) + 3e-9
 
     def faults(self, first: int, last: int) -> list[int]:
         """Return the teeth, from `first` to `last`, with a fault or a stray beside them."""
@@ -165,6 +177,15 @@ class Window:
         basis = WEIGHTS[:, None] * np.exp(-2j * np.pi * self.cycles * np.outer(NODES, orders))
         angle = self.cycles * (np.arange(len(period)) - (len(period) - self.trigger_cycles))
         return np.asarray(2.0 * (wave @ basis) * np.exp(-2j * np.pi * np.outer(angle, orders)))
+
+    def uncertain(self, orders: FloatArray, numbers: Sequence[int]) -> list[ComplexArray]:
+        """Return by how much the amplitudes can change for each of these pulses interpolated."""
+        found, known = [], self.amplitudes(orders)
+        for number in numbers:
+            pulses = self.pulses.copy()
+            pulses[number] += self.run.most
+            found.append(replace(self, pulses=pulses).amplitudes(orders) - known)
+        return found
 
     def waveforms(self, first: int, points: int) -> FloatArray:
         """

@@ -254,6 +254,14 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
     assert (tmp_path / 'reliability-faults.png').exists()
 
 
+@pytest.mark.campaign
+def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
+    assert benchmark('fault_replay').main(['--scenes', '20', '--seed', '70000']) == 0
+    scenes, averages, wrong = re.findall(r'\d+', capsys.readouterr().out)
+    assert (int(scenes), int(wrong)) == (20, 0)
+    assert int(averages) > 1000
+
+
 def test_soak_says_which_averages_a_full_queue_lost(benchmark):
     soak = benchmark('soak')
     sequence = [k for k in range(40) if k not in (20, 21)]  # of a silence that 12 averages filled
