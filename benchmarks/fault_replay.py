@@ -15,8 +15,8 @@ Play the scenes of the fault campaign into the averager itself, without nodes an
 
 plays 400 scenes, with the parameters that the campaign sets, within some minutes; it gives four
 times as many averages as over DDS. Each is compared with the truth as in `fault_campaign.py`. One
-that is wrong has a line, with the faults of its scene and the parameters; the last line counts. The
-exit status is 1 if any was wrong.
+that is wrong has a line, with the faults of its scene and the parameters; the last line counts.
+The exit status is 1 if any was wrong.
 """
 
 import argparse

@@ -17,6 +17,7 @@ How fast they find the package depends on what else the machine does: no test as
 import importlib
 import json
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -144,8 +145,8 @@ def test_methods_are_timed_in_turns(benchmark):
 
 
 def test_memory_does_not_grow_with_the_record(benchmark):
-    short, *_, long = benchmark('core_speed').memory(0.1).values()
-    assert long < 1.1 * short
+    _, short, _, long = benchmark('core_speed').memory(0.4).values()  # 4 and 16 s
+    assert long < 1.05 * short
 
 
 def run(script, *arguments, environment):
@@ -259,7 +260,7 @@ def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
     assert benchmark('fault_replay').main(['--scenes', '20', '--seed', '70000']) == 0
     scenes, averages, wrong = re.findall(r'\d+', capsys.readouterr().out)
     assert (int(scenes), int(wrong)) == (20, 0)
-    assert int(averages) > 1000
+    assert int(averages) > 100
 
 
 def test_soak_says_which_averages_a_full_queue_lost(benchmark):

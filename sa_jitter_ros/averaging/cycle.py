@@ -46,6 +46,7 @@ _AHEAD = 1 << 12
 EDGE = 8
 _BESIDE = 32  # samples on either side of a cycle that may lie in its averages
 _EDGE_POWERS = 10  # of the polynomials through the shares: exact to 1e-8
+_EDGE_PLACES = np.cos(np.pi * (np.arange(_EDGE_POWERS) + 0.5) / _EDGE_POWERS)
 _EDGE_NODES = 96  # of the quadrature of the kernel, which has 8 turns: exact to rounding
 _LARGE = 1 << 61  # of what integers of 64 bits hold
 
@@ -479,27 +480,32 @@ def _edge_shares(points: int, orders: tuple[float, ...], behind: FloatArray) -> 
         len(behind), len(orders), -1))
 
 
+@lru_cache(maxsize=1)
+def _edge_kernel() -> tuple[tuple[FloatArray, FloatArray], ...]:
+    """Return places and weights (..., place) of the kernel's integrals from its begin on."""
+    x, weight = leggauss(_EDGE_NODES)
+    steps = np.arange(-EDGE, EDGE)  # from the first point behind the pulse
+    found = []
+    for end in (-steps - (_EDGE_PLACES[:, None] + 1.0) / 2.0, np.array(float(EDGE))):
+        length = end[..., None] + EDGE
+        place = length * (0.5 * (x + 1.0)) - EDGE
+        found.append((place, 0.5 * length * weight * impulse_response(place)))
+    return tuple(found)
+
+
 @lru_cache(maxsize=16)
 def _edge_polynomials(points: int, orders: tuple[float, ...]) -> ComplexArray:
     """Return `_edge_shares` as polynomials (power, order, point) of 2 behind - 1."""
-    nodes = np.cos(np.pi * (np.arange(_EDGE_POWERS) + 0.5) / _EDGE_POWERS)
-    steps = np.arange(-EDGE, EDGE)  # from the first point behind the pulse
     turn = 2.0 * np.pi / points * np.array(orders)
-    x, weight = leggauss(_EDGE_NODES)
-
-    def integral(end: FloatArray) -> ComplexArray:
-        """Integrate the kernel times exp(-j turn place) from -EDGE to `end` (..., order)."""
-        length = end[..., None] + EDGE
-        place = length * (0.5 * (x + 1.0)) - EDGE
-        kernel = 0.5 * length * weight * impulse_response(place)
-        return np.asarray(np.einsum('...i,...io->...o', kernel, np.exp(
-            -1j * np.multiply.outer(place, turn))))
-
-    before = integral(-steps - (nodes[:, None] + 1.0) / 2.0) / integral(np.array(EDGE))
+    part, whole = (
+        np.einsum('...i,...io->...o', kernel, np.exp(-1j * np.multiply.outer(place, turn)))
+        for place, kernel in _edge_kernel())
+    before = part / whole
     before[:, :EDGE] -= 1.0
-    shares = np.swapaxes(before, 1, 2) * np.exp(-1j * np.multiply.outer(turn, steps))
+    shares = np.swapaxes(before, 1, 2) * np.exp(
+        -1j * np.multiply.outer(turn, np.arange(-EDGE, EDGE)))
     flat = shares.reshape(_EDGE_POWERS, -1)
-    return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), flat)).reshape(
+    return np.asarray(np.linalg.solve(np.vander(_EDGE_PLACES, increasing=True), flat)).reshape(
         shares.shape)
 
 
