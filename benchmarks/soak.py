@@ -46,9 +46,8 @@ from sa_jitter_ros.nodes.base import RESULT_QOS
 ROOT = Path(__file__).resolve().parents[1]
 SPAN = 30.0  # s over which latencies are summed up
 PERIOD = 5.0  # s between two looks at the memory
-PUBLISHED = TRIGGER_CYCLES / SPEED  # s from one average to the next
 NODES = {
-    'synchronous_averager': {'trigger_cycles': TRIGGER_CYCLES, 'shaft.orders': list(ORDERS)},
+    'synchronous_averager': {'shaft.orders': list(ORDERS)},
     'jitter_predictor': {'follow_shaft_speed': True, 'trigger_cycles': TRIGGER_CYCLES,
                          'orders': list(ORDERS)}}
 
@@ -61,7 +60,8 @@ def resident(process: int) -> float:
 
 
 @contextmanager
-def nodes(correct: bool, shafts: int) -> Iterator[dict[str, subprocess.Popen[str]]]:
+def nodes(correct: bool, shafts: int, trigger_cycles: int
+          ) -> Iterator[dict[str, subprocess.Popen[str]]]:
     """Start the nodes, the averager on the last core, and end them by SIGINT."""
     cores, running = sorted(os.sched_getaffinity(0)), {}
     try:
@@ -72,6 +72,7 @@ def nodes(correct: bool, shafts: int) -> Iterator[dict[str, subprocess.Popen[str
                 arguments += ['-p', f'{key}:={str(value).lower()}']
             if name == 'synchronous_averager':
                 arguments += ['-p', f'correct_jitter:={str(correct).lower()}', '-p',
+                              f'trigger_cycles:={trigger_cycles}', '-p',
                               f'shafts:={["shaft", *(f"shaft{k}" for k in range(1, shafts))]}']
                 for k in range(1, shafts):
                     arguments += ['-p', f'shaft{k}.ratio:={0.37 + 0.231 * k:.3f}']
@@ -88,8 +89,8 @@ def nodes(correct: bool, shafts: int) -> Iterator[dict[str, subprocess.Popen[str
                 raise RuntimeError(f'{name} ended with status {process.returncode}')
 
 
-def soak(channels: int, seconds: float, *, correct: bool, shafts: int, block_seconds: float,
-         report: Callable[[str], None]) -> dict[str, Any]:
+def soak(channels: int, seconds: float, *, correct: bool, shafts: int, trigger_cycles: int,
+         block_seconds: float, report: Callable[[str], None]) -> dict[str, Any]:
     """Run for so long; return latencies, memory and what the averager has counted."""
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
     length = block_samples(channels, block_seconds)
@@ -105,7 +106,7 @@ def soak(channels: int, seconds: float, *, correct: bool, shafts: int, block_sec
             executor.spin_once(timeout_sec=0.2)
         return bool(until())
 
-    with nodes(correct, shafts) as running:
+    with nodes(correct, shafts, trigger_cycles) as running:
         if not spin(lambda: sink.status, 60.0):
             raise RuntimeError('the averager sent no status within 60 s')
         source = subprocess.Popen(
@@ -126,12 +127,12 @@ def soak(channels: int, seconds: float, *, correct: bool, shafts: int, block_sec
     counts = sink.status[-1][3]
     return {
         'channels': channels, 'seconds': seconds, 'correct_jitter': correct, 'shafts': shafts,
-        'cpu_share': share,
+        'trigger_cycles': trigger_cycles, 'cpu_share': share,
         'load': [f'{value:.1f}' for value in os.getloadavg()], 'source_late': sent['latest'],
         'end': sink.ends, 'sequence': sink.sequences, 'published': int(counts['averages']),
         'latency': [arrival - sent['start'] - end for arrival, end in zip(
             sink.arrivals, sink.ends)],
-        'expected': int((seconds * SPEED - 1) / TRIGGER_CYCLES), 'rss': rss,
+        'expected': int((seconds * SPEED - 1) / trigger_cycles), 'rss': rss,
         'counts': {key: int(counts[key]) for key in (*KEYS, 'samples_lost')},
         'messages': list(dict.fromkeys(item[2] for item in sink.status if item[1]))}
 
@@ -147,6 +148,11 @@ def spans(found: Mapping[str, Any]) -> np.ndarray:
                      for k in np.unique(number)])
 
 
+def period(found: Mapping[str, Any]) -> float:
+    """Return the time (s) from one average to the next."""
+    return float(found.get('trigger_cycles', TRIGGER_CYCLES) / SPEED)
+
+
 def overwritten(found: Mapping[str, Any]) -> tuple[int, float]:
     """
     Return how many published averages did not arrive, and the shortest silence (s) around one.
@@ -159,7 +165,7 @@ def overwritten(found: Mapping[str, Any]) -> tuple[int, float]:
     arrival = np.concatenate(([-np.inf], end + np.array(found['latency']), [np.inf]))
     due = np.interp(absent, sequence, end)
     silences = [np.diff(arrival[after - 1:until + 1]).max() for after, until in zip(
-        np.searchsorted(arrival, due), np.searchsorted(arrival, due + PUBLISHED))]
+        np.searchsorted(arrival, due), np.searchsorted(arrival, due + period(found)))]
     return len(absent), float(min(silences, default=np.inf))
 
 
@@ -170,7 +176,7 @@ def section(found: Mapping[str, Any]) -> str:
     absent, silence = overwritten(found)
     silences = '' if not absent else (
         f': they were due while nothing came for {silence:.1f} s or more, and a topic keeps the '
-        f'newest {RESULT_QOS.depth}, here of {RESULT_QOS.depth * PUBLISHED:g} s')
+        f'newest {RESULT_QOS.depth}, here of {RESULT_QOS.depth * period(found):g} s')
     jitter = 'with' if found['correct_jitter'] else 'without'
     shafts, share = found.get('shafts', 1), found.get('cpu_share')
     load = 'load ' if share is None else f'{100.0 * share:.0f} % of a core, load '
@@ -229,6 +235,7 @@ def main() -> int:
     parser.add_argument('--channels', type=int, default=128)
     parser.add_argument('--correct-jitter', action='store_true')
     parser.add_argument('--shafts', type=int, default=1)
+    parser.add_argument('--trigger-cycles', type=int, default=TRIGGER_CYCLES)
     parser.add_argument('--block-seconds', type=float, default=0.05, help='of a message, at most')
     parser.add_argument('--numbers', type=Path, default=ROOT / 'out' / 'soak.json')
     parser.add_argument('--page', type=Path, default=ROOT / 'docs' / 'reliability.md')
@@ -237,7 +244,8 @@ def main() -> int:
     options = parser.parse_args()
     if not options.only_write:
         found = soak(options.channels, 60.0 * options.minutes, correct=options.correct_jitter,
-                     shafts=options.shafts, block_seconds=options.block_seconds,
+                     shafts=options.shafts, trigger_cycles=options.trigger_cycles,
+                     block_seconds=options.block_seconds,
                      report=lambda text: print(text, file=sys.stderr, flush=True))
         options.numbers.parent.mkdir(parents=True, exist_ok=True)
         options.numbers.write_text(json.dumps(found) + '\n')
