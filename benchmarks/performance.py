@@ -34,7 +34,7 @@ from page import fill, table
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
-PEERS = (('numpy', 'scipy'), ('rota-order',), ('acoular',), ('--pre', 'phonometry'))
+PEERS = (('numpy', 'scipy', 'setuptools'), ('rota-order',), ('acoular',), ('--pre', 'phonometry'))
 # What the wheels of ROS 2 leave for child processes, wrong for another environment's Python.
 WHEELS = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'
 OURS = 'sa_jitter_ros, resampling and mean'
@@ -64,6 +64,8 @@ def peer_python() -> str:
         if done.returncode:
             print(f'performance: cannot install {names[-1]}: '
                   f'{done.stderr.strip().splitlines()[-1]}', file=sys.stderr)
+    # This Python may be another one than that for which the C code of this tree is compiled.
+    subprocess.run([python, 'setup.py', '--quiet', 'build_ext', '--inplace'], cwd=ROOT, check=True)
     return str(python)
 
 
