@@ -103,6 +103,11 @@ class CycleSamples:
         return replace(self, samples=np.where(gaps, 0.0, self.samples), lacking=lacking)
 
     @property
+    def has_ripple(self) -> bool:
+        """Whether the speed ripples inside a cycle."""
+        return bool(self.ripple.any() if isinstance(self.ripple, np.ndarray) else self.ripple)
+
+    @property
     def edges(self) -> FloatArray:
         """Return the pulses (s) between which the cycles lie."""
         return self.pulses[self.first:self.first + self.count + 1]
@@ -132,7 +137,7 @@ class CycleSamples:
         # the cycles that are resampled together.
         origins = np.floor(pulses[self.first:self.first + self.count]) - _AHEAD
         positions = run_times(law, pulses, self.first, origins, u)
-        if np.any(self.ripple):
+        if self.has_ripple:
             positions -= self.rate * np.reshape(self.ripple, (-1, 1)) * u * (1.0 - u)
         index = positions.astype(np.int32)
         fraction = np.subtract(positions, index, out=positions)
@@ -171,7 +176,7 @@ def joined(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
 def _continues(run: CycleSamples, following: CycleSamples) -> bool:
     begin = run.first_index
     return (run.start_time == following.start_time and run.rate == following.rate
-            and not np.any(run.ripple) and not np.any(following.ripple)
+            and not run.has_ripple and not following.has_ripple
             and run.samples.shape[1] == following.samples.shape[1]
             and run.edges[-1] == following.edges[0]
             and begin <= following.first_index <= begin + len(run.samples))

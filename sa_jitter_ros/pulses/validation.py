@@ -210,8 +210,10 @@ class PulseValidator:
                               'give real numbers, (n,)')
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
-        self._non_finite += int(np.count_nonzero(~finite))
-        pulses = pulses[finite] - self._path_delay
+        if not finite.all():
+            self._non_finite += int(np.count_nonzero(~finite))
+            pulses = pulses[finite]
+        pulses -= self._path_delay
         while pulses.size:
             ahead = 0
             if not self._held:
