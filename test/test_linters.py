@@ -73,9 +73,12 @@ def test_ament_pep257():
 
 
 def test_every_file_states_copyright_and_licence():
-    names = [path for source in SOURCES for path in sorted((ROOT / source).glob('**/*.py'))]
+    names = [path for source in SOURCES for path in sorted((ROOT / source).glob('**/*'))
+             if path.suffix in ('.c', '.py', '.pyi') and '.venv' not in path.parts]
     assert len(names) > 200
-    assert [path for path in names if not path.read_text('utf-8').startswith(HEADER)] == []
+    in_c = HEADER.replace('# ', '// ').replace('#\n', '//\n')
+    assert [path for path in names if not path.read_text('utf-8').startswith(
+        in_c if path.suffix == '.c' else HEADER)] == []
 
 
 def test_ament_copyright():
