@@ -67,7 +67,7 @@ def waveform_agrees(window: Window, start: int, waveform: AverageMessage,
     whole = window.waveforms(start, waveform.values.shape[1])
     cycles = len(whole)
     if values['averaging'] == 'exponential':
-        cycles = min(cycles, int(count * r))
+        cycles = min(cycles, max(int(count * r), 1))
         weights = exponential_weights(len(whole), max(count * r, 1.0))
     else:
         weights = equal_weights(len(whole))

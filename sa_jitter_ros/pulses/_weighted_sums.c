@@ -10,7 +10,7 @@
 
 /* The inner loop of resampling.py: weighted sums of samples, whose weights are polynomials.
  *
- * scipy's sparse product, which resampling.py uses where this is not compiled, loads and stores
+ * scipy's sparse product, which weighted_sums.py uses where this is not compiled, loads and stores
  * every sum once for each weight. Here the sums of some channels stay in registers, and so do the
  * weights while they are computed.
  */
