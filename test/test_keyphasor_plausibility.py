@@ -17,7 +17,7 @@ import pytest
 from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.commands.demo_plan import plan_doubts, plan_recording
 from sa_jitter_ros.errors import DataWarning, RecordingError
-from sa_jitter_ros.keyphasor_check.plausibility import doubts
+from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
 from sa_jitter_ros.loop import close_loop as loop
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
 from sa_jitter_ros.recordings import write_npz
@@ -223,3 +223,17 @@ def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):
 def test_loop_names_orders_that_are_not_there(recording):
     with pytest.warns(DataWarning, match='none of the orders 5, 11 stands above'):
         loop(recording, {**DECLARED, 'orders': [5, 11]})
+
+
+@pytest.mark.parametrize(('marks', 'text'), [
+    (1, ''), (2, 'pulses_per_revolution 1 instead of 2 all of them do'),
+    (4, 'pulses_per_revolution 1 instead of 4 they are far larger')])
+def test_other_marks_of_a_measured_gearbox_are_named(shared_data, marks, text):
+    """With 4 marks its orders stand, too: on weak lines at quarters of the mesh order."""
+    machine = np.load(shared_data / 'gear0_gearbox.npz')
+    found = weak_orders(
+        Recording(ArraySource(machine['vibration']), float(machine['sample_rate'])),
+        machine['reference_pulse_times'], machine['orders'].tolist(), ratio=1.0,
+        pulses_per_revolution=marks, pulses_per_trigger=None, missing_teeth=0)
+    assert len(found) == bool(text)
+    assert not text or text in found[0]

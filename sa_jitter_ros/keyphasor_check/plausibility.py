@@ -41,10 +41,11 @@ _PEAK, _SKIRT = 1, (3, 7)
 _CLEAR, _ABOVE = 4.0, 1.5
 # Places at which a spectrum is looked at for peaks there by chance; probability that so many stand
 # by chance, above which nothing is said for the orders; other numbers of marks, in parts of the
-# stated one, and by how much the logarithms of the peaks are larger with them on average.
+# stated one, and by how much the logarithms of the peaks are larger with them on average; by how
+# much where all of the orders stand with the stated one, too.
 _PLACES, _BY_CHANCE = 400, 0.05
 _OTHER_MARKS = (Fraction(1, 2), 2, Fraction(1, 3), 3, Fraction(1, 4), 4, Fraction(1, 8), 8)
-_LARGER = 0.7
+_LARGER, _FAR_LARGER = 0.7, 2.0
 _MOST_VALIDATED = 100_000
 _UNUSED, _FEW = 0.25, 20  # of the time without a trigger cycle, and pulses in it
 _MOST_STRAYS = 0.05
@@ -181,17 +182,17 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
         return (f'none of the orders {listed} stands above its noise{beyond} at {speed:.4g} Hz '
                 f'and ratio {ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
                 '(check_keyphasor finds them)',)
-    if count < stand.size:
-        marks = validator.pulses_per_revolution
-        for other in _OTHER_MARKS:
-            fitting = round(other * marks)
-            if fitting != other * marks:
-                continue
-            others = _sizes(*spectrum, places / float(other))
-            if others.min() > 0.0 and others.sum() > sizes.sum() + _LARGER * sizes.size:
-                return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} '
-                        f'Hz and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead '
-                        f'of {marks} all of them do (check_keyphasor finds out)',)
+    marks, larger = validator.pulses_per_revolution, _LARGER if count < stand.size else _FAR_LARGER
+    for other in _OTHER_MARKS:
+        fitting = round(other * marks)
+        if fitting != other * marks:
+            continue
+        others = _sizes(*spectrum, places / float(other))
+        if others.min() > 0.0 and others.sum() > sizes.sum() + larger * sizes.size:
+            better = 'all of them do' if count < stand.size else 'they are far larger'
+            return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} Hz '
+                    f'and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead of '
+                    f'{marks} {better} (check_keyphasor finds out)',)
     return ()
 
 
