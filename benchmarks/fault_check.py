@@ -108,8 +108,10 @@ class ShaftChecker:
             raise WrongAverageError(f'{self._name}: sequence {header.sequence} behind '
                                     f'{self._sequence - 1}')
         place, reasons = None, []
+        bridged = any(values['missing_pulses'] == 'bridge' for values in self._settings)
         for run in reversed(self._runs[-RUNS:]):
-            first, last = run.tooth_at(header.start_time), run.tooth_at(header.end_time)
+            first, last = (run.tooth_at(time, bridged=bridged)
+                           for time in (header.start_time, header.end_time))
             if first is None or last is None:
                 continue
             for values in reversed(self._settings):
@@ -279,7 +281,8 @@ def check_correction(name: str, received: Received, place: Place,
     run, step = place.run, place.values['pulses_per_trigger'] or TEETH
     teeth = np.arange(place.first, place.last + 1, step)
     times, errors, standard_errors = received.pulse_error.values[:, :3].T
-    if [run.tooth_at(time) for time in times] != teeth.tolist():
+    bridged = place.values['missing_pulses'] == 'bridge'
+    if [run.tooth_at(time, bridged=bridged) for time in times] != teeth.tolist():
         raise WrongAverageError(f'{name}: pulses at {times} s are not those of {header}')
     true = run.errors(teeth)
     true -= true.mean()

@@ -119,18 +119,18 @@ class Run:
         return np.array([self.jitter.get(tooth, 0.0) + self.displaced.get(tooth, 0.0)
                          for tooth in teeth.tolist()])
 
-    def tooth_at(self, time: float) -> int | None:
+    def tooth_at(self, time: float, *, bridged: bool) -> int | None:
         """
         Return the tooth whose pulse has this header time (s), or None.
 
-        That of one beside a fault may be interpolated between pulses around it.
+        If missing pulses are `bridged`, that of one near a fault may be interpolated.
         """
         tau = time - self.clock
         tooth = round((tau - self.first_tooth) * TEETH * self.speed)
         if tooth < 0:
             return None
         shown = float(self.times(np.array([tooth]))[0])
-        if self.faults(tooth - AROUND, tooth + AROUND) and abs(
+        if bridged and self.faults(tooth - AROUND, tooth + AROUND) and abs(
                 tau - self.first_tooth - tooth / (TEETH * self.speed)) <= self.most:
             return tooth
         # to the nanosecond in messages, and as absolute times round
