@@ -60,9 +60,8 @@ setup(
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'nodes/live_view_page/*'], f'{NAME}.pulses': ['*.pyi']},
-    # Without a C compiler scipy does the same, in three times the time.
-    ext_modules=[Extension(f'{NAME}.pulses._weighted_sums',
-                           [f'{NAME}/pulses/_weighted_sums.c'],
+    # Without a C compiler numpy and scipy do the same, in a few times the time.
+    ext_modules=[Extension(f'{NAME}.pulses._inner_loops', [f'{NAME}/pulses/_inner_loops.c'],
                            extra_compile_args=['-O3'], optional=True)],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

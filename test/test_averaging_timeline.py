@@ -71,7 +71,7 @@ def test_memory_of_a_stretch_follows_what_it_holds(steps):
         segment = timeline.segments[0]
         assert (segment.index, segment.end_index) == (begin, end)
         np.testing.assert_array_equal(segment.samples[:, 0], np.arange(begin, end))
-        assert len(segment._data) <= max(2 * (end - begin), 1024)
+        assert len(segment._data) <= max(4 * (end - begin), 1024)
 
 
 def test_time_of_a_sample_counts_from_the_first_of_its_run():

@@ -29,8 +29,10 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
-from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_times
-from sa_jitter_ros.pulses.resampling import impulse_response, interpolate_between, margin
+from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_lines, run_times
+from sa_jitter_ros.pulses.inner_loops import add_products
+from sa_jitter_ros.pulses.resampling import (
+    impulse_response, interpolate_along, interpolate_between, margin)
 from scipy.fft import next_fast_len
 
 FloatArray = NDArray[np.float64]
@@ -39,6 +41,7 @@ ComplexArray = NDArray[np.complex128]
 
 _MAX_POINTS = 1 << 18  # of an automatically chosen grid; beyond it the waveform is low-passed
 _SMALL_NUMBER = 512  # denominator of r up to which all cycles have the same waveform points
+_COPIED = 1 << 15  # numbers from which on cycles of several arrays are not put together
 _SMALL_GRID = 64  # points of a cycle up to which its amplitudes are one plain product
 # Samples in front of a cycle where its positions begin, which are thus positive.
 _AHEAD = 1 << 12
@@ -125,23 +128,30 @@ class CycleSamples:
                        else self.ripple, lacking=self.lacking[first:end])
 
     def at(self, law: AngleLaw, u: FloatArray, *, method: str, cutoff: float = 1.0,
-           kept: NDArray[np.bool_] | None = None) -> FloatArray:
+           ahead: FloatArray | float = 0.0, kept: NDArray[np.bool_] | None = None) -> FloatArray:
         """
-        Return values (point, channel) at fractions `u` of every cycle, cycle after cycle.
+        Return values (point, channel) at fractions `u` (u,) of every cycle, cycle after cycle.
 
-        `u` (u,) are the same in all cycles, or (cycle, u) those of each; they may lie somewhat
-        outside of the cycle. `kept` (cycle, u) are those that are wanted, None for all.
+        Each cycle begins with its fraction `ahead` (cycle,). Points may lie somewhat outside of
+        the cycle. `kept` (cycle, u) are those that are wanted, None for all.
         """
         pulses = (self.pulses - self.start_time) * self.rate
         # Positions in a cycle count from a sample in front of it, so that they do not depend on
         # the cycles that are resampled together.
         origins = np.floor(pulses[self.first:self.first + self.count]) - _AHEAD
+        first = (origins - self.first_index).astype(np.int32)
+        if law is LINEAR_LAW and not self.has_ripple and kept is None:
+            begins, periods = run_lines(pulses, self.first, origins)
+            return interpolate_along(self.samples, first, begins + periods * ahead, periods, u,
+                                     method=method, cutoff=cutoff)
+        if isinstance(ahead, np.ndarray):
+            u = ahead[:, None] + u
         positions = run_times(law, pulses, self.first, origins, u)
         if self.has_ripple:
             positions -= self.rate * np.reshape(self.ripple, (-1, 1)) * u * (1.0 - u)
         index = positions.astype(np.int32)
         fraction = np.subtract(positions, index, out=positions)
-        index += (origins - self.first_index).astype(np.int32)[:, None]
+        index += first[:, None]
         if kept is not None:
             index, fraction = index[kept], fraction[kept]
         return interpolate_between(self.samples, index.ravel(), fraction.ravel(), method=method,
@@ -165,15 +175,21 @@ class CycleSamples:
 def joined(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
     """Return the same cycles with those together whose samples and pulses continue."""
     groups: list[list[CycleSamples]] = []
+    size = 0
     for run in runs:
-        if groups and _continues(groups[-1][-1], run):
+        if groups and _continues(groups[-1][-1], run, size):
             groups[-1].append(run)
         else:
             groups.append([run])
+            size = 0
+        size += run.samples.size
     return [_join(group) for group in groups]
 
 
-def _continues(run: CycleSamples, following: CycleSamples) -> bool:
+def _continues(run: CycleSamples, following: CycleSamples, size: int) -> bool:
+    """Whether cycles continue a run of so many numbers, and are worth to be copied to it."""
+    if size > _COPIED and run.samples.base is not following.samples.base:
+        return False
     begin = run.first_index
     return (run.start_time == following.start_time and run.rate == following.rate
             and not run.has_ripple and not following.has_ripple
@@ -331,10 +347,10 @@ class CycleProjection:
             return
         row, rows = first // width, points // width
         if rows:
-            parts = self._coarse[:, row:row + rows] @ values[:, :rows * width].reshape(
-                count, rows, width * channels)
-            self._parts = parts if self._parts is None else np.add(
-                self._parts, parts, out=self._parts)
+            if self._parts is None:
+                self._parts = np.zeros((count, len(self._coarse), width * channels))
+            add_products(self._coarse[:, row:row + rows], values[:, :rows * width].reshape(
+                count, rows, width * channels), self._parts)
         if rows * width < points:
             last = self._coarse[:, row + rows]
             total = self._fine[:, :points - rows * width] @ values[:, rows * width:]
@@ -433,15 +449,19 @@ class WaveformPoints:
         """Return those of some of the cycles."""
         return replace(self, first=self.first[first:end + 1], behind=self.behind[first:end + 1])
 
+    @property
+    def ahead(self) -> FloatArray:
+        """Return the position u (cycle,) of the first point of each cycle."""
+        return np.asarray(self.behind[:-1] / (self.points * self.cycles))
+
     def fractions(self, around: int = 0) -> FloatArray:
         """
-        Return the positions u (cycle, point) of the points in their cycles.
+        Return the positions u (point,) of the points, from the first one of each cycle on.
 
         In cycles with fewer points than others they go on behind the last one. There are `around`
         points more in front and behind.
         """
-        steps = np.arange(-around, self.most + around)
-        return np.asarray((self.behind[:-1, None] + steps) / (self.points * self.cycles))
+        return np.arange(-around, self.most + around) / (self.points * self.cycles)
 
     def sums(self, values: FloatArray, orders: tuple[float, ...]
              ) -> tuple[ComplexArray, FloatArray, FloatArray]:

@@ -26,6 +26,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
+from sa_jitter_ros.pulses.inner_loops import add_steps
 
 _CACHED = 1 << 16  # numbers
 
@@ -38,15 +39,6 @@ def _power(values: Array) -> FloatArray:
     if np.iscomplexobj(values):
         return np.asarray(np.square(values.real) + np.square(values.imag))
     return np.asarray(np.square(values))
-
-
-def _sum_of_powers(values: Array) -> FloatArray:
-    """Return the sum of the squared magnitudes over the first axis."""
-    if len(values) == 1:
-        return _power(values[0])
-    if np.iscomplexobj(values):
-        return _sum_of_powers(values.real) + _sum_of_powers(values.imag)
-    return np.asarray(np.einsum('k...,k...->...', values, values))
 
 
 class RunningMean(Protocol):
@@ -104,9 +96,12 @@ class BlockMean:
         """Take a piece (cycle, where, ...) of the arrays that are expected."""
         if self._new:
             self._first[where] = values[0]
+        if values.dtype == np.float64:
+            add_steps(values, self._first[where], self._sum[where], self._squares[where])
+            return
         steps = values - self._first[where]
-        self._sum[where] += steps.sum(axis=0) if len(steps) > 1 else steps[0]
-        self._squares[where] += _sum_of_powers(steps)
+        self._sum[where] += steps.sum(axis=0)
+        self._squares[where] += _power(steps).sum(axis=0)
 
     def merge(self, other: 'BlockMean') -> None:
         """Add all arrays of another mean."""

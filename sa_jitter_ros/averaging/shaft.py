@@ -314,9 +314,9 @@ class ShaftAverager:
         if self._needs_edges(n) and cutoff == 1.0:
             return self._resample_uneven(cycles, points)
         u = points.fractions()
-        inside = np.arange(u.shape[1]) < points.number[:, None]
+        inside = np.arange(u.size) < points.number[:, None]
         self._add_points(points, cycles.at(
-            self._law, u, method=method, cutoff=cutoff, kept=inside))
+            self._law, u, method=method, cutoff=cutoff, ahead=points.ahead, kept=inside))
         return self._project(cycles, size)
 
     def _project(self, cycles: CycleSamples, size: int,
@@ -366,8 +366,8 @@ class ShaftAverager:
             end = min(first + piece, cycles.count)
             part = points.part(first, end)
             values = cycles.part(first, end).at(
-                self._law, part.fractions(EDGE), method=self.settings.interpolation).reshape(
-                    end - first, -1, channels)
+                self._law, part.fractions(EDGE), ahead=part.ahead,
+                method=self.settings.interpolation).reshape(end - first, -1, channels)
             sums.append(part.sums(values, self.settings.orders))
             for k, wave in enumerate(values[:, EDGE:], first):
                 every[begin[k]:begin[k + 1]] = wave[:begin[k + 1] - begin[k]]

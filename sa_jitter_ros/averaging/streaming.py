@@ -297,6 +297,7 @@ class StreamingAverager:
     # --- cycles ---
 
     def _process(self) -> list[tuple[str, Average]]:
+        before = self._next
         while len(self._triggers) - self._next >= 2:
             items = self._triggers.items
             times = items['time']
@@ -322,7 +323,8 @@ class StreamingAverager:
             count = self._together(segment, times[self._next:self._next + ready + 1])
             self._hand_over(segment, count, stop)
             self._next += count
-        self._forget_used()
+        if self._next != before:
+            self._forget_used()
         due, self._due = self._due, []
         return due
 

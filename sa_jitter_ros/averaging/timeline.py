@@ -22,6 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.pulses.inner_loops import frames
 from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved
 
 FloatArray = NDArray[np.float64]
@@ -55,11 +56,11 @@ class Segment:
     removed without being averaged.
     """
 
-    def __init__(self, clock: SampleClock, epoch: int, index: int, samples: FloatArray) -> None:
+    def __init__(self, clock: SampleClock, epoch: int, index: int, channels: int) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
-        self._data = np.ascontiguousarray(samples.T)
+        self._data = np.empty((0, channels))
         self.lacks_channels = False
-        self._begin, self._end = 0, len(self._data)
+        self._begin = self._end = 0
         self._index = self._settled = index  # samples before `_settled` are counted
         self._begins_run = index == clock.index
 
@@ -92,18 +93,25 @@ class Segment:
         """Position of a time (s) in samples from the first one."""
         return (time - self.clock.time) * self.clock.rate + (self.clock.index - self.index)
 
-    def append(self, samples: FloatArray) -> None:
-        """Add samples (channel, sample) behind the last one."""
+    def append(self, samples: FloatArray, *, gaps: bool = False) -> bool:
+        """
+        Add samples (channel, sample) behind the last one; return whether it was done.
+
+        It is not where a number is not finite and no `gaps` are allowed.
+        """
         count = samples.shape[1]
         if self._end + count > len(self._data):
             kept = self.samples
-            size = max(2 * (len(kept) + count), 1024)
+            size = max(4 * (len(kept) + count), 1024)
             data = np.empty((size, kept.shape[1]))
             data[:len(kept)] = kept
             self._index, self._data = self.index, data
             self._begin, self._end = 0, len(kept)
-        self._data[self._end:self._end + count] = samples.T
+        finite = frames(np.asarray(samples, np.float64), self._data[self._end:self._end + count])
+        if not (finite or gaps):
+            return False
         self._end += count
+        return True
 
     def use(self, low: float, high: float) -> int:
         """
@@ -437,11 +445,10 @@ class VibrationTimeline:
     def _store(self, samples: FloatArray, index: int) -> None:
         """Keep the samples that at least one channel has; others are a gap."""
         assert self._clock is not None
-        every = np.isfinite(samples)
-        if every.all():
+        if self._open(index, len(samples)).append(samples):
             self._lacking = []
-            self._put(samples, index)
             return
+        every = np.isfinite(samples)
         some = every.any(axis=0)
         self.counts.non_finite += int(np.count_nonzero(~every.all(axis=0)))
         bad = int(np.count_nonzero(~some))
@@ -455,10 +462,12 @@ class VibrationTimeline:
         if not spans or spans[0][0] > 0:
             self._close()
         for begin, end in spans:
-            self._put(kept[:, begin:end], index + begin)
-            self.segments[-1].lacks_channels |= bool(self._lacking)
+            segment = self._open(index + begin, len(samples))
+            segment.append(kept[:, begin:end], gaps=True)
+            segment.lacks_channels |= bool(self._lacking)
             if end < samples.shape[1]:
                 self._close()
+        self._tidy()
 
     def _name_channels(self, channels: list[int], index: int) -> None:
         """Say which channels lack samples, when they begin to."""
@@ -467,9 +476,9 @@ class VibrationTimeline:
                                  f'{channels}: they have no average there')
         self._lacking = channels
 
-    def _put(self, samples: FloatArray, index: int) -> None:
+    def _open(self, index: int, channels: int) -> Segment:
+        """Return the segment that a sample continues, a new one behind a gap."""
         assert self._clock is not None
-        if self.segments and not self.segments[-1].closed:
-            self.segments[-1].append(samples)
-        else:
-            self.segments.append(Segment(self._clock, self.epoch, index, samples))
+        if not self.segments or self.segments[-1].closed:
+            self.segments.append(Segment(self._clock, self.epoch, index, channels))
+        return self.segments[-1]

@@ -210,6 +210,11 @@ def angle_law(name: str) -> AngleLaw:
     return _LAWS[name]
 
 
+def _not_increasing(pulses: FloatArray) -> SignalError:
+    return SignalError(f'pulse times {pulses.tolist()} s do not increase: remove repeated and '
+                       'misplaced pulses first, as PulseValidator does')
+
+
 def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) -> FloatArray:
     """
     Return the times (s) at fractions `u` of one trigger cycle in a run of pulses.
@@ -227,9 +232,22 @@ def cycle_times(law: AngleLaw, pulses: FloatArray, cycle: int, u: FloatArray) ->
     first = max(cycle - law.before, 0)
     near = pulses[first:cycle + 2 + (law.after if cycle else law.after_first)]
     if not np.all(np.diff(near) > 0.0):
-        raise SignalError(f'pulse times {near.tolist()} s do not increase: remove repeated and '
-                          'misplaced pulses first, as PulseValidator does')
+        raise _not_increasing(near)
     return law.fraction_times(near, cycle - first, u)
+
+
+def run_lines(pulses: FloatArray, first: int, origins: FloatArray
+              ) -> tuple[FloatArray, FloatArray]:
+    """
+    Return begin and length (cycle,) in s of consecutive cycles of the linear law.
+
+    Arguments and error are those of `run_times`.
+    """
+    near = pulses[first:first + len(origins) + 1]
+    periods = near[1:] - near[:-1]
+    if not np.all(periods > 0.0):
+        raise _not_increasing(near)
+    return near[:-1] - origins, periods
 
 
 def run_times(law: AngleLaw, pulses: FloatArray, first: int, origins: FloatArray, u: FloatArray
@@ -243,9 +261,7 @@ def run_times(law: AngleLaw, pulses: FloatArray, first: int, origins: FloatArray
     increase.
     """
     if law is LINEAR_LAW:
-        near = pulses[first:first + len(origins) + 1]
-        periods = near[1:] - near[:-1]
-        if np.all(periods > 0.0):
-            return np.asarray((near[:-1] - origins)[:, None] + periods[:, None] * u)
+        begins, periods = run_lines(pulses, first, origins)
+        return np.asarray(begins[:, None] + periods[:, None] * u)
     return np.stack([cycle_times(law, pulses - origin, first + k, u[k] if u.ndim == 2 else u)
                      for k, origin in enumerate(origins)])

@@ -28,11 +28,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
-
-try:
-    from sa_jitter_ros.pulses._weighted_sums import weighted_sums
-except ImportError:  # installed without a C compiler
-    from sa_jitter_ros.pulses.weighted_sums import weighted_sums
+from sa_jitter_ros.pulses.inner_loops import weighted_sums
 
 FloatArray = NDArray[np.float64]
 
@@ -188,16 +184,30 @@ def interpolate_between(samples: FloatArray, index: NDArray[np.int32], fraction:
 
     As `interpolate`, for positions whose whole part is known, which must lie within the samples.
     """
+    return interpolate_along(samples, index, fraction, np.zeros(index.size), np.zeros(1),
+                             method=method, cutoff=cutoff)
+
+
+def interpolate_along(samples: FloatArray, origin: NDArray[np.int32], begin: FloatArray,
+                      length: FloatArray, u: FloatArray, *, method: str, cutoff: float = 1.0
+                      ) -> FloatArray:
+    """
+    Return `samples` (n, channels) at `begin` + `length` `u` behind samples `origin` (row,).
+
+    As `interpolate`, for rows of positions, which must lie within the samples, and behind those of
+    `origin`. Returns (row x u, channels), row by row.
+    """
     polynomials = _polynomials(_known(method), cutoff)
     half = polynomials.shape[1] // 2
-    if not index.size:
-        return np.empty((0, samples.shape[1]))
-    first, last = int(index.min()) - half + 1, int(index.max()) + half
+    values = np.empty((origin.size * u.size, samples.shape[1]))
+    if not values.size:
+        return values
+    ends = origin + begin + length * np.array([[u.min()], [u.max()]])
+    first, last = math.floor(ends.min()) - half, math.floor(ends.max()) + half + 1  # and rounding
     window = samples[max(first, 0):last + 1]
     if first < 0 or last >= len(samples):
         window = np.pad(window, ((max(-first, 0), max(last + 1 - len(samples), 0)), (0, 0)),
                         mode='reflect', reflect_type='odd')
-    values = np.empty((index.size, samples.shape[1]))
-    weighted_sums(np.ascontiguousarray(window), index - np.int32(first + half - 1), fraction,
-                  polynomials, values)
+    weighted_sums(np.ascontiguousarray(window), origin - np.int32(first + half - 1), begin, length,
+                  u, polynomials, values)
     return values

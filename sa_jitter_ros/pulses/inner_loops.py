@@ -2,16 +2,18 @@
 #
 # Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
 # in compliance with the License. You may obtain a copy of the License at
-# http://www.apache.org/licenses/LICENSE-2.0
+# http:#www.apache.org/licenses/LICENSE-2.0
 # Unless required by applicable law or agreed to in writing, software distributed under the License
 # is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-import numpy as np
-from numpy.typing import NDArray
+"""The loops over all samples: those in C where they are compiled, else those in numpy."""
 
+try:
+    from sa_jitter_ros.pulses._inner_loops import add_products, add_steps, frames, weighted_sums
+except ImportError:  # installed without a C compiler
+    from sa_jitter_ros.pulses.inner_loops_numpy import (
+        add_products, add_steps, frames, weighted_sums)
 
-def weighted_sums(samples: NDArray[np.float64], begin: NDArray[np.int32],
-                  fraction: NDArray[np.float64], polynomials: NDArray[np.float64],
-                  values: NDArray[np.float64], /) -> None: ...
+__all__ = ['add_products', 'add_steps', 'frames', 'weighted_sums']

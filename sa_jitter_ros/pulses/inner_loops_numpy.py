@@ -9,10 +9,10 @@
 # the License.
 
 """
-Weighted sums of samples, whose weights are polynomials.
+The loops over all samples, in numpy and scipy.
 
-This is what `_weighted_sums.c` computes, in a third of the time, where the package was installed
-with a C compiler. The sums are the product of a sparse matrix with the samples of all channels.
+This is what `_inner_loops.c` computes, in a fraction of the time, where the package was installed
+with a C compiler. Each function writes to its last arguments.
 """
 
 from functools import lru_cache
@@ -33,28 +33,34 @@ def _steps(taps: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
             np.arange(0, taps * _PIECE + 1, taps, dtype=np.int32))
 
 
-def weighted_sums(samples: FloatArray, begin: NDArray[np.int32], fraction: FloatArray,
-                  polynomials: FloatArray, values: FloatArray, /) -> None:
+def weighted_sums(samples: FloatArray, origin: NDArray[np.int32], begin: FloatArray,
+                  length: FloatArray, u: FloatArray, polynomials: FloatArray, values: FloatArray, /
+                  ) -> None:
     """
-    Write the weighted sums of `samples` (n, channels) to `values` (m, channels).
+    Write weighted sums of `samples` (n, channels) to `values` (row x u, channels), row by row.
 
-    The sums begin at samples `begin` (m,). The weights are `polynomials` (power, tap) of
-    2 `fraction` - 1.
+    The place of a sum is `begin` + `length` `u`, not negative, from sample `origin` (row,) on. It
+    begins at the sample before it, and its weights are `polynomials` (power, tap) of twice the
+    rest, less 1. Sums are the product of a sparse matrix with the samples of all channels.
     """
+    places = (begin[:, None] + length[:, None] * u).ravel()
+    index = places.astype(np.int32)
+    fraction = np.subtract(places, index, out=places)
+    index += np.repeat(origin, u.size)
     order, taps = polynomials.shape
-    channels, size = samples.shape[1], min(begin.size, _PIECE)
+    channels, size = samples.shape[1], min(index.size, _PIECE)
     values[:] = 0.0
     powers, weights = np.ones((order, size)), np.empty((size, taps))
     steps, rows = _steps(taps)
-    for start in range(0, begin.size, size):
-        count = min(size, begin.size - start)
+    for start in range(0, index.size, size):
+        count = min(size, index.size - start)
         power = powers[:, :count]
         np.multiply(fraction[start:start + count], 2.0, out=power[1])
         power[1] -= 1.0
         for k in range(2, order):
             np.multiply(power[k - 1], power[1], out=power[k])
         np.matmul(power.T, polynomials, out=weights[:count])
-        columns = np.repeat(begin[start:start + count], taps)
+        columns = np.repeat(index[start:start + count], taps)
         columns += steps[:columns.size]
         # What csr_matrix calls for a product, without its checks, which take as long here.
         matrix = count, len(samples), rows[:count + 1], columns, weights.reshape(-1)
@@ -64,3 +70,22 @@ def weighted_sums(samples: FloatArray, begin: NDArray[np.int32], fraction: Float
         else:
             _sparsetools.csr_matvecs(*matrix[:2], channels, *matrix[2:], samples.reshape(-1),
                                      found)
+
+
+def frames(samples: FloatArray, values: FloatArray, /) -> bool:
+    """Write `samples` (channel, n) to `values` (n, channel); return whether all are finite."""
+    values[:] = samples.T
+    return bool(np.isfinite(samples).all())
+
+
+def add_steps(values: FloatArray, first: FloatArray, total: FloatArray, squares: FloatArray, /
+              ) -> None:
+    """Add the steps from `first` (...) to the `values` (cycle, ...), and their squares."""
+    steps = values - first
+    total += steps.sum(axis=0) if len(steps) > 1 else steps[0]
+    squares += np.einsum('k...,k...->...', steps, steps)
+
+
+def add_products(table: FloatArray, values: FloatArray, sums: FloatArray, /) -> None:
+    """Add the products of a `table` (line, row) with `values` (cycle, row, n)."""
+    sums += table @ values
