@@ -59,9 +59,9 @@ setup(
     project_urls={'Source': f'{HOME}/{NAME}', 'Bug tracker': f'{HOME}/{NAME}/issues'},
     license='Apache-2.0',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'nodes/live_view_page/*'], f'{NAME}.pulses': ['*.pyi']},
+    package_data={NAME: ['py.typed', 'nodes/live_view_page/*'], f'{NAME}.inner_loops': ['*.pyi']},
     # Without a C compiler numpy and scipy do the same, in a few times the time.
-    ext_modules=[Extension(f'{NAME}.pulses._inner_loops', [f'{NAME}/pulses/_inner_loops.c'],
+    ext_modules=[Extension(f'{NAME}.inner_loops._in_c', [f'{NAME}/inner_loops/_in_c.c'],
                            extra_compile_args=['-O3'], optional=True)],
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -25,13 +25,14 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 SCIENCE = {'numpy', 'scipy'}
 CORE = {
     'errors': set(),
+    'inner_loops': SCIENCE,
     'json_values': {'numpy'},
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
     'samples': {'numpy'},
     'version': set(),
-    'pulses': SCIENCE | {'errors', 'parameters', 'samples'},
-    'averaging': SCIENCE | {'errors', 'parameters', 'pulses', 'samples'},
+    'pulses': SCIENCE | {'errors', 'inner_loops', 'parameters', 'samples'},
+    'averaging': SCIENCE | {'errors', 'inner_loops', 'parameters', 'pulses', 'samples'},
     'prediction': SCIENCE | {'errors', 'parameters', 'pulses'},
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {

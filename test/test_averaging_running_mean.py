@@ -50,6 +50,15 @@ def test_merged_means_are_the_mean_of_all(first, second):
     np.testing.assert_allclose(merged.standard_error, whole.standard_error, atol=1e-11 * scale)
 
 
+def test_arrays_may_lie_in_any_order_in_memory(rng):
+    values = rng.standard_normal((5, 4, 3))
+    plain, turned = BlockMean(), BlockMean()
+    plain.update(values)
+    turned.update(np.asfortranarray(values))
+    np.testing.assert_array_equal(turned.mean, plain.mean)
+    np.testing.assert_array_equal(turned.standard_error, plain.standard_error)
+
+
 def test_merging_with_nothing_changes_nothing():
     mean = filled(BlockMean(), [1.0, 3.0])
     mean.merge(BlockMean())

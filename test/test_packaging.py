@@ -182,7 +182,7 @@ def test_c_is_compiled_where_there_is_a_compiler():
     header = Path(sysconfig.get_path('include')) / 'Python.h'
     if shutil.which('cc') is None or not header.is_file():
         pytest.skip('no C compiler, or no header of Python: apt install gcc python3-dev')
-    assert find_spec(f'{NAME}.pulses._inner_loops') is not None
+    assert find_spec(f'{NAME}.inner_loops._in_c') is not None
 
 
 @pytest.mark.build
@@ -195,7 +195,7 @@ def test_pip_installs_with_and_without_a_c_compiler(tmp_path, compiler):
     run(tmp_path, 'env', f'CC={shutil.which(compiler)}', sys.executable, '-m', 'pip', 'install',
         '--no-build-isolation', '--no-deps', '--no-compile', '--target', tmp_path / 'home',
         source)
-    made = list((tmp_path / 'home').glob(f'{NAME}/pulses/_inner_loops.*.so'))
+    made = list((tmp_path / 'home').glob(f'{NAME}/inner_loops/_in_c.*.so'))
     assert len(made) == (compiler == 'cc')
     values = run(tmp_path / 'home', sys.executable, '-c', (
         'import numpy as np; from sa_jitter_ros.pulses.resampling import interpolate; '

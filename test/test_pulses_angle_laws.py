@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, cycle_times
+from sa_jitter_ros.pulses.angle_law import angle_law, ANGLE_LAWS, cycle_times, run_lines
 
 U = np.linspace(0.0, 1.0, 33)
 
@@ -102,6 +102,12 @@ def test_a_parabola_that_turns_round_is_replaced_by_a_line():
 def test_pulses_out_of_order_are_refused(name, pulses):
     with pytest.raises(SignalError, match='do not increase: remove repeated'):
         cycle_times(angle_law(name), np.array(pulses), 0, U)
+
+
+def test_error_names_the_pulses_that_do_not_increase():
+    pulses = np.concatenate((np.arange(500.0), np.arange(498.5, 600.0)))
+    with pytest.raises(SignalError, match=r'pulse times \[499\.0, 498\.5\] s'):
+        run_lines(pulses, 0, np.zeros(550))
 
 
 def test_unknown_law_is_refused():

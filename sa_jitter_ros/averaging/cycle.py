@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
+from sa_jitter_ros.inner_loops import add_products
 from sa_jitter_ros.pulses.angle_law import AngleLaw, LINEAR_LAW, run_lines, run_times
-from sa_jitter_ros.pulses.inner_loops import add_products
 from sa_jitter_ros.pulses.resampling import (
     impulse_response, interpolate_along, interpolate_between, margin)
 from scipy.fft import next_fast_len

@@ -26,7 +26,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
-from sa_jitter_ros.pulses.inner_loops import add_steps
+from sa_jitter_ros.inner_loops import add_steps
 
 _CACHED = 1 << 16  # numbers
 
@@ -78,6 +78,7 @@ class BlockMean:
 
     def update(self, values: Array) -> None:
         """Take one or more arrays (cycle, ...), at least one."""
+        values = np.ascontiguousarray(values)
         self.expect(len(values), values.shape[1:], values.dtype)
         # Piece by piece, so that what is computed of a piece stays in the cache.
         size = max(_CACHED // (values[:, :1].size or 1), 1)

@@ -22,7 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.pulses.inner_loops import frames
+from sa_jitter_ros.inner_loops import frames
 from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved
 
 FloatArray = NDArray[np.float64]

@@ -246,7 +246,8 @@ def run_lines(pulses: FloatArray, first: int, origins: FloatArray
     near = pulses[first:first + len(origins) + 1]
     periods = near[1:] - near[:-1]
     if not np.all(periods > 0.0):
-        raise _not_increasing(near)
+        wrong = int(np.argmin(periods > 0.0))
+        raise _not_increasing(near[wrong:wrong + 2])
     return near[:-1] - origins, periods
 
 

@@ -8,7 +8,7 @@
 // or implied. See the License for the specific language governing permissions and limitations under
 // the License.
 
-/* The loops over all samples: what inner_loops_numpy.py does where this is not compiled.
+/* The loops over all samples: what in_numpy.py does where this is not compiled.
  *
  * What is added up stays in registers, where numpy and scipy load and store it once for each
  * number, and each array is read once.
@@ -36,6 +36,11 @@ typedef double aligned __attribute__((vector_size(64), may_alias));
 typedef double four __attribute__((vector_size(32), aligned(8), may_alias));
 typedef double two __attribute__((vector_size(16), aligned(8), may_alias));
 typedef double one __attribute__((may_alias));
+
+INLINE double total(eight sum)
+{
+    return ((sum[0] + sum[4]) + (sum[2] + sum[6])) + ((sum[1] + sum[5]) + (sum[3] + sum[7]));
+}
 
 /* --- what arrays are given --- */
 
@@ -86,14 +91,15 @@ static int take_arrays(PyObject *const *given, Py_ssize_t number, int count, int
     return 0;
 }
 
-/* Give the arrays back; return `result`, NULL where they did not fit. */
+/* Give the arrays back; return `result`, NULL for an error, which is that they do not fit. */
 static PyObject *give_back(Py_buffer *views, int count, int fitted, PyObject *result)
 {
     while (count > 0)
         PyBuffer_Release(&views[--count]);
     if (fitted)
         return Py_NewRef(result);
-    PyErr_SetString(PyExc_ValueError, "the arrays do not fit each other");
+    if (!PyErr_Occurred())
+        PyErr_SetString(PyExc_ValueError, "the arrays do not fit each other");
     return NULL;
 }
 
@@ -116,28 +122,37 @@ static PyObject *give_back(Py_buffer *views, int count, int fitted, PyObject *re
     *(type *)(values + c) = (sum[0] + sum[1]) + (sum[2] + sum[3]); \
 } while (0)
 
-/* The polynomials, the highest power first, and room for the weights. Each row begins at a multiple
- * of 64 bytes and has `width` numbers, the taps and zeros behind them. */
-struct table {
-    double *polynomials, *weights;
-    Py_ssize_t order, taps, width;
+/* Places of the sums: `count` u in each of the rows. */
+struct places {
+    const int32_t *origin;
+    const double *begin, *length, *u;
+    Py_ssize_t rows, count;
 };
 
-/* The sums of a row, `count` from `begin` on, at `length` u; 0 if one is not within `last`. */
+/* `table` holds the polynomials, the highest power first, and room for the weights. Each of its
+ * rows begins at a multiple of 64 bytes and has `width` numbers, the taps and zeros behind them.
+ * Returns 0 if a sum is not within the samples, of which it may begin at the `last`. */
 FOR_EACH_PROCESSOR
 static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t last,
-                         Py_ssize_t origin, double begin, double length, const double *u,
-                         Py_ssize_t count, const struct table *given, double *values)
+                         const struct places *at, double *table, Py_ssize_t order,
+                         Py_ssize_t taps, Py_ssize_t width, double *values)
 {
-    const double *table = given->polynomials;
-    double *weights = given->weights;
-    const Py_ssize_t order = given->order, taps = given->taps, width = given->width;
-    for (Py_ssize_t i = 0; i < count; i++, values += channels) {
-        const double place = begin + length * u[i];
-        const int32_t whole = (int32_t)place;
-        if (!(place >= 0.0 && origin + whole >= 0 && origin + whole <= last))
+    double *weights = table + order * width;
+    const struct places p = *at;
+    const Py_ssize_t size = p.rows * p.count;
+    for (Py_ssize_t i = 0, row = 0, column = 0; i < size; i++, values += channels) {
+        const double place = p.begin[row] + p.length[row] * p.u[column];
+        if (!(place >= 0.0 && place <= INT32_MAX))
             return 0;
-        const double *first = samples + (origin + whole) * channels;
+        const int32_t whole = (int32_t)place;
+        const Py_ssize_t index = p.origin[row] + (Py_ssize_t)whole;
+        if (index < 0 || index > last)
+            return 0;
+        if (++column == p.count) {
+            column = 0;
+            row++;
+        }
+        const double *first = samples + index * channels;
         const double x = 2.0 * (place - whole) - 1.0;
         Py_ssize_t t, c = 0;
         for (t = 0; t < width; t += 8) {
@@ -152,8 +167,7 @@ static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t 
                 sum += *(const eight *)(weights + t) * *(const eight *)(first + t);
             for (; t < taps; t++)
                 sum[t % 8] += weights[t] * first[t];
-            *values = ((sum[0] + sum[4]) + (sum[2] + sum[6]))
-                      + ((sum[1] + sum[5]) + (sum[3] + sum[7]));
+            *values = total(sum);
             continue;
         }
         for (; c + 8 <= channels; c += 8)
@@ -183,24 +197,20 @@ static int fit(const Py_buffer *samples, const Py_buffer *origin, const Py_buffe
 /* Return whether all sums are within the samples; -1 where there is no memory. */
 static int compute(Py_buffer *views)
 {
-    const Py_ssize_t channels = views[0].shape[1], rows = views[1].shape[0];
-    const Py_ssize_t count = views[4].shape[0];
     const Py_ssize_t order = views[5].shape[0], taps = views[5].shape[1];
-    const Py_ssize_t width = (taps + 7) / 8 * 8, last = views[0].shape[0] - taps;
-    const int32_t *origin = views[1].buf;
-    const double *begin = views[2].buf, *length = views[3].buf, *polynomials = views[5].buf;
-    double *room = aligned_alloc(64, (order + 1) * width * sizeof(double)), *values = views[6].buf;
-    if (room == NULL)
+    const Py_ssize_t width = (taps + 7) / 8 * 8;
+    const struct places at = {views[1].buf, views[2].buf, views[3].buf, views[4].buf,
+                              views[1].shape[0], views[4].shape[0]};
+    const double *polynomials = views[5].buf;
+    double *table = aligned_alloc(64, (order + 1) * width * sizeof(double));
+    if (table == NULL)
         return -1;
-    memset(room, 0, (order + 1) * width * sizeof(double));
+    memset(table, 0, (order + 1) * width * sizeof(double));
     for (Py_ssize_t k = 0; k < order; k++)
-        memcpy(room + (order - 1 - k) * width, polynomials + k * taps, taps * sizeof(double));
-    const struct table table = {room, room + order * width, order, taps, width};
-    int inside = 1;
-    for (Py_ssize_t k = 0; inside && k < rows; k++, values += count * channels)
-        inside = weighted_sums(views[0].buf, channels, last, origin[k], begin[k], length[k],
-                               views[4].buf, count, &table, values);
-    free(room);
+        memcpy(table + (order - 1 - k) * width, polynomials + k * taps, taps * sizeof(double));
+    const int inside = weighted_sums(views[0].buf, views[0].shape[1], views[0].shape[0] - taps,
+                                     &at, table, order, taps, width, views[6].buf);
+    free(table);
     return inside;
 }
 
@@ -216,8 +226,9 @@ static PyObject *take_weighted_sums(PyObject *self, PyObject *const *given, Py_s
         done = compute(views);
         Py_END_ALLOW_THREADS
     }
-    PyObject *result = give_back(views, 7, done, Py_None);
-    return done < 0 ? PyErr_NoMemory() : result;
+    if (done < 0)
+        PyErr_NoMemory();
+    return give_back(views, 7, done > 0, Py_None);
 }
 
 /* --- frames: samples (channel, n) to (n, channel), whether all are finite --- */
@@ -274,9 +285,7 @@ static int frames(const char *samples, Py_ssize_t channels, Py_ssize_t count,
                 }
         }
     }
-    for (int k = 0; k < 8; k++)
-        sum += zero[k];
-    return sum == 0.0;
+    return sum + total(zero) == 0.0;
 }
 
 /* Samples that are in the order of frames. */
@@ -294,8 +303,7 @@ static int copied(const double *samples, Py_ssize_t count, double *values)
         values[i] = samples[i];
         zero[0] += samples[i] * 0.0;
     }
-    return ((zero[0] + zero[1]) + (zero[2] + zero[3]))
-           + ((zero[4] + zero[5]) + (zero[6] + zero[7])) == 0.0;
+    return total(zero) == 0.0;
 }
 
 static PyObject *take_frames(PyObject *self, PyObject *const *given, Py_ssize_t number)
@@ -439,18 +447,18 @@ static PyObject *take_products(PyObject *self, PyObject *const *given, Py_ssize_
 static PyMethodDef methods[] = {
     METHOD("weighted_sums", take_weighted_sums,
            "weighted_sums(samples, origin, begin, length, u, polynomials, values)\n--\n\n"
-           "See inner_loops_numpy. Raises ValueError for sums beyond the samples."),
-    METHOD("frames", take_frames, "frames(samples, values)\n--\n\nSee inner_loops_numpy."),
+           "See in_numpy. Raises ValueError for sums beyond the samples."),
+    METHOD("frames", take_frames, "frames(samples, values)\n--\n\nSee in_numpy."),
     METHOD("add_steps", take_steps,
-           "add_steps(values, first, sum, squares)\n--\n\nSee inner_loops_numpy."),
+           "add_steps(values, first, sum, squares)\n--\n\nSee in_numpy."),
     METHOD("add_products", take_products,
-           "add_products(table, values, sums)\n--\n\nSee inner_loops_numpy."),
+           "add_products(table, values, sums)\n--\n\nSee in_numpy."),
     {NULL, NULL, 0, NULL}};
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_inner_loops", NULL, -1, methods, NULL, NULL, NULL, NULL};
+    PyModuleDef_HEAD_INIT, "_in_c", NULL, -1, methods, NULL, NULL, NULL, NULL};
 
-PyMODINIT_FUNC PyInit__inner_loops(void)
+PyMODINIT_FUNC PyInit__in_c(void)
 {
     return PyModule_Create(&module);
 }

@@ -11,9 +11,8 @@
 """The loops over all samples: those in C where they are compiled, else those in numpy."""
 
 try:
-    from sa_jitter_ros.pulses._inner_loops import add_products, add_steps, frames, weighted_sums
+    from sa_jitter_ros.inner_loops._in_c import add_products, add_steps, frames, weighted_sums
 except ImportError:  # installed without a C compiler
-    from sa_jitter_ros.pulses.inner_loops_numpy import (
-        add_products, add_steps, frames, weighted_sums)
+    from sa_jitter_ros.inner_loops.in_numpy import add_products, add_steps, frames, weighted_sums
 
 __all__ = ['add_products', 'add_steps', 'frames', 'weighted_sums']

@@ -11,7 +11,7 @@
 """
 The loops over all samples, in numpy and scipy.
 
-This is what `_inner_loops.c` computes, in a fraction of the time, where the package was installed
+This is what `_in_c.c` computes, in a fraction of the time, where the package was installed
 with a C compiler. Each function writes to its last arguments.
 """
 

@@ -16,10 +16,10 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 
-COMPILED = 'sa_jitter_ros.pulses._inner_loops'
+COMPILED = 'sa_jitter_ros.inner_loops._in_c'
 needs_c = pytest.mark.skipif(util.find_spec(COMPILED) is None, reason='no C compiler')
 BOTH = pytest.mark.parametrize('name', [
-    'sa_jitter_ros.pulses.inner_loops_numpy', pytest.param(COMPILED, marks=needs_c)])
+    'sa_jitter_ros.inner_loops.in_numpy', pytest.param(COMPILED, marks=needs_c)])
 
 
 def arrays(rng, *, rows, points, channels, taps, order=8, samples=300):
