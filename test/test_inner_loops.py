@@ -22,12 +22,12 @@ BOTH = pytest.mark.parametrize('name', [
     'sa_jitter_ros.inner_loops.in_numpy', pytest.param(COMPILED, marks=needs_c)])
 
 
-def arrays(rng, *, rows, points, channels, taps, order=8, samples=300):
+def arrays(rng, *, rows, points, channels, half, order=8, samples=300):
     """Return what `weighted_sums` takes: rows of places up to 90 samples long, with their sums."""
     return (rng.standard_normal((samples, channels)),
-            rng.integers(0, samples - taps - 90, rows).astype(np.int32),
+            rng.integers(0, samples - 2 * half - 90, rows).astype(np.int32),
             rng.uniform(0.0, 2.0, rows), rng.uniform(0.0, 88.0, rows),
-            rng.uniform(0.0, 1.0, points), rng.standard_normal((order, taps)),
+            rng.uniform(0.0, 1.0, points), rng.standard_normal((order, half)),
             np.full((rows * points, channels), np.nan))
 
 
@@ -39,24 +39,28 @@ def change(arrays_, which, value):
 # --- weighted sums -------------------------------------------------------------------------------
 
 @BOTH
-@given(channels=st.integers(1, 70), taps=st.integers(1, 120), order=st.integers(2, 9),
+@given(channels=st.integers(1, 70), half=st.integers(1, 60), order=st.integers(2, 9),
        rows=st.integers(1, 5), points=st.integers(1, 9), seed=st.integers(0, 1000))
-def test_sums_are_those_of_the_definition(name, channels, taps, order, rows, points, seed):
+def test_sums_are_those_of_the_definition(name, channels, half, order, rows, points, seed):
     given_ = arrays(np.random.default_rng(seed), rows=rows, points=points, channels=channels,
-                    taps=taps, order=order)
+                    half=half, order=order)
     samples, origin, begin, length, u, polynomials, values = given_
     import_module(name).weighted_sums(*given_)
     places = (begin[:, None] + length[:, None] * u).ravel()
     first = np.repeat(origin, points) + places.astype(int)
-    weights = np.vander(2.0 * (places % 1.0) - 1.0, order, increasing=True) @ polynomials
+    x = 2.0 * (places % 1.0) - 1.0
+    weights = np.concatenate((
+        np.vander(x, order, increasing=True) @ polynomials,
+        (np.vander(-x, order, increasing=True) @ polynomials)[:, ::-1]), axis=1)
     for at, row, found in zip(first, weights, values):
-        np.testing.assert_allclose(found, row @ samples[at:at + taps], atol=1e-11 * order * taps)
+        np.testing.assert_allclose(found, row @ samples[at:at + 2 * half],
+                                   atol=1e-11 * order * half)
 
 
 @BOTH
 @pytest.mark.parametrize('channels', [1, 3, 64])
 def test_sums_are_the_same_however_many_are_made_together(name, channels, rng):
-    given_ = arrays(rng, rows=50, points=100, channels=channels, taps=16)
+    given_ = arrays(rng, rows=50, points=100, channels=channels, half=8)
     samples, *rows, u, polynomials, values = given_
     weighted_sums = import_module(name).weighted_sums
     weighted_sums(*given_)
@@ -70,7 +74,7 @@ def test_sums_are_the_same_however_many_are_made_together(name, channels, rng):
 
 @needs_c
 def test_sums_in_c_are_within_the_arrays(rng):
-    good = arrays(rng, rows=4, points=5, channels=3, taps=16)
+    good = arrays(rng, rows=4, points=5, channels=3, half=8)
     compiled = import_module(COMPILED).weighted_sums
     late, early = good[1].copy(), good[1].copy()
     late[2], early[2] = 300 - 16 + 1, -200
@@ -80,7 +84,7 @@ def test_sums_in_c_are_within_the_arrays(rng):
             (1, good[1].astype(np.int64)), (2, good[2][:-1]), (2, good[2].astype('>f8')),
             (2, good[2] - 200.0), (2, np.full(4, np.nan)), (2, np.full(4, 1e300)),
             (3, good[3][:-1]), (4, good[4][:-1]), (4, good[4] * 1e4), (5, good[5][0]),
-            (5, np.empty((0, 16))), (6, good[6][:-1]), (6, good[6][:, :2].copy())):
+            (5, np.empty((0, 8))), (5, np.empty((8, 0))), (6, good[6][:-1]), (6, good[6][:, :2].copy())):
         with pytest.raises(ValueError, match='do not fit'):
             compiled(*change(good, which, value))
     with pytest.raises(ValueError, match='contiguous'):

@@ -27,6 +27,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from sa_jitter_ros.inner_loops import add_products
@@ -211,13 +212,13 @@ def _join(runs: Sequence[CycleSamples]) -> CycleSamples:
 
 def _joined_samples(runs: Sequence[CycleSamples]) -> FloatArray:
     """Return the samples of runs that continue, without a copy where they are of one array."""
-    every = runs[0].samples.base
-    if isinstance(every, np.ndarray) and all(
-            run.samples.base is every and run.samples.strides == every.strides for run in runs):
-        begin, end = (
-            (address - every.ctypes.data) // every.strides[0] for address in (
-                runs[0].samples.ctypes.data, runs[-1].samples.ctypes.data))
-        return every[begin:end + len(runs[-1].samples)]
+    first, last = runs[0].samples, runs[-1].samples
+    if first.base is not None and all(
+            run.samples.base is first.base and run.samples.strides == first.strides
+            for run in runs):
+        step = first.strides[0]
+        count = (last.ctypes.data - first.ctypes.data) // step + len(last)
+        return as_strided(first, (count, first.shape[1]), first.strides)
     parts, end = [runs[0].samples], runs[0].first_index + len(runs[0].samples)
     for run in runs[1:]:
         begin = run.first_index

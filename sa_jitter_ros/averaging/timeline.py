@@ -22,7 +22,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.inner_loops import frames
+from sa_jitter_ros.inner_loops import frames, room
 from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved
 
 FloatArray = NDArray[np.float64]
@@ -58,7 +58,7 @@ class Segment:
 
     def __init__(self, clock: SampleClock, epoch: int, index: int, channels: int) -> None:
         self.clock, self.epoch, self.closed = clock, epoch, False
-        self._data = np.empty((0, channels))
+        self._data = room((0, channels))
         self.lacks_channels = False
         self._begin = self._end = 0
         self._index = self._settled = index  # samples before `_settled` are counted
@@ -103,7 +103,7 @@ class Segment:
         if self._end + count > len(self._data):
             kept = self.samples
             size = max(4 * (len(kept) + count), 1024)
-            data = np.empty((size, kept.shape[1]))
+            data = room((size, kept.shape[1]))
             data[:len(kept)] = kept
             self._index, self._data = self.index, data
             self._begin, self._end = 0, len(kept)

@@ -122,6 +122,9 @@ static PyObject *give_back(Py_buffer *views, int count, int fitted, PyObject *re
     *(type *)(values + c) = (sum[0] + sum[1]) + (sum[2] + sum[3]); \
 } while (0)
 
+/* Samples from the first of a sum to what is fetched from the memory, which takes that long. */
+#define AHEAD 64
+
 /* Places of the sums: `count` u in each of the rows. */
 struct places {
     const int32_t *origin;
@@ -129,17 +132,21 @@ struct places {
     Py_ssize_t rows, count;
 };
 
-/* `table` holds the polynomials, the highest power first, and room for the weights. Each of its
- * rows begins at a multiple of 64 bytes and has `width` numbers, the taps and zeros behind them.
- * Returns 0 if a sum is not within the samples, of which it may begin at the `last`. */
-FOR_EACH_PROCESSOR
-static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t last,
-                         const struct places *at, double *table, Py_ssize_t order,
-                         Py_ssize_t taps, Py_ssize_t width, double *values)
+/* `table` holds the polynomials of the first half of the weights, the lowest power first, in rows
+ * of `width` numbers that begin at a multiple of 64 bytes: zeros and the `half`; `room` is that of
+ * the weights between as many zeros. Weights of the second half are those of the first, in the
+ * other order, with the odd powers taken away. Returns 0 if a sum is not within the samples, of
+ * which it may begin at the `last`. */
+INLINE int sums(const double *samples, const Py_ssize_t channels, Py_ssize_t last,
+                const struct places *at, const double *restrict table, double *restrict room,
+                const Py_ssize_t order, const Py_ssize_t half, double *restrict values)
 {
-    double *weights = table + order * width;
+    typedef int64_t places __attribute__((vector_size(64)));
+    const places turned = {7, 6, 5, 4, 3, 2, 1, 0};
+    const Py_ssize_t width = (half + 7) / 8 * 8;
+    const double *weights = room + width - half;
     const struct places p = *at;
-    const Py_ssize_t size = p.rows * p.count;
+    const Py_ssize_t size = p.rows * p.count, taps = 2 * half;
     for (Py_ssize_t i = 0, row = 0, column = 0; i < size; i++, values += channels) {
         const double place = p.begin[row] + p.length[row] * p.u[column];
         if (!(place >= 0.0 && place <= INT32_MAX))
@@ -153,13 +160,20 @@ static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t 
             row++;
         }
         const double *first = samples + index * channels;
-        const double x = 2.0 * (place - whole) - 1.0;
+        const double x = 2.0 * (place - whole) - 1.0, square = x * x;
         Py_ssize_t t, c = 0;
         for (t = 0; t < width; t += 8) {
-            eight sum = *(const aligned *)(table + t);
-            for (Py_ssize_t k = 1; k < order; k++)
-                sum = sum * x + *(const aligned *)(table + k * width + t);
-            *(aligned *)(weights + t) = sum;
+            const double *power = table + (order - 2) * width + t;
+            eight even = *(const aligned *)power, odd = *(const aligned *)(power + width);
+            for (Py_ssize_t k = order - 2; k > 0; k -= 2) {
+                power -= 2 * width;
+                even = even * square + *(const aligned *)power;
+                odd = odd * square + *(const aligned *)(power + width);
+            }
+            odd *= x;
+            const eight second = even - odd;
+            *(aligned *)(room + t) = even + odd;
+            *(aligned *)(room + 2 * width - 8 - t) = __builtin_shuffle(second, turned);
         }
         if (channels == 1) {
             eight sum = {0.0};
@@ -170,8 +184,10 @@ static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t 
             *values = total(sum);
             continue;
         }
-        for (; c + 8 <= channels; c += 8)
+        for (; c + 8 <= channels; c += 8) {
+            __builtin_prefetch(first + AHEAD * channels + c);
             ADD_UP(eight);
+        }
         for (; c + 4 <= channels; c += 4)
             ADD_UP(four);
         for (; c + 2 <= channels; c += 2)
@@ -180,6 +196,19 @@ static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t 
             ADD_UP(one);
     }
     return 1;
+}
+
+/* What is known to the compiler stays in registers: the default interpolator, one channel. */
+FOR_EACH_PROCESSOR
+static int weighted_sums(const double *samples, Py_ssize_t channels, Py_ssize_t last,
+                         const struct places *at, const double *table, double *room,
+                         Py_ssize_t order, Py_ssize_t half, double *values)
+{
+    if (order == 8 && half == 8 && channels == 1)
+        return sums(samples, 1, last, at, table, room, 8, 8, values);
+    if (order == 8 && half == 8)
+        return sums(samples, channels, last, at, table, room, 8, 8, values);
+    return sums(samples, channels, last, at, table, room, order, half, values);
 }
 
 static int fit(const Py_buffer *samples, const Py_buffer *origin, const Py_buffer *begin,
@@ -191,25 +220,27 @@ static int fit(const Py_buffer *samples, const Py_buffer *origin, const Py_buffe
         && is_array(polynomials, 2, 'd', 8) && is_array(values, 2, 'd', 8)
         && begin->shape[0] == origin->shape[0] && length->shape[0] == origin->shape[0]
         && values->shape[0] == origin->shape[0] * u->shape[0]
-        && values->shape[1] == samples->shape[1] && polynomials->shape[0] > 0;
+        && values->shape[1] == samples->shape[1] && polynomials->shape[0] > 0
+        && polynomials->shape[1] > 0;
 }
 
 /* Return whether all sums are within the samples; -1 where there is no memory. */
 static int compute(Py_buffer *views)
 {
-    const Py_ssize_t order = views[5].shape[0], taps = views[5].shape[1];
-    const Py_ssize_t width = (taps + 7) / 8 * 8;
+    const Py_ssize_t powers = views[5].shape[0], half = views[5].shape[1];
+    const Py_ssize_t order = (powers + 1) / 2 * 2, width = (half + 7) / 8 * 8;
     const struct places at = {views[1].buf, views[2].buf, views[3].buf, views[4].buf,
                               views[1].shape[0], views[4].shape[0]};
     const double *polynomials = views[5].buf;
-    double *table = aligned_alloc(64, (order + 1) * width * sizeof(double));
+    double *table = aligned_alloc(64, (order + 2) * width * sizeof(double));
     if (table == NULL)
         return -1;
-    memset(table, 0, (order + 1) * width * sizeof(double));
-    for (Py_ssize_t k = 0; k < order; k++)
-        memcpy(table + (order - 1 - k) * width, polynomials + k * taps, taps * sizeof(double));
-    const int inside = weighted_sums(views[0].buf, views[0].shape[1], views[0].shape[0] - taps,
-                                     &at, table, order, taps, width, views[6].buf);
+    memset(table, 0, (order + 2) * width * sizeof(double));
+    for (Py_ssize_t k = 0; k < powers; k++)
+        memcpy(table + (k + 1) * width - half, polynomials + k * half, half * sizeof(double));
+    const int inside = weighted_sums(views[0].buf, views[0].shape[1],
+                                     views[0].shape[0] - 2 * half, &at, table,
+                                     table + order * width, order, half, views[6].buf);
     free(table);
     return inside;
 }
@@ -260,7 +291,7 @@ FOR_EACH_PROCESSOR
 static int frames(const char *samples, Py_ssize_t channels, Py_ssize_t count,
                   Py_ssize_t channel_step, Py_ssize_t step, double *values)
 {
-    const Py_ssize_t many = step == sizeof(double) ? channels / 8 * 8 : 0, tile = 64;
+    const Py_ssize_t many = step == sizeof(double) ? channels / 8 * 8 : 0, tile = 2048;
     eight zero = {0.0}, row[8];
     double sum = 0.0;
     for (Py_ssize_t begin = 0; begin < count; begin += tile) {

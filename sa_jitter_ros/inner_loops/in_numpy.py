@@ -40,9 +40,12 @@ def weighted_sums(samples: FloatArray, origin: NDArray[np.int32], begin: FloatAr
     Write weighted sums of `samples` (n, channels) to `values` (row x u, channels), row by row.
 
     The place of a sum is `begin` + `length` `u`, not negative, from sample `origin` (row,) on. It
-    begins at the sample before it, and its weights are `polynomials` (power, tap) of twice the
-    rest, less 1. Sums are the product of a sparse matrix with the samples of all channels.
+    begins at the sample before it. The weights of its first half are `polynomials` (power, tap) of
+    twice the rest, less 1; those of the second half are of the negative, in the other order. Sums
+    are the product of a sparse matrix with the samples of all channels.
     """
+    polynomials = np.concatenate((polynomials, polynomials[:, ::-1]), axis=1)
+    polynomials[1::2, polynomials.shape[1] // 2:] *= -1.0
     places = (begin[:, None] + length[:, None] * u).ravel()
     index = places.astype(np.int32)
     fraction = np.subtract(places, index, out=places)

@@ -28,7 +28,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.inner_loops import weighted_sums
+from sa_jitter_ros.inner_loops import room, weighted_sums
 
 FloatArray = NDArray[np.float64]
 _Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
@@ -75,10 +75,10 @@ def _stretch(method: str, cutoff: float) -> tuple[str, int, float]:
 @lru_cache(maxsize=64)
 def _polynomials(method: str, cutoff: float) -> FloatArray:
     """
-    Coefficients (power, tap) of the weights.
+    Coefficients (power, tap) of the weights of samples up to the one in front of a position.
 
-    They are polynomials of 2 f - 1, f being the fraction of a sample that a position lies beyond
-    the sample in front of it, through the kernel at the Chebyshev nodes.
+    They are polynomials of 2 f - 1, f being the fraction of a sample that the position lies beyond
+    that sample, through the kernel at the Chebyshev nodes. The kernel is symmetric.
     """
     method, half, stretch = _stretch(method, cutoff)
     width, powers = math.ceil(half / stretch), _DEGREE[method] + 1
@@ -86,7 +86,7 @@ def _polynomials(method: str, cutoff: float) -> FloatArray:
     taps = np.arange(1 - width, width + 1)
     weights = _kernel(method, stretch * (taps - (nodes[:, None] + 1.0) / 2.0), half)
     weights /= weights.sum(axis=1, keepdims=True)  # the gain of a constant is 1
-    return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), weights))
+    return np.asarray(np.linalg.solve(np.vander(nodes, increasing=True), weights[:, :width]))
 
 
 def _known(method: str) -> str:
@@ -208,10 +208,10 @@ def _weighted(samples: FloatArray, ends: tuple[int, int], places: _Places, polyn
               ) -> FloatArray:
     """Return the weighted sums at places (origin, begin, length, u) between two samples."""
     origin, begin, length, u = places
-    values = np.empty((origin.size * u.size, samples.shape[1]))
+    values = room((origin.size * u.size, samples.shape[1]))
     if not values.size:
         return values
-    half = polynomials.shape[1] // 2
+    half = polynomials.shape[1]
     first, last = ends[0] - half + 1, ends[1] + half
     window = samples[max(first, 0):last + 1]
     if first < 0 or last >= len(samples):
