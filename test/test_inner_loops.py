@@ -84,7 +84,8 @@ def test_sums_in_c_are_within_the_arrays(rng):
             (1, good[1].astype(np.int64)), (2, good[2][:-1]), (2, good[2].astype('>f8')),
             (2, good[2] - 200.0), (2, np.full(4, np.nan)), (2, np.full(4, 1e300)),
             (3, good[3][:-1]), (4, good[4][:-1]), (4, good[4] * 1e4), (5, good[5][0]),
-            (5, np.empty((0, 8))), (5, np.empty((8, 0))), (6, good[6][:-1]), (6, good[6][:, :2].copy())):
+            (5, np.empty((0, 8))), (5, np.empty((8, 0))), (6, good[6][:-1]),
+            (6, good[6][:, :2].copy())):
         with pytest.raises(ValueError, match='do not fit'):
             compiled(*change(good, which, value))
     with pytest.raises(ValueError, match='contiguous'):

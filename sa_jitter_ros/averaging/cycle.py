@@ -216,8 +216,8 @@ def _joined_samples(runs: Sequence[CycleSamples]) -> FloatArray:
     if first.base is not None and all(
             run.samples.base is first.base and run.samples.strides == first.strides
             for run in runs):
-        step = first.strides[0]
-        count = (last.ctypes.data - first.ctypes.data) // step + len(last)
+        begin, end = (item.__array_interface__['data'][0] for item in (first, last))
+        count = (end - begin) // first.strides[0] + len(last)
         return as_strided(first, (count, first.shape[1]), first.strides)
     parts, end = [runs[0].samples], runs[0].first_index + len(runs[0].samples)
     for run in runs[1:]:
@@ -552,6 +552,7 @@ def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatAr
     return whole + total // divisor, (total % divisor) / divisor
 
 
+@lru_cache(maxsize=64)
 @lru_cache(maxsize=64)
 def on_grid(points: int, cycles: float) -> bool:
     """Whether the points of the waveform are at the same angles of every trigger cycle."""

@@ -170,7 +170,7 @@ class ShaftAverager:
 
     def _take(self, cycles: CycleSamples) -> None:
         """Let cycles wait; raise `SignalError`."""
-        periods = cycles.periods
+        periods, edges = cycles.periods, cycles.edges
         if not periods.min() > self.shortest(cycles.rate):
             raise SignalError(
                 f'shaft frequency {self.settings.cycle_length / periods.min():.6g} Hz is not '
@@ -182,7 +182,7 @@ class ShaftAverager:
         self._next += cycles.count
         self._taken += cycles.count
         # Not their samples, which depend on how the cycles were handed over.
-        self._waiting_size += float(cycles.periods.sum() * cycles.rate * cycles.samples.shape[1])
+        self._waiting_size += float(edges[-1] - edges[0]) * cycles.rate * cycles.samples.shape[1]
 
     def shortest(self, rate: float) -> float:
         """Return the period (s) of a trigger cycle that is too short for samples at `rate` Hz."""

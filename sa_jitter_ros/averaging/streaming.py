@@ -242,13 +242,12 @@ class StreamingAverager:
         if not times.size:
             return
         items, epochs = np.zeros(times.size, TRIGGER), self._epochs(triggers)
-        changed = epochs != np.concatenate(((self._pulse_epoch,), epochs[:-1]))
-        starts = triggers.starts_run | changed
         items['time'], items['epoch'], items['mark'] = times, epochs, triggers.mark
-        items['starts_run'] = starts
-        if starts.any():
+        if triggers.starts_run.any() or epochs[-1] != self._pulse_epoch:
             # Behind a gap of unknown length the count begins at 0 again.
+            changed = epochs != np.concatenate(((self._pulse_epoch,), epochs[:-1]))
             skipped = triggers.count - np.concatenate(((self._last_count,), triggers.count[:-1]))
+            items['starts_run'] = triggers.starts_run | changed
             items['skipped'] = np.where(changed | triggers.restarted, 0, np.maximum(skipped, 0))
         self._last_count = int(triggers.count[-1])
         self._pulse_epoch = int(epochs[-1])
@@ -265,7 +264,7 @@ class StreamingAverager:
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
         """Return the epoch of each pulse."""
         # If the pulse times ran back, those of the vibration did so, too, or will.
-        earliest = self._pulse_epoch + np.cumsum(triggers.restarted)
+        earliest = self._pulse_epoch + triggers.restarted.cumsum()
         if all(item.epoch == self.timeline.epoch for item in self.timeline.segments):
             return np.asarray(earliest + max(self.timeline.epoch - int(earliest[0]), 0))
         epochs, epoch, times = [], self._pulse_epoch, triggers.times.tolist()
@@ -320,8 +319,8 @@ class StreamingAverager:
                 self._discard(count, f'no vibration without a gap from {start:.6f} s to '
                               f'{end:.6f} s{segment}')
                 continue
-            count = self._together(segment, times[self._next:self._next + ready + 1])
-            self._hand_over(segment, count, stop)
+            count, margin = self._together(segment, times[self._next:self._next + ready + 1])
+            self._hand_over(segment, count, margin, stop)
             self._next += count
         if self._next != before:
             self._forget_used()
@@ -355,8 +354,12 @@ class StreamingAverager:
             return 0
         return count - self._law.after
 
-    def _together(self, segment: Segment, times: FloatArray) -> int:
-        """Return how many of the cycles between `times`, at least one, can be taken together."""
+    def _together(self, segment: Segment, times: FloatArray) -> tuple[int, int]:
+        """
+        Return how many of the cycles between `times`, at least one, can be taken together.
+
+        The second number are the samples that they need on either side.
+        """
         clock, samples = segment.clock, segment.samples
         offset = clock.index - segment.index
         times = times[:min(item.room for item in self.shafts.values()) + 1] - clock.time
@@ -366,16 +369,16 @@ class StreamingAverager:
 
         last = len(samples) - (1.0 - 1e-6 if segment.closed else 1.0)
         reach = min(last, times[0] * clock.rate + offset + 4 * TOGETHER / samples.shape[1])
-        count = cycles_to(reach)
+        count = max(cycles_to(reach), 1)
+        periods = times[1:count + 1] - times[:count]
+        margin = self._margin(float(periods.max()), clock.rate)
         if count > 1:
-            periods = times[1:count + 1] - times[:count]
             if not segment.closed:
-                margin = self._margin(float(periods.max()), clock.rate)
                 count = cycles_to(min(reach, last - margin))
-            short = periods <= max(item.shortest(clock.rate) for item in self.shafts.values())
-            if short.any():  # a cycle that a shaft refuses is taken alone
-                count = min(count, int(short.argmax()))
-        return max(count, 1)
+            shortest = max(item.shortest(clock.rate) for item in self.shafts.values())
+            if periods.min() <= shortest:  # a cycle that a shaft refuses is taken alone
+                count = min(count, int((periods <= shortest).argmax()))
+        return max(count, 1), margin
 
     def _margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s needs on either side, for any shaft."""
@@ -421,7 +424,7 @@ class StreamingAverager:
                         f'{timeline.buffer_seconds:g} s: raise it)')
         return ''
 
-    def _hand_over(self, segment: Segment, count: int, stop: int) -> None:
+    def _hand_over(self, segment: Segment, count: int, margin: int, stop: int) -> None:
         """Average the next `count` cycles, of a run that ends before pulse `stop`."""
         begin = max(self._run, self._next - self._law.before, 0)
         stop = min(stop, self._next + count + 1 + self._law.after_first)
@@ -430,8 +433,6 @@ class StreamingAverager:
         low, high = (segment.position(float(pulses[i])) for i in (first, first + count))
         self.timeline.counts.samples_dropped += segment.use(low, high)
         failed, clock = '', segment.clock
-        edges = pulses[first:first + count + 1]
-        margin = self._margin(float((edges[1:] - edges[:-1]).max()), clock.rate)
         self._lead = 1.5 * margin / clock.rate
         cycles = CycleSamples.cut(
             segment.samples, start_time=clock.time, rate=clock.rate, pulses=pulses, first=first,

@@ -120,10 +120,17 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
     cubic [0.998 0.939]
     spline [1.    0.986]
     """
-    half = _HALF_WIDTH[_known(method)]
-    x, step = np.linspace(-half, half, 1024 * half + 1, retstep=True)
+    x, kernel = _steps_of_kernel(_known(method))
     phase = 2.0 * np.pi * np.multiply.outer(np.asarray(frequency, dtype=np.float64), x)
-    return np.asarray(np.cos(phase) @ _kernel(method, x, half) * step)
+    return np.asarray(np.cos(phase) @ kernel)
+
+
+@lru_cache(maxsize=8)
+def _steps_of_kernel(method: str) -> tuple[FloatArray, FloatArray]:
+    """Return places in a kernel, and its values there times their distance."""
+    half = _HALF_WIDTH[method]
+    x, step = np.linspace(-half, half, 1024 * half + 1, retstep=True)
+    return x, _kernel(method, x, half) * step
 
 
 def impulse_response(places: FloatArray) -> FloatArray:

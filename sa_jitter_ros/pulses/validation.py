@@ -215,13 +215,12 @@ class PulseValidator:
             pulses = pulses[finite]
         pulses -= self._path_delay
         while pulses.size:
-            ahead = 0
+            piece, ahead = pulses[:1 if self._held else _PIECE].tolist(), 0
             if not self._held:
-                back = pulses < np.concatenate(((self._judge.last,), pulses[:-1]))
-                ahead = min(int(back.argmax()) if back.any() else pulses.size, _PIECE)
-                self._judge.take(pulses[:ahead].tolist())
-            if ahead < min(pulses.size, _PIECE):
-                self._take(float(pulses[ahead]))
+                ahead = _in_order(self._judge.last, piece)
+                self._judge.take(piece[:ahead])
+            if ahead < len(piece):
+                self._take(piece[ahead])
                 ahead += 1
             pulses = pulses[ahead:]
         return self._sink.take()
@@ -274,6 +273,14 @@ class PulseValidator:
             self._sink.restart()
             held, self._held = self._held, []
             self._judge.take(held)
+
+
+def _in_order(last: float, times: list[float]) -> int:
+    """Return how many times do not run back, from the `last` one before them on."""
+    every = [last, *times]
+    if every == sorted(every):
+        return len(times)
+    return next(k for k, time in enumerate(times) if time < every[k])
 
 
 def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
