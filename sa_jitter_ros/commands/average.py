@@ -23,7 +23,7 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, Parser, read_options, show)
+    add_fleet_options, add_recording_options, few_collections, Parser, read_options, show)
 from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
@@ -101,6 +101,7 @@ def tell(options: argparse.Namespace, rows: list[Row]) -> int:
                 f'written: {options.output}')
 
 
+@few_collections()
 def main(args: Sequence[str] | None = None) -> int:
     """Average recordings; return 0, or 2 after one line if none could be averaged."""
     options = make_parser().parse_args(args)

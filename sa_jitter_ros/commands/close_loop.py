@@ -26,8 +26,8 @@ from pathlib import Path
 import sys
 
 from sa_jitter_ros.commands.command_line import (
-    add_fleet_options, add_recording_options, failure, Parser, plain_warnings, require_writable,
-    show)
+    add_fleet_options, add_recording_options, failure, few_collections, Parser, plain_warnings,
+    require_writable, show)
 from sa_jitter_ros.commands.progress import Progress
 from sa_jitter_ros.errors import SaJitterError
 
@@ -49,6 +49,7 @@ def make_parser() -> Parser:
     return parser
 
 
+@few_collections()
 def main(args: Sequence[str] | None = None) -> int:
     """Close the loop off line; return the exit status."""
     options = make_parser().parse_args(args)

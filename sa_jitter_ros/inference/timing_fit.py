@@ -19,6 +19,7 @@ is smooth, of the declared jitter, of the noise of the recovery, and of random e
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+import math
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ _LOW, _HIGH = -16.0, 16.0
 
 def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
     """Return a density of motion that is free at some frequencies of a trigger cycle."""
-    knots = np.log(np.geomspace(lowest, 0.5, _KNOTS))
+    knots = np.linspace(math.log(lowest), math.log(0.5), _KNOTS)
     place = np.log(frequency)
     level = np.interp(place, knots, parameters[:_KNOTS])
     level = np.where(frequency > 0.5, parameters[_KNOTS - 1] - np.exp(parameters[_KNOTS]) * (

@@ -26,7 +26,7 @@ from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import (
-    AFTER, BEFORE, legend_above, MEASURED, PANEL_HEIGHT, panels, WIDTH, with_effects)
+    add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
 
 Array = NDArray[Any]
 
@@ -34,6 +34,7 @@ _FEWEST_CYCLES = 3
 _MOST_PANELS = 3
 _POINTS = 200
 _BAND = 1.96
+_COMPRESSION = 1  # files are a tenth larger than by the default, 6, in half the time
 _SPREAD = 0.6  # share of the distance between orders over which the lines of one are spread
 
 
@@ -49,10 +50,11 @@ class Illustration:
     def png(self) -> bytes:
         """Return the figure as PNG."""
         buffer = io.BytesIO()
-        # What `savefig` does, without drawing everything twice for its layout.
+        arrange(self.figure)
+        # What `savefig` does, without drawing everything twice.
         self.figure.set_dpi(144)
         canvas: Any = FigureCanvasAgg(self.figure)
-        canvas.print_png(buffer)
+        canvas.print_png(buffer, pil_kwargs={'compress_level': _COMPRESSION})
         return buffer.getvalue()
 
 
@@ -121,8 +123,7 @@ def _residual_figure(trace: Trace) -> Figure:
     position, orders = _positions(trace)
     versions = _versions(trace)
     held_out = list(trace.held_out)
-    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * (1 + len(versions))), layout='constrained')
-    axes = figure.subplots(1 + len(versions), 1, sharex=True)
+    figure, axes = panels(1 + len(versions), one_axis=True)
     observed = trace.attenuation[held_out]
     axes[0].errorbar(position, observed.mean(axis=0), yerr=observed.std(axis=0), fmt='o',
                      color=MEASURED, markersize=4, capsize=2,
@@ -131,7 +132,7 @@ def _residual_figure(trace: Trace) -> Figure:
         axes[0].plot(position, expected.attenuation[held_out].mean(axis=0), '_', color=colour,
                      markersize=12, markeredgewidth=2, label=f'predicted, {label}')
     axes[0].set_ylabel('attenuation\n(1: no loss)')
-    legend_above(axes[0])
+    add_legend(axes[0])
     for row, (label, colour, _, residual) in zip(axes[1:], versions):
         half = _BAND * residual.standard_error
         row.bar(position, 2.0 * half, bottom=-half, color='0.85', label='95 % band',
@@ -141,8 +142,8 @@ def _residual_figure(trace: Trace) -> Figure:
         row.axhline(0.0, color='0.4', linewidth=0.8)
         row.use_sticky_edges = False
         row.margins(y=0.08)
-        row.set_ylabel('observed minus predicted\nattenuation')
-        legend_above(row)
+        row.set_ylabel('observed minus predicted')
+        add_legend(row)
     step = max(1, orders.size // 30)
     axes[-1].set_xticks(np.arange(orders.size)[::step], [f'{g:g}' for g in orders[::step]],
                         rotation=0 if orders.size <= 20 else 90)
@@ -169,7 +170,7 @@ def _distribution_figure(trace: Trace) -> Figure:
             one.plot(x, expected.mean_cdf(trace.held_out, line, x), color=colour, label=label)
         one.set(title=f'order {order:g}, {channel}', xlabel='amplitude / mean level',
                 ylabel='cumulative share')
-        one.legend(fontsize='small')
+        add_legend(one)
     _probability_panel(trace, axes[-1])
     return figure
 
@@ -182,7 +183,7 @@ def _probability_panel(trace: Trace, axes: Axes) -> None:
     axes.plot((0.0, 1.0), (0.0, 1.0), color='0.4', linewidth=0.8, linestyle='--', label='ideal')
     axes.set(title='all lines', xlabel='predicted probability',
              ylabel='cumulative share')
-    axes.legend(fontsize='small')
+    add_legend(axes)
 
 
 def _most_telling(trace: Trace) -> list[int]:

@@ -14,10 +14,12 @@ from collections.abc import Sequence
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
-WIDTH, PANEL_HEIGHT = 5.2, 3.1  # inches: what stands in 10 points is 10 pixels on a phone
+# Inches: what stands in 10 points is 10 pixels on a phone.
+WIDTH, LEFT, RIGHT, HEIGHT = 5.2, 1.0, 0.12, 2.0  # of a figure, beside its panels, of a panel
+_TITLE, _LABELS, _TURNED, _ROW, _GAP = 0.3, 0.5, 0.35, 0.18, 0.12
+_LONG = 28  # letters of a label beside which no second one has room
 
 
 def with_effects(names: Sequence[str]) -> str:
@@ -25,22 +27,54 @@ def with_effects(names: Sequence[str]) -> str:
     return f'with {names[0]}' if len(names) == 1 else f'with {len(names)} effects'
 
 
-def panels(count: int) -> tuple[Figure, list[Axes]]:
-    """Return a figure with `count` panels one below the other, to be read on a phone, too."""
-    figure = Figure(figsize=(WIDTH, PANEL_HEIGHT * count),
-                    layout=ConstrainedLayoutEngine(h_pad=0.12))
-    axes = list(figure.subplots(count, 1, squeeze=False).ravel())
+def panels(count: int, *, one_axis: bool = False) -> tuple[Figure, list[Axes]]:
+    """
+    Return a figure with `count` panels one below the other, to be read on a phone, too.
+
+    With one axis it is labelled at the last panel.
+    """
+    figure = Figure(figsize=(WIDTH, HEIGHT * count))
+    axes = list(figure.subplots(count, 1, squeeze=False, sharex=one_axis).ravel())
     for one in axes:
         one.grid(alpha=0.3)
     return figure, axes
 
 
-def legend_below(axes: Axes) -> None:
-    """Add the legend below a panel, where it does not hide data."""
-    axes.legend(fontsize='small', loc='upper center', bbox_to_anchor=(0.5, -0.2), ncols=2,
-                frameon=False)
+def add_legend(panel: Axes) -> None:
+    """Add the legend where it hides no data: below a panel, above one without a title."""
+    below = bool(panel.get_title())
+    panel.legend(fontsize='small', ncols=_columns(panel.get_legend_handles_labels()[1]),
+                 loc='upper center' if below else 'lower left',
+                 bbox_to_anchor=(0.5, -_LABELS / HEIGHT) if below else (0.0, 1.0),
+                 borderaxespad=0.0, frameon=False)
 
 
-def legend_above(axes: Axes) -> None:
-    """Add the legend above a panel that has no title."""
-    axes.legend(fontsize='small', loc='lower left', bbox_to_anchor=(0.0, 1.0), frameon=False)
+def arrange(figure: Figure) -> None:
+    """
+    Give all panels the same size, and make room for what stands around them now.
+
+    The layouts of matplotlib measure all texts for that, which takes as long as to draw them.
+    """
+    rooms = [_room(panel, panel is figure.axes[-1]) for panel in figure.axes]
+    height = top = sum(above + HEIGHT + below for above, below in rooms)
+    figure.set_size_inches(WIDTH, height)
+    for panel, (above, below) in zip(figure.axes, rooms):
+        top -= above + HEIGHT
+        panel.set_position((LEFT / WIDTH, top / height, 1.0 - (LEFT + RIGHT) / WIDTH,
+                            HEIGHT / height))
+        top -= below
+
+
+def _room(panel: Axes, last: bool) -> tuple[float, float]:
+    """Return the room above and below a panel in inches."""
+    legend, title = panel.get_legend(), bool(panel.get_title())
+    labels = [text.get_text() for text in legend.get_texts()] if legend else []
+    rows = _ROW * -(-len(labels) // _columns(labels))
+    below = _LABELS if last or panel.get_xlabel() else 0.0
+    if any(label.get_rotation() for label in panel.get_xticklabels()):
+        below += _TURNED
+    return (_GAP + _TITLE, below + rows) if title else (_GAP + rows, below)
+
+
+def _columns(labels: Sequence[str]) -> int:
+    return 1 if max(map(len, labels), default=0) > _LONG else 2
