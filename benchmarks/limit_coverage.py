@@ -21,10 +21,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.effects.timing import Setting
+from sa_jitter_ros.effects.timing import Setting, SOURCE
 from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing
-from sa_jitter_ros.inference.timing_data import Stretch
+from sa_jitter_ros.inference.timing_data import steering, Stretch
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.signal import lfilter
 
@@ -77,9 +77,10 @@ def machine(seed: int | Sequence[int], *, count: int = _COUNT, scale: float = 1.
     errors += shocks * UNIT * lfilter([1.0], [1.0, -0.7], rng.uniform(size=count) < 0.03)
     errors += hum * UNIT * np.cos(2.0 * np.pi * 0.1371 * index)
     times = motion + errors
-    source = wander * UNIT * np.convolve(rng.standard_normal(count + 16), np.hanning(17) / np.sqrt(
-        np.sum(np.hanning(17) ** 2)), 'valid')
-    late = errors - source + skew * (motion - motion[0])
+    shape = np.hanning(17) / np.sqrt(np.sum(np.hanning(17) ** 2))
+    source = wander * UNIT * recovered_source(np.convolve(
+        rng.standard_normal(count + 16), shape, 'valid'))
+    late = errors + source[0] + skew * (motion - motion[0])
     late = late + delay * (PERIOD / np.gradient(motion) - 1.0)
     wrong, bends = recovery_noise(rng, count)
     late = late + noise * UNIT * wrong
@@ -87,8 +88,16 @@ def machine(seed: int | Sequence[int], *, count: int = _COUNT, scale: float = 1.
     bends = noise * UNIT * bends
     setting = Setting(MODEL, UNIT, index, times, times - late)
     return Stretch(setting, np.ones(count, np.bool_), late, noise * UNIT, np.inf,
-                   bends[:-1] + np.gradient(np.gradient(motion))[:-1] / 2.0, float(np.std(bends)),
-                   np.inf)
+                   (bends + source[1] + np.gradient(np.gradient(motion)) / 2.0)[:-1],
+                   float(np.std(bends)), np.inf)
+
+
+def recovered_source(source: Array) -> Array:
+    """Return the errors and bends (2, pulse) that a fit makes of a source that moves in time."""
+    even = np.concatenate([source, source[::-1]])  # without a step where it begins again
+    frequency = np.fft.rfftfreq(even.size)
+    seen = steering(SOURCE, frequency, frequency)[:, 1:3].T * np.fft.rfft(even)
+    return np.fft.irfft(seen, even.size)[:, :source.size]
 
 
 def recovery_noise(rng: np.random.Generator, count: int) -> Array:

@@ -226,29 +226,29 @@ def test_one_index_far_ahead_does_not_leave_later_pulses_in_the_past():
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
 def test_a_sample_that_no_channel_has_is_a_gap(bad):
     samples = np.tile(np.arange(100.0), (3, 1))
-    samples[:, [0, 40, 41, 99]] = bad
+    samples[:, [5, 40, 41, 99]] = bad
     timeline = timeline_of(SampleBlock(samples, 0.0, RATE, 0), block(100, 50, channels=3))
-    assert held(timeline) == [(0, 1.0, 39.0), (0, 42.0, 98.0), (0, 100.0, 149.0)]
+    assert held(timeline) == [(0, 0.0, 4.0), (0, 6.0, 39.0), (0, 42.0, 98.0), (0, 100.0, 149.0)]
     np.testing.assert_allclose([item.start_time for item in timeline.segments],
-                               [0.001, 0.042, 0.1])
+                               [0.0, 0.006, 0.042, 0.1])
     assert timeline.counts.non_finite == 4 == timeline.counts.samples_dropped
-    assert timeline.messages == ['4 samples from index 0 on are NaN or infinite in all channels: '
+    assert timeline.messages == ['4 samples from index 5 on are NaN or infinite in all channels: '
                                  'their cycles are discarded']
 
 
 @pytest.mark.parametrize('bad', [math.nan, math.inf, -math.inf])
 def test_a_sample_that_one_channel_lacks_is_none_of_the_others(bad):
     samples = np.tile(np.arange(100.0), (3, 1))
-    samples[1, [0, 40, 41, 99]] = bad
+    samples[1, [7, 40, 41, 99]] = bad
     following = SampleBlock(samples, 0.1, RATE, 100)
     timeline = timeline_of(SampleBlock(samples, 0.0, RATE, 0), following)
     segment, = timeline.segments
     assert segment.lacks_channels
-    assert np.flatnonzero(np.isnan(segment.samples[:100, 1])).tolist() == [0, 40, 41, 99]
+    assert np.flatnonzero(np.isnan(segment.samples[:100, 1])).tolist() == [7, 40, 41, 99]
     assert np.isfinite(segment.samples[:, [0, 2]]).all()
     assert timeline.counts.non_finite == 8
     assert timeline.counts.samples_dropped == 0
-    assert timeline.messages == ['samples from index 0 on are NaN or infinite in channels [1]: '
+    assert timeline.messages == ['samples from index 7 on are NaN or infinite in channels [1]: '
                                  'they have no average there']
 
 

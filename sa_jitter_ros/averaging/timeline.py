@@ -454,9 +454,12 @@ class VibrationTimeline:
         bad = int(np.count_nonzero(~some))
         self.counts.samples_dropped += bad
         if bad:
-            self.messages.append(f'{bad} samples from index {index} on are NaN or infinite in all '
+            first = index + int(some.argmin())
+            self.messages.append(f'{bad} samples from index {first} on are NaN or infinite in all '
                                  'channels: their cycles are discarded')
-        self._name_channels(np.flatnonzero(~every[:, some].all(axis=1)).tolist(), index)
+        lacking = some & ~every
+        self._name_channels(np.flatnonzero(lacking.any(axis=1)).tolist(),
+                            index + int(lacking.any(axis=0).argmax()))
         kept = np.where(every, samples, np.nan)
         spans = finite_spans(samples)
         if not spans or spans[0][0] > 0:
