@@ -11,6 +11,7 @@
 """Blocks of consecutive samples, as recordings, messages and the averager exchange them."""
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,7 @@ def unresolved(time: float, sample_rate: float) -> str:
     >>> unresolved(1e12, 1e4).partition(':')[0]
     'time 1e+12 s is so large that a float64 rounds it to 1.2 samples'
     """
-    step = float(np.spacing(abs(time))) * sample_rate
+    step = math.ulp(time) * sample_rate
     if abs(time) <= _ABSOLUTE or step <= _RESOLUTION:
         return ''
     return (f'time {time:.6g} s is so large that a float64 rounds it to {step:.2g} samples: give '

@@ -26,6 +26,7 @@ ComplexArray = NDArray[np.complex128]
 
 # The orders that leak contain leakage of each other: iterations until this is negligible.
 _PASSES = 6
+_ORTHOGONAL = 1e-12  # leakage that is rounding: of whole orders over whole fundamental cycles
 # Lines of the average next to an order that show the noise: beyond the main lobe of the window.
 _LOBE, _AROUND = 3, 150
 _OUTLIER = 3.0  # times the noise
@@ -63,6 +64,8 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
     0.0
     """
     share = _leaking(orders, length)
+    if np.abs(share).max(initial=0.0) < _ORTHOGONAL:
+        return cycles
     turn = np.exp(2j * np.pi * np.multiply.outer(angles, orders))[:, None, :]
     clean = cycles
     for _ in range(_PASSES):
