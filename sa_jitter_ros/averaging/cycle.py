@@ -213,7 +213,7 @@ def _join(runs: Sequence[CycleSamples]) -> CycleSamples:
 def _joined_samples(runs: Sequence[CycleSamples]) -> FloatArray:
     """Return the samples of runs that continue, without a copy where they are of one array."""
     first, last = runs[0].samples, runs[-1].samples
-    if first.base is not None and all(
+    if first.base is not None and first.strides[0] and all(
             run.samples.base is first.base and run.samples.strides == first.strides
             for run in runs):
         begin, end = (item.__array_interface__['data'][0] for item in (first, last))
@@ -552,7 +552,6 @@ def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatAr
     return whole + total // divisor, (total % divisor) / divisor
 
 
-@lru_cache(maxsize=64)
 @lru_cache(maxsize=64)
 def on_grid(points: int, cycles: float) -> bool:
     """Whether the points of the waveform are at the same angles of every trigger cycle."""

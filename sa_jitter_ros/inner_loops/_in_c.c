@@ -141,8 +141,8 @@ INLINE int sums(const double *samples, const Py_ssize_t channels, Py_ssize_t las
                 const struct places *at, const double *restrict table, double *restrict room,
                 const Py_ssize_t order, const Py_ssize_t half, double *restrict values)
 {
-    typedef int64_t places __attribute__((vector_size(64)));
-    const places turned = {7, 6, 5, 4, 3, 2, 1, 0};
+    typedef int64_t lanes __attribute__((vector_size(64)));
+    const lanes turned = {7, 6, 5, 4, 3, 2, 1, 0};
     const Py_ssize_t width = (half + 7) / 8 * 8;
     const double *weights = room + width - half;
     const struct places p = *at;
