@@ -128,7 +128,7 @@ def one_line(error: Exception) -> str:
 def _check_structure(text: str) -> None:
     """Raise ParameterError for a text that may need unlimited time or memory."""
     depth = 0
-    for event in yaml.parse(text, _Loader):
+    for event in _events(text):
         line = event.start_mark.line + 1
         if isinstance(event, yaml.AliasEvent):
             raise ParameterError(f'line {line}: YAML aliases are not supported: write the value '
@@ -139,6 +139,17 @@ def _check_structure(text: str) -> None:
             depth -= 1
         if depth > _DEEPEST:
             raise ParameterError(f'line {line}: nested deeper than {_DEEPEST} levels')
+
+
+def _events(text: str) -> Iterator[yaml.Event]:
+    """Iterate over a text; libyaml reads ahead and may be the first to find it too deep."""
+    try:
+        yield from yaml.parse(text, _Loader)
+    except yaml.MarkedYAMLError as error:
+        if error.problem_mark is None or 'nesting depth' not in str(error.problem):
+            raise
+        raise ParameterError(f'line {error.problem_mark.line + 1}: nested deeper than {_DEEPEST} '
+                             'levels') from error
 
 
 def _sections(content: Any, name: str) -> Iterator[tuple[str, Mapping[Any, Any]]]:

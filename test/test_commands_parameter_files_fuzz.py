@@ -93,9 +93,7 @@ HOSTILE = {
     'merge keys': ('a: &a {x: 1}\nb: {<<: [*a, *a]}\n', 'aliases are not supported'),
     'endless': ('jitter_predictor:\n  ros__parameters: &a\n    x: *a\n',
                 'aliases are not supported'),
-    # libyaml reads ahead in lists, and has a limit of its own since PyYAML 6.0.4.
-    'deep lists': (HEAD + 'orders: ' + '[' * 100_000,
-                   'nested deeper than 20 levels|exceeded maximum nesting depth'),
+    'deep lists': (HEAD + 'orders: ' + '[' * 100_000, 'nested deeper than 20 levels'),
     'deep maps': (HEAD + 'a: ' + '{a: ' * 300 + '1' + '}' * 300, 'nested deeper than 20 levels'),
     'object': (HEAD + 'orders: !!python/object/apply:os.system [touch ran]', 'constructor'),
     'module': (HEAD + 'orders: !!python/module:os', 'constructor'),
