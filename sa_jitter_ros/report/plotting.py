@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
 # Inches: what stands in 10 points is 10 pixels on a phone.
-WIDTH, LEFT, RIGHT, HEIGHT = 5.2, 1.0, 0.12, 2.0  # of a figure, beside its panels, of a panel
+_WIDTH, _LEFT, _RIGHT, _HEIGHT = 5.2, 1.0, 0.12, 2.0  # of a figure, beside its panels, of a panel
 _TITLE, _LABELS, _TURNED, _ROW, _GAP = 0.3, 0.5, 0.35, 0.18, 0.12
 _LONG = 28  # letters of a label beside which no second one has room
 
@@ -33,7 +33,7 @@ def panels(count: int, *, one_axis: bool = False) -> tuple[Figure, list[Axes]]:
 
     With one axis it is labelled at the last panel.
     """
-    figure = Figure(figsize=(WIDTH, HEIGHT * count))
+    figure = Figure(figsize=(_WIDTH, _HEIGHT * count))
     axes = list(figure.subplots(count, 1, squeeze=False, sharex=one_axis).ravel())
     for one in axes:
         one.grid(alpha=0.3)
@@ -45,7 +45,7 @@ def add_legend(panel: Axes) -> None:
     below = bool(panel.get_title())
     panel.legend(fontsize='small', ncols=_columns(panel.get_legend_handles_labels()[1]),
                  loc='upper center' if below else 'lower left',
-                 bbox_to_anchor=(0.5, -_LABELS / HEIGHT) if below else (0.0, 1.0),
+                 bbox_to_anchor=(0.5, -_LABELS / _HEIGHT) if below else (0.0, 1.0),
                  borderaxespad=0.0, frameon=False)
 
 
@@ -56,12 +56,12 @@ def arrange(figure: Figure) -> None:
     The layouts of matplotlib measure all texts for that, which takes as long as to draw them.
     """
     rooms = [_room(panel, panel is figure.axes[-1]) for panel in figure.axes]
-    height = top = sum(above + HEIGHT + below for above, below in rooms)
-    figure.set_size_inches(WIDTH, height)
+    height = top = sum(above + _HEIGHT + below for above, below in rooms)
+    figure.set_size_inches(_WIDTH, height)
     for panel, (above, below) in zip(figure.axes, rooms):
-        top -= above + HEIGHT
-        panel.set_position((LEFT / WIDTH, top / height, 1.0 - (LEFT + RIGHT) / WIDTH,
-                            HEIGHT / height))
+        top -= above + _HEIGHT
+        panel.set_position((_LEFT / _WIDTH, top / height, 1.0 - (_LEFT + _RIGHT) / _WIDTH,
+                            _HEIGHT / height))
         top -= below
 
 
