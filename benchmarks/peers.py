@@ -125,7 +125,7 @@ def blocks(record: Record, seconds: float = 0.05) -> Iterator[tuple[SampleBlock,
     sent = 0
     for start in range(0, record.samples.shape[1], length):
         samples = record.samples[:, start:start + length]
-        end = int(np.searchsorted(record.pulses, (start + samples.shape[1]) / record.rate))
+        end = int(record.pulses.searchsorted((start + samples.shape[1]) / record.rate))
         yield (SampleBlock(samples, start / record.rate, record.rate, start),
                record.pulses[sent:end])
         sent = end

@@ -241,16 +241,13 @@ class StreamingAverager:
         times = triggers.times
         if not times.size:
             return
-        items, epochs = np.zeros(times.size, TRIGGER), self._epochs(triggers)
-        items['time'], items['epoch'], items['mark'] = times, epochs, triggers.mark
-        if triggers.starts_run.any() or epochs[-1] != self._pulse_epoch:
-            # Behind a gap of unknown length the count begins at 0 again.
-            changed = epochs != np.concatenate(((self._pulse_epoch,), epochs[:-1]))
-            skipped = triggers.count - np.concatenate(((self._last_count,), triggers.count[:-1]))
-            items['starts_run'] = triggers.starts_run | changed
-            items['skipped'] = np.where(changed | triggers.restarted, 0, np.maximum(skipped, 0))
+        items = np.zeros(times.size, TRIGGER)
+        items['time'], items['mark'] = times, triggers.mark
+        if np.count_nonzero(triggers.starts_run) or self.timeline.epoch > self._pulse_epoch:
+            self._begin_runs(items, triggers)
+        else:
+            items['epoch'] = self._pulse_epoch
         self._last_count = int(triggers.count[-1])
-        self._pulse_epoch = int(epochs[-1])
         elapsed = items['elapsed']
         if len(self._triggers):
             last = float(self._triggers.items['elapsed'][-1])
@@ -260,6 +257,17 @@ class StreamingAverager:
         elapsed[1:] = elapsed[0] + np.maximum(times[1:] - times[:-1], 0.0).cumsum()
         self._last_time = float(times[-1])
         self._triggers.append(items)
+
+    def _begin_runs(self, items: NDArray[Any], triggers: TriggerPulses) -> None:
+        """Set the epochs of pulses, where runs begin, and what was discarded before."""
+        epochs = self._epochs(triggers)
+        # Behind a gap of unknown length the count begins at 0 again.
+        changed = epochs != np.concatenate(((self._pulse_epoch,), epochs[:-1]))
+        skipped = triggers.count - np.concatenate(((self._last_count,), triggers.count[:-1]))
+        items['epoch'] = epochs
+        items['starts_run'] = triggers.starts_run | changed
+        items['skipped'] = np.where(changed | triggers.restarted, 0, np.maximum(skipped, 0))
+        self._pulse_epoch = int(epochs[-1])
 
     def _epochs(self, triggers: TriggerPulses) -> NDArray[np.int64]:
         """Return the epoch of each pulse."""
@@ -342,7 +350,7 @@ class StreamingAverager:
         """Return the number of the pulse behind the last one of the next cycle's run."""
         items = self._triggers.items
         begins = items['starts_run'][self._next + 1:]
-        number = int(np.argmax(begins)) if len(begins) else 0
+        number = int(begins.argmax()) if len(begins) else 0
         return self._next + 1 + number if len(begins) and begins[number] else len(items)
 
     def _ready(self, stop: int) -> int:
@@ -362,27 +370,27 @@ class StreamingAverager:
         """
         clock, samples = segment.clock, segment.samples
         offset = clock.index - segment.index
-        times = times[:min(item.room for item in self.shafts.values()) + 1] - clock.time
+        times = times[:min([item.room for item in self.shafts.values()]) + 1] - clock.time
 
         def cycles_to(position: float) -> int:
             return int(times.searchsorted((position - offset) / clock.rate, 'right')) - 1
 
         last = len(samples) - (1.0 - 1e-6 if segment.closed else 1.0)
-        reach = min(last, times[0] * clock.rate + offset + 4 * TOGETHER / samples.shape[1])
+        reach = min(last, float(times[0]) * clock.rate + offset + 4 * TOGETHER / samples.shape[1])
         count = max(cycles_to(reach), 1)
-        periods = times[1:count + 1] - times[:count]
-        margin = self._margin(float(periods.max()), clock.rate)
+        periods = (times[1:count + 1] - times[:count]).tolist()
+        margin = self._margin(max(periods), clock.rate)
         if count > 1:
             if not segment.closed:
                 count = cycles_to(min(reach, last - margin))
-            shortest = max(item.shortest(clock.rate) for item in self.shafts.values())
-            if periods.min() <= shortest:  # a cycle that a shaft refuses is taken alone
-                count = min(count, int((periods <= shortest).argmax()))
+            shortest = max([item.shortest(clock.rate) for item in self.shafts.values()])
+            if min(periods) <= shortest:  # a cycle that a shaft refuses is taken alone
+                count = min(count, next(k for k, item in enumerate(periods) if item <= shortest))
         return max(count, 1), margin
 
     def _margin(self, period: float, rate: float) -> int:
         """Return the samples that a cycle of `period` s needs on either side, for any shaft."""
-        return max(item.margin(period, rate) for item in self.shafts.values())
+        return max([item.margin(period, rate) for item in self.shafts.values()])
 
     def _uncovered(self, stop: int) -> int:
         """Return the number of cycles, from the next one on, whose vibration will not come."""

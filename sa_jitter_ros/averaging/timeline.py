@@ -280,7 +280,7 @@ class VibrationTimeline:
         for segment in self.segments:
             if segment.epoch < epoch:
                 self.counts.samples_dropped += segment.trim(segment.end_index)
-            elif segment.epoch == epoch and np.isfinite(before):
+            elif segment.epoch == epoch and math.isfinite(before):
                 self.counts.samples_dropped += segment.trim(
                     segment.index + math.floor(segment.position(before)))
         self._tidy()
@@ -337,7 +337,7 @@ class VibrationTimeline:
         if samples.ndim != 2 or samples.size == 0:
             raise SignalError(f'block of shape {samples.shape}: send channel x sample, at least '
                               'one of each')
-        if not (np.isfinite(block.start_time) and np.isfinite(block.sample_rate)
+        if not (math.isfinite(block.start_time) and math.isfinite(block.sample_rate)
                 and block.sample_rate > 0.0):
             raise SignalError(f'block at {block.start_time} s with {block.sample_rate} Hz: send a '
                               'finite time and a positive rate')

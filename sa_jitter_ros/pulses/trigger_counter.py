@@ -163,7 +163,7 @@ class TriggerCounter:
         return TriggerPulses.joined(found)
 
     def _count(self) -> None:
-        numbers = np.cumsum(self._steps)
+        numbers = np.array(self._steps).cumsum()
         targets = np.arange(self._target, numbers[-1] + 1, self._per_trigger)
         if targets.size:
             found = self._trigger_pulses(targets, numbers)
@@ -185,18 +185,18 @@ class TriggerCounter:
         self._found.append(found)
 
     def _trigger_pulses(self, targets: IntArray, numbers: IntArray) -> TriggerPulses:
-        doubtful = np.zeros(targets.size + 1, np.bool_)
+        starts, restarts, doubtful = np.zeros((3, targets.size + 1), np.bool_)
         if self._dropped:
             doubtful[np.searchsorted(targets, numbers[self._dropped], side='right')] = True
         doubtful[0] |= self._doubtful
         self._doubtful = bool(doubtful[-1])
-        starts, restarts = np.zeros((2, targets.size), np.bool_)
-        marks = np.full(targets.size, -1)
-        if self._numbering is not None:
+        if self._numbering is None:
+            marks = np.full(targets.size, -1)
+        else:
             marks = targets % self._teeth + self._numbering * self._teeth
         at = numbers.searchsorted(targets)
         times, measured = np.array(self._times)[at], numbers[at] == targets
-        if not measured.all():  # missing teeth are interpolated between their neighbours
+        if np.count_nonzero(measured) < measured.size:  # missing teeth are interpolated between their neighbours
             times = np.interp(targets, numbers, self._times)
-        return TriggerPulses(times, starts, restarts, targets // self._per_trigger, measured,
-                             doubtful[:-1], marks)
+        return TriggerPulses(times, starts[:-1], restarts[:-1], targets // self._per_trigger,
+                             measured, doubtful[:-1], marks)

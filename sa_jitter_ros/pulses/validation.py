@@ -210,8 +210,8 @@ class PulseValidator:
                               'give real numbers, (n,)')
         pulses = given.astype(np.float64)
         finite = np.isfinite(pulses)
-        if not finite.all():
-            self._non_finite += int(np.count_nonzero(~finite))
+        if bad := finite.size - int(np.count_nonzero(finite)):
+            self._non_finite += bad
             pulses = pulses[finite]
         pulses -= self._path_delay
         while pulses.size:
