@@ -25,7 +25,7 @@ import warnings
 from sa_jitter_ros.errors import DataWarning, ParameterError
 from sa_jitter_ros.recordings.fields import fields_of
 
-_OBJECTS = 100_000  # new ones after which Python looks for garbage, as a rule 700
+_OBJECTS = 1_000_000  # new ones after which Python looks for garbage, as a rule 700
 # Keywords of `sa_jitter_ros.recordings.read`, and parameters of the recording player.
 _READ_OPTIONS = ('acquisition', 'sample_rate', 'vibration_channels', 'tach_channel', 'time_column')
 

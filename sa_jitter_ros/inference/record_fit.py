@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
 from sa_jitter_ros.pulses.resampling import interpolate
-from scipy.fft import next_fast_len
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 from scipy.special import gammaincc, gammainccinv
 
@@ -216,12 +216,12 @@ def _low_passed(samples: Array, rate: float, top: float) -> tuple[Array, float]:
     """Return the samples up to 1.15 `top` (Hz) at a rate that the interpolator reads exactly."""
     count = len(samples)
     padded = next_fast_len(count + 200, real=True)
-    spectrum = np.fft.rfft(samples - samples.mean(axis=0), padded, axis=0)
+    spectrum = rfft(samples - samples.mean(axis=0), padded, axis=0)
     spectrum[int(_EDGE * top / rate * padded):] = 0.0
     size = next_fast_len(min(round(padded * _SAMPLES * top / rate), padded), real=True)
     size = min(size, padded)
-    found = np.fft.irfft(spectrum[:size // 2 + 1], size, axis=0)
-    return found[:int(count * size / padded)] * (size / padded), rate * size / padded
+    found = irfft(spectrum[:size // 2 + 1], size, axis=0)[:int(count * size / padded)]
+    return np.ascontiguousarray(found * (size / padded)), rate * size / padded
 
 
 class _States:

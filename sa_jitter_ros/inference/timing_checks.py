@@ -241,8 +241,10 @@ def _filtered(values: Array, gain: Array, data: TimingData) -> Array:
 def _moments(values: Array) -> Array:
     """Return skewness and logarithm of kurtosis of each row."""
     z = values - values.mean(axis=-1, keepdims=True)
-    z = z / np.sqrt(np.mean(z**2, axis=-1, keepdims=True))
-    return np.array([np.mean(z**3, axis=-1), np.log(np.mean(z**4, axis=-1))])
+    square = z * z
+    power = square.mean(axis=-1)
+    return np.array([(square * z).mean(axis=-1) / power**1.5,
+                     np.log((square * square).mean(axis=-1) / power**2)])
 
 
 def _chance(value: float, draws: Array) -> float:

@@ -18,7 +18,7 @@ is smooth, of the declared jitter, of the noise of the recovery, and of random e
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 import math
 from typing import Any
 
@@ -44,12 +44,16 @@ _LOW, _HIGH = -16.0, 16.0
 
 def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
     """Return a density of motion that is free at some frequencies of a trigger cycle."""
-    knots = np.linspace(math.log(lowest), math.log(0.5), _KNOTS)
-    place = np.log(frequency)
+    knots, place = _knots(lowest), np.log(frequency)
     level = np.interp(place, knots, parameters[:_KNOTS])
     level = np.where(frequency > 0.5, parameters[_KNOTS - 1] - np.exp(parameters[_KNOTS]) * (
         place - knots[-1]), level)
     return np.asarray(np.exp(level) / (2.0 * np.pi * frequency) ** 4)
+
+
+@lru_cache(maxsize=16)
+def _knots(lowest: float) -> Array:
+    return np.linspace(math.log(lowest), math.log(0.5), _KNOTS)
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
+from scipy.fft import irfft, rfft
 from scipy.special import ndtr
 
 Array = NDArray[Any]
@@ -39,10 +40,10 @@ _DRAWN, _SEED, _PARTS = 4000, 11, 50
 def through(values: Array, gain: Array, data: TimingData) -> Array:
     """Return values (..., pulse) through a filter whose `gain` is given in bins of frequency."""
     count = values.shape[-1]
-    transform = np.fft.rfft(values, axis=-1) * np.interp(
+    transform = rfft(values) * np.interp(
         np.arange(count // 2 + 1) / count, data.frequency, gain)
     transform[..., 0] = 0.0
-    return np.asarray(np.fft.irfft(transform, count, axis=-1))
+    return np.asarray(irfft(transform, count))
 
 
 def errors_left(item: Stretch, unit: float, known: Array) -> Array:

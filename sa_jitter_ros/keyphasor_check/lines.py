@@ -25,6 +25,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.resampling import interpolate
+from scipy.fft import next_fast_len, rfft
 
 FloatArray = NDArray[np.float64]
 
@@ -119,13 +120,13 @@ def angle_spectrum(samples: FloatArray, start: float, rate: float, times: FloatA
     times, turned = times[:count], turned[:count]
     if times.size < 3 or turned[-1] - turned[0] < fewest:
         return None
-    points = int((times[-1] - times[0]) * rate)
+    points = next_fast_len(int((times[-1] - times[0]) * rate), real=True)
     angle = turned[0] + (turned[-1] - turned[0]) * np.arange(points) / points
     position = (np.interp(angle, turned, times) - start) * rate
     over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
     over_angle -= over_angle.mean(axis=0)
     window = np.hanning(points + 1)[:-1, None]
-    spectrum = np.abs(np.fft.rfft(over_angle * window, axis=0))[:int(0.42 * points)]
+    spectrum = np.abs(rfft(over_angle * window, axis=0))[:int(0.42 * points)]
     return spectrum, _background(spectrum), 1.0 / float(turned[-1] - turned[0])
 
 

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.inner_loops import room, weighted_sums
+from scipy.special import i0
 
 FloatArray = NDArray[np.float64]
 _Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
@@ -60,7 +61,7 @@ def _kernel(method: str, x: FloatArray, half: int) -> FloatArray:
             total += -6.0 * _SPLINE_POLE / (1.0 - _SPLINE_POLE**2) * _SPLINE_POLE ** abs(k) * b3
         return total
     window = np.sqrt(np.maximum(1.0 - (d / half) ** 2, 0.0))
-    taper: FloatArray = np.i0(_KAISER_BETA * window) / np.i0(_KAISER_BETA)
+    taper: FloatArray = i0(_KAISER_BETA * window) / i0(_KAISER_BETA)
     return np.where(d < half, np.sinc(x) * taper, 0.0)
 
 

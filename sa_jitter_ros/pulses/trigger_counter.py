@@ -196,7 +196,8 @@ class TriggerCounter:
             marks = targets % self._teeth + self._numbering * self._teeth
         at = numbers.searchsorted(targets)
         times, measured = np.array(self._times)[at], numbers[at] == targets
-        if np.count_nonzero(measured) < measured.size:  # missing teeth are interpolated between their neighbours
+        if np.count_nonzero(measured) < measured.size:
+            # Missing teeth are interpolated between their neighbours.
             times = np.interp(targets, numbers, self._times)
         return TriggerPulses(times, starts[:-1], restarts[:-1], targets // self._per_trigger,
                              measured, doubtful[:-1], marks)

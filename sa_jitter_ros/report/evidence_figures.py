@@ -110,7 +110,8 @@ def _distribution(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -
     top = max(np.abs(errors).max(), *(_MICRO * np.quantile(np.abs(item.draws), 0.999)
                                       for item in versions))
     edges = np.linspace(-top, top, 41).tolist()
-    axes.hist(errors, edges, density=True, color='0.8', label='recovered')
+    axes.hist(errors, edges, density=True, histtype='stepfilled', color='0.8',
+              label='recovered')
     for item in versions:
         axes.hist(_MICRO * item.draws, edges, density=True, histtype='step', color=item.colour,
                   label=item.label)
@@ -197,7 +198,7 @@ def _intervals(axes: Axes, evidence: Evidence) -> None:
     relative = intervals / np.median(intervals)
     # Very steady intervals differ by rounding only: too little to be divided into bins.
     ends = min(relative.min(), 1.0 - _FINEST), max(relative.max(), 1.0 + _FINEST)
-    axes.hist(relative, 60, range=ends, color='0.6')
+    axes.hist(relative, 60, range=ends, histtype='stepfilled', color='0.6')
     axes.set_yscale('log')
     axes.set_ylim(bottom=0.5)
     axes.set(title='pulse intervals', xlabel='interval / median interval', ylabel='number')
