@@ -18,6 +18,7 @@ import argparse
 from collections.abc import Callable
 from functools import partial
 import json
+from operator import itemgetter
 import os
 from pathlib import Path
 import resource
@@ -42,6 +43,7 @@ SPEED = 16.6  # Hz
 RATE = 10000.0  # Hz
 KEYPHASOR_RATE = 5000.0  # Hz
 CHANNELS = 4
+_RUNS = 5  # of `close_loop`, of which the least counts
 MODEL = f"""\
 jitter_predictor:
   ros__parameters:
@@ -128,7 +130,7 @@ def clock(count: int, rounds: int) -> float:
 
 
 def close_loop(megabytes: float) -> dict[str, Any]:
-    """Seconds that the command takes on a recording with an effect that is not declared."""
+    """Seconds that the command takes, at least, with an effect that is not declared."""
     samples = round(megabytes * 1e6 / 8 / CHANNELS)
     gearbox = Gearbox(
         mesh('shaft', 19, harmonics=(1.0, 0.5, 0.25), channel_gains=(1.0, 0.8, 0.6, 0.4), seed=1),
@@ -147,18 +149,24 @@ def close_loop(megabytes: float) -> dict[str, Any]:
                     if name != 'PYTHONDONTWRITEBYTECODE'}
         subprocess.run([sys.executable, '-c', 'import sa_jitter_ros.commands.loop_run, '
                         'sa_jitter_ros.report.html_report'], check=True, env=compiled)
-        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-        subprocess.run(
-            [sys.executable, '-c', 'from sa_jitter_ros.commands.close_loop import main; '
-             'raise SystemExit(main())', str(recording), '--declared', str(model), '--output',
-             str(Path(folder, 'report')), '--quiet'],
-            check=True, stdout=subprocess.DEVNULL, env=compiled)
-        after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - start
+        runs = [_run([
+            sys.executable, '-c', 'from sa_jitter_ros.commands.close_loop import main; '
+            'raise SystemExit(main())', str(recording), '--declared', str(model), '--output',
+            str(Path(folder, 'report')), '--quiet'], compiled)
+            for _ in range(_RUNS)]
         report = json.loads(Path(folder, 'report', 'report.json').read_text())
-        return {'megabytes': recording.stat().st_size / 1e6, 'wall': wall,
-                'cpu': after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime,
+        wall, cpu = min(runs, key=itemgetter(1))
+        return {'megabytes': recording.stat().st_size / 1e6, 'wall': wall, 'cpu': cpu,
                 'seconds': samples / RATE, 'channels': CHANNELS, 'verdict': report['verdict'],
                 'missing': [effect['name'] for effect in report['missing_effects']]}
+
+
+def _run(command: list[str], environment: dict[str, str]) -> tuple[float, float]:
+    """Run a command; return its seconds and those of CPU."""
+    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, env=environment)
+    after, wall = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic() - start
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def main() -> int:

@@ -155,13 +155,13 @@ def period(found: Mapping[str, Any]) -> float:
 
 def overwritten(found: Mapping[str, Any]) -> tuple[int, float]:
     """
-    Return how many published averages did not arrive, and the shortest silence (s) around one.
+    Return how many averages of the first shaft did not arrive, and the least silence (s) around.
 
     A silence is the longest time between two arrivals of those that have part in the period in
     which an average should have come.
     """
     sequence, end = np.array(found['sequence']), np.array(found['end'])
-    absent = np.setdiff1d(np.arange(found['published']), sequence)
+    absent = np.setdiff1d(np.arange(found['published'] // found.get('shafts', 1)), sequence)
     arrival = np.concatenate(([-np.inf], end + np.array(found['latency']), [np.inf]))
     due = np.interp(absent, sequence, end)
     silences = [np.diff(arrival[after - 1:until + 1]).max() for after, until in zip(
@@ -184,8 +184,8 @@ def section(found: Mapping[str, Any]) -> str:
         f'{found["seconds"] / 60.0:g} minutes at {found["channels"]} channels of {RATE / 1e3:g} '
         f'kHz ({8e-6 * found["channels"] * RATE:.0f} MB/s), {shafts} shaft{"s" * (shafts > 1)}, '
         f'{jitter} `correct_jitter`, {load}average {found["load"][1]}: '
-        f'{found["published"]:,} averages were published, at least {found["expected"]:,} were '
-        f'due; {absent:,} did not reach the watcher{silences}. '
+        f'{found["published"]:,} averages were published, at least {shafts * found["expected"]:,} '
+        f'were due; {absent:,} of the first shaft did not reach the watcher{silences}. '
         f'The latency '
         f'from the last pulse of an average to its arrival is {np.median(latency):.0f} ms in the '
         f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
@@ -224,7 +224,7 @@ def draw(found: Mapping[str, Any], file: Path) -> None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, ncols=3)
     above.set_title(f'{found["channels"]} channels at {RATE / 1e3:g} kHz, {len(found["end"]):,} '
-                    f'averages of {found["published"]:,}', fontsize=10)
+                    f'averages of {found["published"] // found.get("shafts", 1):,}', fontsize=10)
     figure.savefig(file, dpi=110)
 
 

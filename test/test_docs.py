@@ -486,7 +486,8 @@ def general_topics():
 @cache
 def diagnostic_keys():
     """Return the keys that the nodes show in /diagnostics."""
-    keys = {'<shaft>.corrections_refused', '<shaft>.refusal', 'channels', 'sample_rate'}
+    keys = {'<shaft>.corrections_refused', '<shaft>.refusal', 'channels', 'sample_rate',
+            'problems'}
     for name in NODES:
         with node(name) as made:
             made.update_counts()

@@ -228,6 +228,19 @@ def test_a_channel_that_shows_nothing_is_named(ros_graph, value, words):
     assert text == f'channel 1 of vibration: {words}, look at its sensor and cable'
 
 
+def test_the_status_names_some_problems_and_counts_the_rest(ros_graph):
+    b = AveragerBench(ros_graph, trigger_cycles=10)
+    b.play(MACHINE, 1.0, change=lambda number, block: [SampleBlock(
+        np.full((9, block.samples.shape[1]), 3.25), block.start_time, block.sample_rate,
+        block.index)])
+    b.diagnostics()
+    level, text, values = b.diagnostics()
+    assert level == WARN
+    channels = [f'channel {number} of vibration' for number in range(9)]
+    assert [item.split(':')[0] for item in text.split('; ')] == [*channels[:6], 'and 3 more']
+    assert [item.split(':')[0] for item in values['problems'].split('; ')] == channels
+
+
 def noise_of(rng):
     """Return a change of what is played: noise in place of the vibration."""
     return lambda number, block: [SampleBlock(

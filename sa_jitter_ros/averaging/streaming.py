@@ -244,7 +244,7 @@ class StreamingAverager:
         items = np.zeros(times.size, TRIGGER)
         items['time'], items['mark'] = times, triggers.mark
         if np.count_nonzero(triggers.starts_run) or self.timeline.epoch > self._pulse_epoch:
-            self._begin_runs(items, triggers)
+            self._mark_runs(items, triggers)
         else:
             items['epoch'] = self._pulse_epoch
         self._last_count = int(triggers.count[-1])
@@ -258,7 +258,7 @@ class StreamingAverager:
         self._last_time = float(times[-1])
         self._triggers.append(items)
 
-    def _begin_runs(self, items: NDArray[Any], triggers: TriggerPulses) -> None:
+    def _mark_runs(self, items: NDArray[Any], triggers: TriggerPulses) -> None:
         """Set the epochs of pulses, where runs begin, and what was discarded before."""
         epochs = self._epochs(triggers)
         # Behind a gap of unknown length the count begins at 0 again.

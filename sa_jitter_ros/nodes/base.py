@@ -37,7 +37,7 @@ from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
-from sa_jitter_ros.nodes.health import Flow, Health, Level
+from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.nodes.parameters import command_line_parameters, ParameterSet
 from sa_jitter_ros.parameter_file import require_regular_file
@@ -271,11 +271,13 @@ class MonitoringNode(Node):
             self._log(change, line)
         status = DiagnosticStatus(
             level=bytes([level]), name=self.get_fully_qualified_name().lstrip('/'),
-            message='; '.join(problems) or (f'{", ".join(grown)} increased' if grown else text),
+            message=first_of(problems) or (f'{", ".join(grown)} increased' if grown else text),
             hardware_id=self.get_parameter(HARDWARE_ID.name).value or socket.gethostname())
         self._reported, self._last_warning = dict(self.counts), ''
         shown = {**{key: str(count) for key, count in self.counts.items()},
                  **self.health.ages(), **values}
+        if (everything := '; '.join(problems)) != first_of(problems):
+            shown['problems'] = everything
         status.values = [KeyValue(key=key, value=value) for key, value in shown.items()]
         message = DiagnosticArray(status=[status])
         message.header.stamp = self.get_clock().now().to_msg()

@@ -23,6 +23,7 @@ from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
+from sa_jitter_ros.nodes.health import first_of
 from sa_jitter_ros.nodes.messages import decode_average
 from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, require_shaft_names, Values
@@ -40,7 +41,6 @@ PARAMETERS = (
 )
 _NOT_KEPT = 'none'
 _SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens
-_SHOWN = 3  # changes in the message of the status
 
 
 class ChangeMonitor(MonitoringNode):
@@ -145,10 +145,10 @@ class ChangeMonitor(MonitoringNode):
         for item in self._monitor.changes():
             (severe if self._is_severe(item) else others).append(str(item))
         if severe:
-            self.faults['change'] = _some(severe)
+            self.faults['change'] = first_of(severe)
         else:
             self.faults.pop('change', '')
-        self.set_missing('the machine has changed', _some(others))
+        self.set_missing('the machine has changed', first_of(others))
 
     def _is_severe(self, item: Change) -> bool:
         least = abs(item.change) - 2.0 * item.standard_error
@@ -211,12 +211,6 @@ def baseline_path(file: str, machine: str, node: str) -> Path | None:
         file = os.path.join(os.environ.get('ROS_HOME') or '~/.ros', 'sa_jitter_ros',
                             f'{quote(name, safe="")}.npz')
     return Path(os.path.expanduser(file))
-
-
-def _some(lines: Sequence[str]) -> str:
-    """Return the first lines, and how many there are beside them."""
-    more = f'; and {len(lines) - _SHOWN} more' if len(lines) > _SHOWN else ''
-    return '; '.join(lines[:_SHOWN]) + more
 
 
 def main(args: Sequence[str] | None = None) -> int:

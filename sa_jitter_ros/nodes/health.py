@@ -15,13 +15,25 @@ A `Flow` is one kind of data that a node takes or makes. `Health` holds those of
 their silence and says once when it begins, grows and ends. It knows nothing of ROS.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 import math
 import time
 
+_SHOWN = 6  # problems in the message of a status
 ERROR_FACTOR = 3.0  # silence is an error after so many times the time that makes it a warning
+
+
+def first_of(lines: Sequence[str]) -> str:
+    """
+    Return the first lines in one, and how many there are beside them.
+
+    >>> first_of([f'problem {number}' for number in range(1, 9)])[-21:]
+    'problem 6; and 2 more'
+    """
+    more = f'; and {len(lines) - _SHOWN} more' if len(lines) > _SHOWN else ''
+    return '; '.join(lines[:_SHOWN]) + more
 
 
 class Level(IntEnum):
