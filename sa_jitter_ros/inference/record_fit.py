@@ -30,7 +30,7 @@ it leaves, over angle (orders) and over time (tones): the sharper peak decides w
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 import math
 
 import numpy as np
@@ -801,23 +801,30 @@ def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
 
     The floor of a channel is at least the power of a line of the amplitude `least` (channel,).
     """
-    window = np.hanning(len(values) + 1)[:-1, None]
-    power = np.abs(np.fft.rfft((values * window).T)).T ** 2
-    ratio = np.zeros(len(power))
-    for channel, limit in zip(power.T, (0.5 * least * window.sum()) ** 2):
-        floor = np.full(len(power), limit)
+    window = _hann(len(values))
+    lines = rfft(values.T * window)
+    power = lines.real**2 + lines.imag**2
+    ratio = np.zeros(power.shape[1])
+    for channel, limit in zip(power, (0.5 * least * window.sum()) ** 2):
+        floor = np.full(channel.size, limit)
         for wide in (max(_WIDE, int(span / 2)), _SKIRT):
-            floor = np.maximum(floor, _medians(channel, wide))
+            np.maximum(floor, _medians(channel, wide), out=floor)
         ratio += channel * np.log(2.0) / floor
-    return ratio, power.sum(axis=1)
+    return ratio, power.sum(axis=0)
+
+
+@lru_cache(maxsize=4)
+def _hann(count: int) -> Array:
+    return np.hanning(count + 1)[:-1]
 
 
 def _medians(power: Array, reach: int) -> Array:
     """Return the median of the values up to `reach` bins away, between some bins linearly."""
-    size = min(2 * reach, len(power))
-    starts = np.arange(0, len(power) - size + 1, max(1, reach // 2))
-    windows = np.lib.stride_tricks.sliding_window_view(power, size)[starts]
-    return np.interp(np.arange(len(power)), starts + size // 2, row_medians(windows))
+    size, step = min(2 * reach, len(power)), max(1, reach // 2)
+    medians = row_medians(np.lib.stride_tricks.sliding_window_view(power, size)[::step])
+    inner = np.linspace(medians[:-1], medians[1:], step, endpoint=False, axis=1).ravel()
+    return np.pad(inner, (size // 2, len(power) - size // 2 - inner.size), mode='constant',
+                  constant_values=(medians[0], medians[-1]))
 
 
 def _between(values: Array) -> float:
