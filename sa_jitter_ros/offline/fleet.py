@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+import gc
 from pathlib import Path
 from typing import TypeVar
 
@@ -89,6 +90,8 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], *, processe
     elif processes == 1:
         for job in jobs:
             yield job, attempt(function, job)
+            if job is not jobs[-1]:
+                gc.collect()  # commands let garbage wait, and that of a recording may be large
     else:
         pool = Processes(function, processes)
         try:
