@@ -15,7 +15,7 @@ Speed of prediction, recovery and the loop off line.
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 import json
 from operator import itemgetter
@@ -42,7 +42,9 @@ RATIO = 2.40789
 SPEED = 16.6  # Hz
 RATE = 10000.0  # Hz
 KEYPHASOR_RATE = 5000.0  # Hz
-CHANNELS = 4
+#: Recordings for `close_loop`: s, Hz, gains of the channels, and gears. The first has 10 MB.
+LOOPS = (31.25, 10000.0, (1.0, 0.8, 0.6, 0.4), 1), (100.0, 25600.0, (1.0, 0.8, 0.6), 1), (
+    100.0, 25600.0, (1.0, 0.8, 0.6), 2)
 _RUNS = 5  # of `close_loop`, of which the least counts
 MODEL = f"""\
 jitter_predictor:
@@ -129,19 +131,26 @@ def clock(count: int, rounds: int) -> float:
     return median(elapsed[1:])
 
 
-def close_loop(megabytes: float) -> dict[str, Any]:
-    """Seconds that the command takes, at least, with an effect that is not declared."""
-    samples = round(megabytes * 1e6 / 8 / CHANNELS)
+def close_loop(seconds: float, rate: float, gains: Sequence[float], gears: int
+               ) -> dict[str, Any]:
+    """
+    Seconds that the command takes, at least, with an effect that is not declared.
+
+    The recording has a channel for each of the `gains`. A second one of `gears` is not declared.
+    """
+    samples, harmonics = round(seconds * rate), (1.0, 0.5, 0.25)
+    sources = [*mesh('shaft', 19, harmonics=harmonics, channel_gains=gains, seed=1),
+               *mesh('other', 41, harmonics=harmonics, channel_gains=gains, seed=2)]
     gearbox = Gearbox(
-        mesh('shaft', 19, harmonics=(1.0, 0.5, 0.25), channel_gains=(1.0, 0.8, 0.6, 0.4), seed=1),
-        RATE, shafts={'shaft': RATIO}, speed=((0.0, SPEED),), keyphasor=Keyphasor(),
+        sources[:gears * len(harmonics)], rate, shafts={'shaft': RATIO, 'other': 0.7123},
+        speed=((0.0, SPEED),), keyphasor=Keyphasor(),
         effects=(AdditiveNoise(0.1, name='noise'),
                  DeclaredJitter('uniform', 1.0 / np.sqrt(12.0) / KEYPHASOR_RATE),
                  *make_effects({'excess_jitter': {'std': 1e-4}})), seed=1)
     with tempfile.TemporaryDirectory() as folder:
         recording, model = Path(folder, 'rig.npz'), Path(folder, 'model.yaml')
-        np.savez(recording, vibration=gearbox.vibration(0, samples), sample_rate=RATE,
-                 pulse_times=gearbox.pulses(0.0, samples / RATE).times, ratio=RATIO,
+        np.savez(recording, vibration=gearbox.vibration(0, samples), sample_rate=rate,
+                 pulse_times=gearbox.pulses(0.0, seconds).times, ratio=RATIO,
                  orders=[19.0, 38.0, 57.0])
         model.write_text(MODEL)
         # Python compiles the modules once, when a package is installed or used first.
@@ -157,7 +166,8 @@ def close_loop(megabytes: float) -> dict[str, Any]:
         report = json.loads(Path(folder, 'report', 'report.json').read_text())
         wall, cpu = min(runs, key=itemgetter(1))
         return {'megabytes': recording.stat().st_size / 1e6, 'wall': wall, 'cpu': cpu,
-                'seconds': samples / RATE, 'channels': CHANNELS, 'verdict': report['verdict'],
+                'seconds': seconds, 'channels': len(gains), 'gears': gears,
+                'verdict': report['verdict'],
                 'missing': [effect['name'] for effect in report['missing_effects']]}
 
 
@@ -185,7 +195,8 @@ def main() -> int:
             ('prediction', partial(prediction, max(round(64 * scale), 2), rounds)),
             ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
             ('threads', partial(recovery_by_threads, max(round(100 * scale), 20), rounds)),
-            ('close_loop', partial(close_loop, max(10.0 * scale, 3.0)))):
+            ('close_loop', lambda: [close_loop(max(scale, 0.3) * seconds, *other)
+                                    for seconds, *other in LOOPS])):
         print(f'loop: {name}', file=sys.stderr, flush=True)
         found[name] = measure()
     found['load'] = f'{os.getloadavg()[0]:.1f}'
