@@ -27,6 +27,7 @@ CORE = {
     'errors': set(),
     'inner_loops': SCIENCE,
     'json_values': {'numpy'},
+    'number_text': set(),
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
     'samples': {'numpy'},
@@ -40,7 +41,8 @@ CORE = {
     'recordings': SCIENCE | {'errors', 'h5py', 'parameters', 'pulses', 'rosbags', 'samples'},
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
-        'averaging', 'effects', 'errors', 'prediction', 'pulses', 'recordings', 'samples'},
+        'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
+        'samples'},
     'monitoring': SCIENCE | {
         'averaging', 'errors', 'json_values', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
@@ -50,7 +52,7 @@ CORE = {
         'matplotlib', 'parameter_file', 'parameters', 'pulses', 'recordings', 'samples'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
-        'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
+        'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
         'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',
         'pulses', 'recordings', 'report'},

@@ -38,6 +38,7 @@ from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
+from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 
@@ -283,11 +284,10 @@ def _sizes(effect: Effect, errors: Mapping[str, Any]) -> str:
     for name, limits in parameter_ranges(type(effect)).items():
         value, error = effect.values[name], errors.get(name)
         if isinstance(value, tuple):
-            found.append(f'{name} of {np.sqrt(np.mean(np.square(value))):.3g} {limits.unit} RMS')
-        elif error is not None:
-            found.append(f'{name} {value:.3g} +- {error:.2g} {limits.unit}')
+            size = float(np.sqrt(np.mean(np.square(value))))
+            found.append(f'{name} of {measured_text(size, None, limits.unit)} RMS')
         else:
-            found.append(f'{name} {value:.6g} {limits.unit}')
+            found.append(f'{name} {measured_text(value, error, limits.unit)}')
     return ', '.join(found)
 
 
@@ -298,8 +298,8 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
     scale = math.exp(0.5 * log_power)
     p_value = _p_value(choice, JITTER, chooser)
     same = math.sqrt(setting.model.distribution.variance)
-    text = (f'independent pulse errors of {scale * same:.3g} s, {scale:.3g} +- '
-            f'{0.5 * scale * error:.2g} times the declared ones; probability '
+    text = (f'independent pulse errors of {measured_text(scale * same, None, "s")}, '
+            f'{measured_text(scale, 0.5 * scale * error)} times the declared ones; probability '
             f'{choice.probabilities[JITTER]:.3g} beside all other sets of effects')
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
     odds = math.inf

@@ -18,10 +18,10 @@ from pathlib import PurePath
 from typing import Any
 
 from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.number_text import (
+    measured_text, number_text, order_text, p_text, percent_text)
 from sa_jitter_ros.report.figures import illustrate, Illustration
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
-from sa_jitter_ros.report.number_text import (
-    measured_text, number_text, order_text, p_text, percent_text)
 from sa_jitter_ros.report.report import parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
@@ -305,5 +305,4 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[Json]], *, kind: str = '
 
 def _kept(text: str) -> str:
     """Return a text in which numbers stay together with their errors and units."""
-    return escape(text.replace(' +- ', ' ± ').replace(' ± ', '\u00a0±\u00a0').replace(
-        ' %', '\u00a0%'))
+    return escape(text.replace(' ± ', '\u00a0±\u00a0').replace(' %', '\u00a0%'))

@@ -26,9 +26,9 @@ from sa_jitter_ros.inference.dependence import Dependence, moving
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.report.new_section import new_section, ONLY_SHAFT
-from sa_jitter_ros.report.number_text import measured_text
 from sa_jitter_ros.version import __version__
 
 Json = Any

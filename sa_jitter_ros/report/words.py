@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.report.number_text import order_text, p_text, percent_text
+from sa_jitter_ros.number_text import order_text, p_text, percent_text
 from sa_jitter_ros.report.report import parameters_text
 
 Json = Any

@@ -8,7 +8,7 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Numbers of a report as people read them: with the digits that their error leaves, and units."""
+"""Numbers as people read them: with the digits that their error leaves, and units."""
 
 from collections.abc import Sequence
 import math
@@ -18,6 +18,7 @@ Json = Any
 
 _PREFIXES = (('', 1.0), ('m', 1e-3), ('µ', 1e-6), ('n', 1e-9))
 _PREFIXED = ('s', 'rad')
+_LARGE = (('T', 1e12), ('G', 1e9), ('M', 1e6))  # prefixes of a frequency
 _EXACT = 1e-9  # relative error of a number that only rounding makes uncertain
 _DIGITS = 3  # of a number without error
 _LEAST_P = 1e-12
@@ -38,8 +39,8 @@ def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
     '6.10 ± 0.21, -4.20 ± 0.21 mrad'
     >>> measured_text(0.01931, 0.00131, '1'), measured_text(None)
     ('0.0193 ± 0.0013', '–')
-    >>> measured_text(280835514.3, None, 'Hz')
-    '281 MHz'
+    >>> measured_text(280835514.3, None, 'Hz'), measured_text(5.41e12, None, 'Hz')
+    ('281 MHz', '5.41 THz')
     """
     values = value if isinstance(value, list) else [value]
     errors = error if isinstance(error, list) else [error] * len(values)
@@ -100,8 +101,9 @@ def _unit(values: Sequence[Json], unit: str) -> tuple[float, str]:
     """Return the size of a unit that suits the largest value, and its name."""
     unit = '' if unit == '1' else unit.replace('^2', '²')
     largest = max((abs(item) for item in values if isinstance(item, (int, float))), default=0.0)
-    if unit == 'Hz' and largest >= 1e6:
-        return 1e6, 'MHz'
+    if unit == 'Hz':
+        return next(((scale, prefix + unit) for prefix, scale in _LARGE if largest >= scale),
+                    (1.0, unit))
     if unit not in _PREFIXED or not 0.0 < largest < 1.0:
         return 1.0, unit
     prefix, scale = next((item for item in _PREFIXES if largest >= item[1]), _PREFIXES[-1])
