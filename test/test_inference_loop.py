@@ -114,6 +114,21 @@ def test_reference_keyphasor_is_used_unless_the_source_moves_relative_to_it():
         observe(swapped, MODEL)
 
 
+@pytest.mark.machines
+def test_moving_source_takes_from_the_average_with_a_reference_keyphasor_too():
+    # An average with the reference keyphasor shows nothing of the loss that the wander makes.
+    found = traced(*make_effects({'phase_wander': {'std': 0.006}}), acquisitions=24,
+                   reference=True)
+    assert found.observation.against_reference
+    assert [item.name for item in found.findings] == ['phase_wander']
+    highest = found.lines.order == len(MODEL.orders) - 1
+    off = (found.attenuation - found.prediction_after.attenuation)[list(found.held_out)]
+    loss = (found.prediction_before.attenuation
+            - found.prediction_after.attenuation)[list(found.held_out)]
+    assert loss[:, highest].mean() > 0.01
+    assert abs(off[:, highest].mean()) < 0.2 * loss[:, highest].mean()
+
+
 def test_declared_model_suffices():
     found = traced()
     content = report(found)

@@ -58,6 +58,8 @@ class Bench:
     Everything that scoring needs; `untold` maps effects that these data cannot show to the reason.
 
     `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them.
+    `moving` are effects that take as much from the amplitude with a reference keyphasor as from
+    the raw one.
     """
 
     observation: Observation
@@ -73,6 +75,15 @@ class Bench:
     untold: Mapping[str, str] = field(default_factory=dict)
     memory: Memory = field(default_factory=Memory, repr=False)
     fewer: 'Bench | None' = None
+    moving: tuple[Effect, ...] = ()
+
+    def with_moving_source(self, effects: Sequence[Effect]) -> 'Bench':
+        """Return the bench for a source that moves as effects say."""
+        if not self.observation.against_reference:
+            return self
+        moving = tuple(item for item in self.with_declared(effects) if item.moves_source)
+        return replace(self, moving=moving,
+                       fewer=self.fewer and self.fewer.with_moving_source(effects))
 
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""
@@ -116,6 +127,8 @@ class Bench:
             return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
 
         kept = self.scatter.beat_gain  # raw and corrected amplitude have both lost the rest
+        if self.moving:
+            kept = kept * self._without_jitter(self.moving, chosen).attenuation
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
                 kept * np.abs(of('raw')) / self.level)
 
@@ -129,14 +142,18 @@ class Bench:
         orders = self.observation.orders.size
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
         power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
-        model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
         scattering = [effect for effect in self.with_declared(effects) if effect.scatters]
-        known = expect(replace(self.observation, model=model), self.lines, self.level, scattering,
-                       self.pulses, self.group, [0]).amplitude_variance[0]
+        known = self._without_jitter(scattering, [0]).amplitude_variance[0]
         chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
         if np.mean(power / known) < 1.0 + chance:
             return 0.0
         return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
+
+    def _without_jitter(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Expectation:
+        """Predict some acquisitions with these effects alone."""
+        model = replace(self.observation.model, jitter_distribution='table', jitter_table=(0.0,))
+        return expect(replace(self.observation, model=model), self.lines, self.level, effects,
+                      self.pulses, self.group, chosen)
 
     def compare(self, effects: Sequence[Effect], findings: Sequence[Finding] = ()) -> Comparison:
         """Return the residual of the attenuation of the held-out acquisitions, one by one."""

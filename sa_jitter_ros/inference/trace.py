@@ -31,7 +31,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
-from sa_jitter_ros.effects.timing import Pattern, SOURCE
+from sa_jitter_ros.effects.timing import SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     best_of, Candidate, least_change, too_small, try_all)
@@ -214,9 +214,10 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     say = progress or (lambda text: None)
     own = bench.unsteadiness(())
     first = bench.score((), unsteadiness=own)
-    at_first = dependences(bench, (), ())
     say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
     chosen, present, timing = _of_timing(bench)
+    bench = bench.with_moving_source(_effects(chosen))
+    at_first = dependences(bench, (), ())
     for finding in chosen:
         say(f'found {finding.name}: {finding.evidence}')
     candidates = [Candidate(finding.name, 0, finding, None, '') for finding in chosen]
@@ -241,6 +242,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     if of_timing or of_lines:
         chosen, candidates = _beyond_doubt(chosen, candidates, of_timing, of_lines)
         effects = _effects(chosen)
+        bench = bench.with_moving_source(effects)
         own = bench.unsteadiness(effects)
         before = bench.score((), unsteadiness=own)
         after = bench.score(effects, chosen, unsteadiness=own)
@@ -359,8 +361,7 @@ def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], of
 def _absorbs(finding: Finding) -> bool:
     """Return whether an effect may absorb a part of what is none of it."""
     effect = finding.effect
-    return effect is not None and (effect.random or (
-        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times))
+    return effect is not None and (effect.random or effect.moves_source)
 
 
 def _few(bench: Bench) -> list[int]:
