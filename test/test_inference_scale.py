@@ -20,7 +20,7 @@ from sa_jitter_ros.inference.expectation import expect, Lines, Memory
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.scoring import STEADY
-from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.inference.trace import make_bench, trace
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -77,6 +77,19 @@ def test_small_unexplained_scatter_is_unsteadiness(recording, observation, rng):
     assert found.after.chi2_per_dof == pytest.approx(
         1.0, abs=4.0 * np.sqrt(2.0 / (count // 2) + 2.0 / count))
     assert found.after.ks < 1.63 / np.sqrt(count // 2)
+
+
+def test_levels_of_few_averages_are_part_of_the_scale(recording, observation, rng):
+    few = replace(observation, acquisitions=observation.acquisitions[:8])
+    size, found = 0.02, []
+    for _ in range(40):
+        changed = drifting(few, size, rng)
+        bench = make_bench(changed, [changed], [recording], ())
+        assert len(bench.fit) == 4
+        found.append(bench.score((), unsteadiness=size).chi2_per_dof)
+    error = np.std(found, ddof=1) / np.sqrt(len(found))
+    assert np.mean(found) == pytest.approx(1.0, abs=4.0 * error)
+    assert error < 0.05  # a quarter of it is that of the levels
 
 
 def test_large_unexplained_scatter_stays_unexplained(recording, observation, rng):

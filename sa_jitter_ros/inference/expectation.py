@@ -201,13 +201,13 @@ class Expectation:
 
 def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Influence],
            pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int], *,
-           unsteadiness: float = 0.0, memory: Memory | None = None) -> Expectation:
+           unsteadiness: float | Array = 0.0, memory: Memory | None = None) -> Expectation:
     """
     Predict the `chosen` acquisitions, each at its own speed.
 
     `level` (line,) are mean amplitudes, to which noise is relative; `pulses[a][i]` are the pulses
     of acquisition a with their known errors, for the channels whose `group` (channel,) is i;
-    `unsteadiness` is the unexplained scatter of the amplitudes relative to the level. `memory`
+    `unsteadiness`, one or (line,), is the unexplained scatter relative to the level. `memory`
     keeps results for calls that differ in `effects`, `chosen` and `unsteadiness` only.
     """
     memory = Memory() if memory is None else memory

@@ -108,12 +108,14 @@ UNDEFINED = Residual(
 
 def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Array,
              amplitude_expected: Array, amplitude_variance: Array, probability: Array, *,
-             sensitivities: Sequence[Sensitivity] = ()) -> Residual:
+             level_variance: float | Array = 0.0, sensitivities: Sequence[Sensitivity] = ()
+             ) -> Residual:
     """
     Compare observed with predicted values, all arrays (acquisition, line).
 
     The variances include those of the observations; `probability` is the predicted distribution
-    function at the amplitudes; `sensitivities` are those to each fitted parameter.
+    function at the amplitudes; `level_variance` (line,) is the part of `amplitude_variance` that
+    all acquisitions share; `sensitivities` are those to each fitted parameter.
     """
     difference = attenuation - expected
     count = len(difference)
@@ -137,7 +139,7 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         p_scatter=_scatter_p_value(difference - mean, scale,
                                    [item.variance for item in sensitivities]),
         p_amplitude_scatter=_scatter_p_value(
-            shift - shift.mean(axis=0), width,
+            shift - shift.mean(axis=0), np.sqrt(amplitude_variance - level_variance),
             [item.amplitude_variance for item in sensitivities]),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)

@@ -112,7 +112,7 @@ class Bench:
         return float(np.max(changes))
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
-               unsteadiness: float = 0.0) -> Expectation:
+               unsteadiness: float | Array = 0.0) -> Expectation:
         """Predict some acquisitions."""
         return expect(self.observation, self.lines, self.level, self.with_declared(effects),
                       self.pulses, self.group, chosen, unsteadiness=unsteadiness,
@@ -142,12 +142,16 @@ class Bench:
         orders = self.observation.orders.size
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
         power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
-        scattering = [effect for effect in self.with_declared(effects) if effect.scatters]
-        known = self._without_jitter(scattering, [0]).amplitude_variance[0]
+        known = self._corrected_variance(effects)
         chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
         if np.mean(power / known) < 1.0 + chance:
             return 0.0
         return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
+
+    def _corrected_variance(self, effects: Sequence[Effect]) -> Array:
+        """Return the variance (line,) that noise and effects give a corrected amplitude."""
+        scattering = [effect for effect in self.with_declared(effects) if effect.scatters]
+        return np.asarray(self._without_jitter(scattering, [0]).amplitude_variance[0])
 
     def _without_jitter(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Expectation:
         """Predict some acquisitions with these effects alone."""
@@ -166,12 +170,14 @@ class Bench:
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
-        """Return the residual of the held-out acquisitions."""
+        """Return the residual of the held-out acquisitions; the others measured the levels."""
         attenuation, variance, amplitude = self.observed(self.held_out)
-        expected = self.expect(effects, self.held_out, unsteadiness=unsteadiness)
+        level = (self._corrected_variance(effects) + unsteadiness**2) / len(self.fit)
+        unsure = np.sqrt(level + unsteadiness**2)
+        expected = self.expect(effects, self.held_out, unsteadiness=unsure)
         moved = []
         for others in _moved(effects, findings):
-            other = self.expect(others, self.held_out, unsteadiness=unsteadiness)
+            other = self.expect(others, self.held_out, unsteadiness=unsure)
             moved.append(Sensitivity(
                 (other.attenuation - expected.attenuation).mean(axis=0),
                 float(np.mean((other.attenuation_variance - expected.attenuation_variance)
@@ -180,7 +186,7 @@ class Bench:
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
-            sensitivities=moved)
+            level_variance=level, sensitivities=moved)
 
 
 def _moved(effects: Sequence[Effect], findings: Sequence[Finding]) -> Iterator[list[Effect]]:
