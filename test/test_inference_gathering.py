@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sa_jitter_ros.inference.gathering import _uncertainty, _unskewed
+from sa_jitter_ros.inference.gathering import _slope, _uncertainty, _unskewed
 
 PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
 
@@ -35,3 +35,16 @@ def test_recovered_errors_are_as_sure_as_the_reference_shows_with_a_skew_too(rng
     # of 12 variances with 23 degrees of freedom
     assert _uncertainty(observation, motion, [motion], smooth) == pytest.approx(
         wrong, rel=4.0 / np.sqrt(2.0 * 12 * 23))
+
+
+def test_skew_of_neighbours_is_that_of_their_whole_run(rng):
+    count = 40 * (PULSES - 1) + 1
+    times = PERIOD * np.arange(count)
+    errors = SKEW * times + TICK * rng.uniform(-0.5, 0.5, count)
+    items = [SimpleNamespace(first=first, times=times[first:first + PULSES])
+             for first in range(0, count - 1, PULSES - 1) if first != 10 * (PULSES - 1)]
+    rows = np.array([errors[item.first:item.first + PULSES] for item in items])
+    rows -= rows.mean(axis=1, keepdims=True)
+    rows[20, 3] = np.nan
+    error = TICK / np.ptp(times) / np.sqrt(count)  # of the whole, without the gap
+    assert _slope(items, rows) == pytest.approx(SKEW, abs=4.0 * 2.0 * error)

@@ -263,6 +263,6 @@ def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
                                       error_std=0.01 / rate)])
         assert names_of(timing) == {'clock_skew', 'keyphasor_quantisation'}
         value, error = value_of(timing, 'clock_skew', 'skew')
-        assert error < 0.1 * skew
+        assert error < 0.01 * skew
         off.append((value - skew) / error)
     assert np.max(np.abs(off)) < 3.0

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Array = NDArray[Any]
@@ -137,6 +138,21 @@ def ticks_leave_room(errors: Sequence[Array], variance: float, clock_rate: float
     """
     beyond = np.mean([placed_on_grid(row, clock_rate)[1] ** 2 for row in errors])
     return bool(beyond < max(variance, (_ROOM / clock_rate) ** 2))
+
+
+def ticks_log_likelihood(errors: Sequence[Array], variance: float, clock_rate: float) -> float:
+    """
+    Return how likely a clock makes the pulse errors (pulse,) of some stretches, in s.
+
+    They are uniform over a tick, and wrong by normal errors of `variance`, as large as
+    `ticks_leave_room` lets them be at least.
+    """
+    std = max(np.sqrt(variance) * clock_rate, _ROOM)
+    total = 0.0
+    for row in errors:
+        placed = clock_rate * np.abs(placed_on_grid(row, clock_rate)[0])
+        total += float(np.sum(special.log_ndtr((0.5 - placed) / std)))
+    return total
 
 
 def on_grid(errors: Array, clock_rate: float) -> Array:

@@ -288,7 +288,29 @@ def _unskewed(items: Sequence[Acquisition], motion: Array, smooth: Array) -> Arr
     certainty = abs(slopes.mean()) / (slopes.std(ddof=1) / np.sqrt(slopes.size))
     if 2.0 * special.stdtr(slopes.size - 1, -certainty) > _CERTAIN:
         return motion
-    return np.asarray(motion - float(np.median(slopes)) * times)
+    return np.asarray(motion - _slope(items, left) * times)
+
+
+def _slope(items: Sequence[Acquisition], errors: Array) -> float:
+    """
+    Return the slope over time of errors (acquisition, pulse), each less a mean of its own.
+
+    Neighbours share a pulse, so that a run of them has one mean only.
+    """
+    runs: list[tuple[list[Array], list[Array]]] = []
+    end, last = -1, np.nan
+    for item, row in zip(items, errors):
+        if item.first == end and np.isfinite(last - row[0]):
+            row = row + (last - row[0])
+        else:
+            runs.append(([], []))
+        for values, new in zip(runs[-1], (item.times, row)):
+            values.append(new[np.isfinite(row)])
+        end, last = item.first + item.times.size - 1, row[-1]
+    rows = [(np.concatenate(time), np.concatenate(error)) for time, error in runs]
+    centred = [(time - time.mean(), error) for time, error in rows if time.size]
+    return float(sum(time @ error for time, error in centred)
+                 / sum(time @ time for time, _ in centred))
 
 
 def _without_gaps(known: Array, missing: Array, times: Array) -> Array:

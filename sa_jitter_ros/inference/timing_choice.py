@@ -27,11 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.lattice import ticks_leave_room
+from sa_jitter_ros.effects.lattice import ticks_leave_room, ticks_log_likelihood
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -148,7 +149,7 @@ class Chooser:
         """
         Return the fit of patterns beside which ticks can make all errors, None where they cannot.
 
-        The size of a single pattern may be any that leaves the errors within the ticks.
+        Of a single pattern, the sizes that leave the errors within the ticks give its value.
         """
         fit = self.fit(names)
         found = {name: np.concatenate([self.patterns[name][0].columns(item.setting)
@@ -162,13 +163,20 @@ class Chooser:
         possible = tried[[self._room([size * column]) for size in tried]]
         if not possible.size:
             return None
-        fit = copy(fit)  # any of them is as likely
-        fit.sizes = possible.mean(keepdims=True)
-        fit.size_covariance = np.array([[(np.ptp(possible) + step) ** 2 / 12.0]])
+        likely = np.array([ticks_log_likelihood(*self._left([size * column]))
+                           for size in possible])
+        weight = np.exp(likely - special.logsumexp(likely))
+        fit = copy(fit)
+        fit.sizes = np.array([possible @ weight])
+        fit.size_covariance = np.array([[(possible - fit.sizes) ** 2 @ weight + step**2 / 12.0]])
         return fit
 
     def _room(self, known: Sequence[Array]) -> bool:
         """Tell whether the ticks can make the errors less `known` ones (all pulses), in units."""
+        return ticks_leave_room(*self._left(known))
+
+    def _left(self, known: Sequence[Array]) -> tuple[list[Array], float, float]:
+        """Return the errors less `known` ones in s, their variance, and the rate of the clock."""
         begin, found = 0, []
         for item in self.data.stretches:
             part = slice(begin, begin + item.errors.size)
@@ -178,7 +186,7 @@ class Chooser:
                 left -= self.data.unit * row[part]
             found.append(left[item.measured])
         noise = float(np.mean([item.error_std**2 for item in self.data.stretches]))
-        return ticks_leave_room(found, noise, self.setting.clock_rate)
+        return found, noise, self.setting.clock_rate
 
     def score(self, names: frozenset[str], fit: TimingFit) -> float:
         """Return the logarithm of the evidence for a set of effects, its prior odds included."""
