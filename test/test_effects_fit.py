@@ -17,8 +17,8 @@ import pytest
 from sa_jitter_ros.effects import EFFECTS, make_effect
 from sa_jitter_ros.effects.amplitude_modulation import _chance
 from sa_jitter_ros.effects.band import (
-    flat_band_correlation, recovered_correlation, ripple_of_acceleration,
-    SLOW_BAND)
+    ACCELERATION_BAND, band_of_ripple, flat_band_correlation, recovered_correlation,
+    ripple_of_acceleration, SLOW_BAND, slow_band)
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
 from sa_jitter_ros.prediction.influence import Pulses
@@ -101,13 +101,14 @@ def recovered(motion):
     steps = 16
     u = (np.arange(steps) + 0.5) / steps
     cycles = np.arange(PULSES - 1)
-    design = np.zeros((PULSES - 1, steps, 2 * PULSES - 1))
-    for k in cycles:  # hats, and a bump inside each cycle
+    design = np.zeros((PULSES - 1, steps, 3 * PULSES - 2))
+    for k in cycles:  # hats, and a bump and a bend inside each cycle
         design[k, :, k], design[k, :, k + 1] = 1.0 - u, u
         design[k, :, PULSES + k] = u * (1.0 - u)
+        design[k, :, 2 * PULSES - 1 + k] = u * (1.0 - u) * (2.0 * u - 1.0)
     values = motion((cycles[:, None] + u).ravel())
-    fitted = np.linalg.lstsq(design.reshape(-1, 2 * PULSES - 1), values.T, rcond=None)[0].T
-    return fitted[:, :PULSES], fitted[:, PULSES:]
+    fitted = np.linalg.lstsq(design.reshape(-1, 3 * PULSES - 2), values.T, rcond=None)[0].T
+    return fitted[:, :PULSES], fitted[:, PULSES:2 * PULSES - 1]
 
 
 def sines(rng, band, draws=ACQUISITIONS):
@@ -128,13 +129,26 @@ def test_recovery_sees_a_motion_as_least_squares_does(rng):
     seen = np.mean(errors[:, 5:12] * errors[:, 8:9], axis=0)
     expected = recovered_correlation(np.arange(5, 12) - 8, SLOW_BAND)
     assert seen == pytest.approx(expected, abs=4.0 * np.sqrt(2.0 / 600.0))
-    assert expected[3] == pytest.approx(1.06, abs=0.005)
+    assert expected[3] == pytest.approx(0.993, abs=0.005)
     assert flat_band_correlation(0, SLOW_BAND) == pytest.approx(1.0)
     narrow = (0.1999, 0.2001)
     assert ripple_of_acceleration((1e-4, 2e-4)) == pytest.approx(0.5, rel=1e-6)
     _, ripple = recovered(sines(rng, narrow, 600))
     size = np.sqrt(np.mean(ripple[:, 10] ** 2)) / (2.0 * np.pi * 0.2) ** 2
     assert size == pytest.approx(ripple_of_acceleration(narrow), rel=4.0 / np.sqrt(1200.0))
+
+
+@pytest.mark.parametrize('bandwidth', [0.1, 0.2, 0.35, 0.45])
+def test_ripple_of_neighbours_tells_the_bandwidth_of_an_acceleration(rng, bandwidth):
+    motion = sines(rng, slow_band(bandwidth, ACCELERATION_BAND), 600)
+    _, ripple = recovered(lambda time: motion(time, derivative=2))
+    product = np.mean(ripple[:, 5:12] * ripple[:, 6:13], axis=1)
+    power = np.mean(ripple[:, 5:13] ** 2, axis=1)
+    together = product.mean() / power.mean()
+    error = np.std(product - together * power) / np.sqrt(600.0) / power.mean()
+    low, high = band_of_ripple(together + 4.0 * error * np.array([1.0, -1.0]))
+    assert low < bandwidth < high
+    assert high - low < 0.1
 
 
 def test_noise_is_fitted_within_its_error(rng):

@@ -35,16 +35,16 @@ _MEMORY, _LONGEST, _PERIODS = 200, 2000, 10.0
 _RULE = unit_nodes(256)  # enough for the turns of some hundred lags
 
 
-def slow_band(bandwidth: float) -> tuple[float, float]:
+def slow_band(bandwidth: float, usual: tuple[float, float] = SLOW_BAND) -> tuple[float, float]:
     """
     Return the band of a slow motion whose highest frequency is `bandwidth`.
 
-    It begins where `SLOW_BAND` does, or at 0.4 of the bandwidth where that is lower.
+    It begins where the `usual` one does, or at 0.4 of the bandwidth where that is lower.
 
-    >>> slow_band(0.4), slow_band(0.01)
-    ((0.02, 0.4), (0.004, 0.01))
+    >>> slow_band(0.4), slow_band(0.01), slow_band(0.3, ACCELERATION_BAND)
+    ((0.02, 0.4), (0.004, 0.01), (0.05, 0.3))
     """
-    return min(SLOW_BAND[0], 0.4 * bandwidth), bandwidth
+    return min(usual[0], 0.4 * bandwidth), bandwidth
 
 
 def slow_memory(trigger_cycles: int, band: tuple[float, float]) -> int:
@@ -83,7 +83,7 @@ def recovered_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
     """
     Return the autocovariance, at whole `lag`, of the pulse errors recovered from a unit motion.
 
-    A motion that is fast enough to bend within a cycle pulls the fitted errors beyond itself.
+    A motion that is fast enough to bend within a cycle pulls the fitted errors a little.
     """
     frequency, weight = _even(band)
     gain = _recovered(frequency)[0] ** 2
@@ -96,8 +96,23 @@ def ripple_of_acceleration(band: tuple[float, float]) -> float:
 
     It is 1/2, that of a constant one, less what changes within the cycle.
     """
+    return float(np.sqrt(_ripple_covariance(band, 0)))
+
+
+def band_of_ripple(correlation: Array) -> Array:
+    """Return the bandwidth of an acceleration whose ripple has a `correlation` of neighbours."""
+    widths = np.geomspace(NARROWEST, WIDEST, 200)
+    bands = [slow_band(width, ACCELERATION_BAND) for width in widths]
+    known = np.array([_ripple_covariance(band, 1) / _ripple_covariance(band, 0)
+                      for band in bands])
+    return np.asarray(np.interp(correlation, known[::-1], widths[::-1]))
+
+
+def _ripple_covariance(band: tuple[float, float], lag: int) -> float:
+    """Return the autocovariance of the recovered ripple of a unit acceleration."""
     frequency, weight = _even(band)
-    return float(np.sqrt(weight @ (_recovered(frequency)[1] / (2.0 * np.pi * frequency)**2)**2))
+    gain = _recovered(frequency)[1] / (2.0 * np.pi * frequency) ** 2
+    return float(weight @ (gain**2 * np.cos(2.0 * np.pi * frequency * lag)))
 
 
 def _even(band: tuple[float, float]) -> tuple[Array, Array]:
@@ -109,12 +124,16 @@ def _recovered(frequency: Array) -> tuple[Array, Array]:
     """
     Return pulse errors and ripple, as factors, that the recovery fits to exp(2 pi j frequency t).
 
-    It fits hats between the pulses and a bump u (1 - u) in every cycle by least squares; both
-    are in phase with the motion, the bump in the middle of its cycle.
+    It fits hats between the pulses, and in every cycle a bump u (1 - u) and a bend
+    u (1 - u) (2 u - 1), by least squares; hats and bump are in phase with the motion, the bump in
+    the middle of its cycle.
     """
     u, weight = _RULE
-    bump = (weight * u * (1.0 - u)) @ np.cos(2.0 * np.pi * np.multiply.outer(u - 0.5, frequency))
+    turn = 2.0 * np.pi * np.multiply.outer(u - 0.5, frequency)
+    bump = (weight * u * (1.0 - u)) @ np.cos(turn)
+    bend = (weight * u * (1.0 - u) * (2.0 * u - 1.0)) @ np.sin(turn)
     half = np.cos(np.pi * frequency)
-    hats = (np.sinc(frequency) ** 2 - 5.0 * half * bump) / (
-        0.25 - np.cos(2.0 * np.pi * frequency) / 12.0)
+    hats = 30.0 * (np.sinc(frequency) ** 2 - 5.0 * half * bump
+                   - 7.0 * np.sin(np.pi * frequency) * bend) / (
+        4.0 + np.cos(2.0 * np.pi * frequency))
     return hats, 30.0 * (bump - half * hats / 6.0)

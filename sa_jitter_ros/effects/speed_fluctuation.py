@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import (
-    ACCELERATION_BAND, fading, ripple_of_acceleration, slow_memory)
+    ACCELERATION_BAND, fading, NARROWEST, ripple_of_acceleration, slow_band, slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError, unit_nodes
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -34,7 +34,9 @@ class SpeedFluctuation(Effect):
 
     The linear law then errs by nearly -(1/2) a T^2 r u (1 - u), a in trigger cycles/s^2: nothing
     at the pulses, most in the middle. Other laws err by what the acceleration changes from cycle
-    to cycle.
+    to cycle. Its spectrum is flat from a twentieth of the trigger rate to `bandwidth` times that
+    rate; where the bandwidth is below 0.125, from 0.4 of it. The narrower, the more do averages
+    differ.
     """
 
     name: ClassVar[str] = 'speed_fluctuation'
@@ -44,6 +46,9 @@ class SpeedFluctuation(Effect):
     remedy: ClassVar[str] = 'use more pulses a revolution, or the angle_law quadratic or spline'
     acceleration_std: float = parameter(
         0.0, 'standard deviation of the acceleration of the tach shaft', 'rad/s^2', minimum=0.0)
+    bandwidth: float = parameter(
+        ACCELERATION_BAND[1], 'highest frequency of the acceleration, cycles a trigger cycle', '1',
+        minimum=NARROWEST, maximum=WIDEST)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the error of the angle law."""
@@ -54,20 +59,23 @@ class SpeedFluctuation(Effect):
                       'trigger speeds', 'the shaft would stop; lower it, or use more '
                       'pulses_per_revolution')
         variance = (size * model.cycle_length) ** 2
-        unit = _unit_covariance(model.weights, model.trigger_cycles)
+        band = slow_band(self.bandwidth, ACCELERATION_BAND)
+        unit = _unit_covariance(model.weights, model.trigger_cycles, band)
         return (GaussianAngleError(
             lambda u, v, lag: np.asarray(variance * unit(u, v, lag)),
-            slow_memory(model.trigger_cycles, ACCELERATION_BAND)),)
+            slow_memory(model.trigger_cycles, band)),)
 
     @classmethod
-    def of_ripple(cls, size: float, model: DeclaredModel) -> 'SpeedFluctuation':
+    def of_ripple(cls, size: float, model: DeclaredModel,
+                  bandwidth: float = ACCELERATION_BAND[1]) -> 'SpeedFluctuation':
         """Return the acceleration that makes errors size u (1 - u), in s, inside the cycles."""
-        return cls(size / ripple_of_acceleration(ACCELERATION_BAND) / model.trigger_period**2
-                   / _cycles(model, 1.0) / model.trigger_period)
+        ripple = ripple_of_acceleration(slow_band(bandwidth, ACCELERATION_BAND))
+        return cls(size / ripple / model.trigger_period**3 / _cycles(model, 1.0), bandwidth)
 
 
 @lru_cache(maxsize=4)
-def _unit_covariance(weights: PulseWeights, cycles: int) -> Covariance:
+def _unit_covariance(weights: PulseWeights, cycles: int, band: tuple[float, float]
+                     ) -> Covariance:
     """
     Return the covariance of the error that the angle law makes of accelerations of variance 1.
 
@@ -76,7 +84,7 @@ def _unit_covariance(weights: PulseWeights, cycles: int) -> Covariance:
     motion. All orders at all speeds ask for the same places, so that it is kept for these. It
     fades over an average of so many `cycles`.
     """
-    low, high = ACCELERATION_BAND
+    low, high = band
     turn = 2j * np.pi * (low + (high - low) * _FREQUENCIES)
     at_pulses = np.exp(np.multiply.outer(turn, np.arange(weights.pulses) - weights.before))
 
@@ -94,7 +102,7 @@ def _unit_covariance(weights: PulseWeights, cycles: int) -> Covariance:
                 known.clear()
             later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
             known[key] = np.einsum('...f,...f', missed(u).conj(), later).real * fading(
-                lag + v - u, cycles, ACCELERATION_BAND)
+                lag + v - u, cycles, band)
         return known[key]
 
     return covariance

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.band import band_of_ripple
 from sa_jitter_ros.effects.effect import Finding, parameter_ranges
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
@@ -343,23 +344,35 @@ def _of_speed(choice: Choice) -> Finding | None:
     made = {name: float(np.average(fit.contribution(name)[:, 2, 2].real, weights=data.size))
             for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
     share = made[SHAFT] / sum(made.values())  # the rest are bends of a source that moves
-    parts, count = [], 0
+    parts, next_, count = [], [], 0
     for item in data.stretches:
         if not np.isfinite(item.bend_std):
             continue
         for part in np.array_split(item.bends, max(1, item.bends.size // _PART)):
             parts.append(share * (np.mean(part**2) - item.bend_std**2))
+            next_.append(share * np.mean(part[1:] * part[:-1]))
             count += part.size
     if len(parts) < _FEWEST_PARTS:
         return None
-    power, error = float(np.mean(parts)), float(np.std(parts, ddof=1) / math.sqrt(len(parts)))
+    power, error = _mean(parts)
     noise = share * float(np.mean([item.bend_std**2 for item in data.stretches]))
     chance = float(special.ndtr(-power / (noise * math.sqrt(2.0 / count) + 1e-300)))
     if power <= 0.0 or chance > _CHANCE:
         return None
     size, size_error = root(power, error)
-    effect = SpeedFluctuation.of_ripple(size, setting.model)
+    together = float(np.mean(next_)) / power  # correlation of neighbours
+    wrong = _mean(np.array(next_) - together * np.array(parts))[1] / power
+    low, bandwidth, high = band_of_ripple(together + wrong * np.array([1.0, 0.0, -1.0])).tolist()
+    effect = SpeedFluctuation.of_ripple(size, setting.model, bandwidth)
+    errors = {'acceleration_std': effect.acceleration_std * size_error / size}
+    if low < high:  # not the widest band
+        errors['bandwidth'] = 0.5 * (high - low)
     return Finding(
-        _SPEED, effect, {'acceleration_std': effect.acceleration_std * size_error / size}, chance,
+        _SPEED, effect, errors, chance,
         'the speed changes within a trigger cycle: the angle between the pulses errs by '
         f'u (1 - u) times {size:.3g} s')
+
+
+def _mean(values: Sequence[float] | Array) -> tuple[float, float]:
+    """Return the mean of some values and its standard error."""
+    return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(len(values)))

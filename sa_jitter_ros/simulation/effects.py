@@ -236,21 +236,24 @@ class SpeedFluctuation(Effect):
     """
     Random acceleration of the tach shaft with the standard deviation `acceleration_std` (rad/s^2).
 
-    Its frequencies are below a fifth of the trigger rate, so that it is nearly constant within a
-    trigger cycle.
+    Its frequencies are below `bandwidth` times the trigger rate: at the usual fifth of it the
+    acceleration is nearly constant within a trigger cycle.
     """
 
     acceleration_std: float
+    bandwidth: float = 0.2
 
     def __post_init__(self) -> None:
         """Check the parameters."""
         require_number('speed_fluctuation.acceleration_std', self.acceleration_std, minimum=0)
+        require_bandwidth('speed_fluctuation.bandwidth', self.bandwidth)
 
     def speed_fluctuation(self, setting: Setting) -> SinusoidSum:
         """Return the relative fluctuation whose derivative is the acceleration."""
         rate = setting.trigger_rate
-        acceleration = band_limited(std=self.acceleration_std, band=(0.05 * rate, 0.2 * rate),
-                                    seed=setting.seed, name='speed_fluctuation')
+        band = min(0.05, 0.4 * self.bandwidth) * rate, self.bandwidth * rate
+        acceleration = band_limited(std=self.acceleration_std, band=band, seed=setting.seed,
+                                    name='speed_fluctuation')
         return acceleration.integral().scaled(1 / (2 * np.pi * setting.motion.nominal_speed))
 
 
