@@ -116,7 +116,8 @@ class AmplitudeModulation(DirectEffect):
         p_value = _chance(variance * pairs / weight.sum(), weight / weight.sum(), product.size)
         if variance > 0.0:
             noise = 1.0 / (weight.sum() * radial.shape[1])
-            slow = (common.mean(axis=1) / weight.sum()) ** 2 - noise
+            # of averages about their own mean, which moves with them
+            slow = (common.mean(axis=1) / weight.sum()) ** 2 / (1.0 - 1.0 / len(rows)) - noise
             bandwidth, bandwidth_error = _bandwidth_of(slow, rows, radial.shape[1])
             within = _variance_of_mean(1, slow_band(bandwidth))
             variance, error = variance / within - known, error / within
