@@ -133,6 +133,12 @@ def test_pulses_without_any_jitter_have_a_report(name, tmp_path):
     assert (tmp_path / 'pulse_errors.png').is_file()
 
 
+def test_table_of_a_single_error_declares_no_jitter(recording):
+    with np.errstate(divide='raise', invalid='raise'):
+        assert close_loop(recording, {
+            **KEYWORDS, 'jitter_distribution': 'table', 'jitter_table': (1e-5,)}).verdict != 'none'
+
+
 @pytest.mark.machines
 def test_every_shaft_has_its_report(recording, found, tmp_path):
     """The ratio of the recording is that of one of the shafts."""

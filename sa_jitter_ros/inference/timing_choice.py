@@ -125,7 +125,8 @@ class Chooser:
         self.fits: dict[frozenset[str], TimingFit] = {}
         model = self.setting.model
         # normal errors stay normal whatever is beside them
-        self.shapes = None if model.jitter_distribution == 'normal' else Shapes(model.distribution)
+        shown = model.jitter_distribution != 'normal' and model.distribution.variance > 0.0
+        self.shapes = Shapes(model.distribution) if shown else None
 
     @property
     def pool(self) -> Sequence[str]:
