@@ -13,15 +13,16 @@ The loop on machines of another simulator: what it finds, and how wrong its numb
 
 `python benchmarks/independent_confusion.py` draws machines (`independent_machines`) with effects
 that their declared model lacks (`independent_effects`), closes the loop on recording and
-parameter file as a user does, and judges the report. It writes one line of JSON a run to the
-standard error and prints a table at the end.
+parameter file as a user does, and judges the report. Beside it stands the oracle: the same
+recording with the true effects and parameters declared, scored on the same held-out acquisitions.
+It writes one line of JSON a run to the standard error and prints a table at the end.
 """
 
 import argparse
 from collections import Counter
 from collections.abc import Mapping, Sequence
 import contextlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, field, replace
 import io
 import json
 from pathlib import Path
@@ -35,12 +36,29 @@ from independent_machines import declared, record
 import numpy as np
 from sa_jitter_ros.commands import close_loop, loop_run
 from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.effects import declared_effects
 from sa_jitter_ros.errors import SaJitterError
+from sa_jitter_ros.inference.residual import Residual, UNDEFINED
+from sa_jitter_ros.inference.trace import make_bench, Trace
+from sa_jitter_ros.recordings import read, Recording
 
 PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('excess_jitter', 'amplitude_modulation'),
          ('speed_fluctuation', 'additive_noise'), ('phase_wander', 'interfering_tone'))
 _OF_PULSES, _SAMPLED = ('excess_jitter', 'correlated_jitter'), 0.5  # sample periods, 12^-0.5 RMS
-_SCATTER = ('additive_noise', 'amplitude_modulation', 'interfering_tone')
+
+
+@dataclass(frozen=True)
+class Score:
+    """
+    How well the held-out acquisitions of a machine were predicted.
+
+    `rms` is that of the mean residual of the attenuation over the lines, `chi2` (per degree of
+    freedom) and `coverage` (of the 95 % band) are those of the raw amplitudes.
+    """
+
+    rms: float = float('nan')
+    chi2: float = float('nan')
+    coverage: float = float('nan')
 
 
 @dataclass(frozen=True)
@@ -50,9 +68,9 @@ class Run:
 
     `noisy` machines have coloured noise, which no declared model holds, so that naming it is
     right. `sampling` are errors of the pulses, among those `found`, that the sampling of a tach
-    waveform makes. Effects that are `present` change no average. `before` and `after` are RMS
-    residuals less their standard errors, in quadrature; `errors` are those of the parameters in
-    stated standard errors.
+    waveform makes. Effects that are `present` change no average. `oracle` knows the true effects
+    and parameters, NaN where no effect of the package describes them; `errors` are those of the
+    parameters in stated standard errors.
     """
 
     effects: tuple[str, ...]
@@ -62,17 +80,16 @@ class Run:
     seconds: float
     status: int
     message: str
-    verdict: str
-    noisy: bool
-    found: tuple[str, ...]
-    present: tuple[str, ...]
-    rivals: tuple[str, ...]
-    sampling: tuple[str, ...]
-    before: float
-    after: float
-    chi2_before: float
-    chi2_after: float
-    errors: Mapping[str, float]
+    verdict: str = ''
+    noisy: bool = False
+    found: tuple[str, ...] = ()
+    present: tuple[str, ...] = ()
+    rivals: tuple[str, ...] = ()
+    sampling: tuple[str, ...] = ()
+    before: Score = Score()
+    after: Score = Score()
+    oracle: Score = Score()
+    errors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def right(self) -> bool:
@@ -85,6 +102,11 @@ class Run:
             found = {'jitter_scale' if name == 'excess_jitter' else name for name in found}
         return self.status == 0 and found <= set(self.effects) <= found | set(self.present) and (
             self.verdict == ('traced' if self.found else 'none'))
+
+    @property
+    def near(self) -> bool:
+        """Tell whether the mean residual fell five-fold, or to less than twice the oracle's."""
+        return self.after.rms <= max(0.2 * self.before.rms, 2.0 * self.oracle.rms)
 
 
 def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: bool = False,
@@ -101,21 +123,26 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
     if scale != 1.0:
         declaration = replace(declaration, keyphasor_rate=scale * declaration.keyphasor_rate)
         effects, truth['jitter_scale'] = (*effects, 'jitter_scale'), {'scale': scale}
+    if case.machine.noise_colour:
+        truth['additive_noise'] = {'std': case.machine.noise_at_orders}
     fields = record(case.machine, case.what, np.random.default_rng([seed, 1]))
     np.savez(folder / 'machine.npz', **fields)
     (folder / 'model.yaml').write_text(declared(declaration))
-    arguments = [str(folder / 'machine.npz'), '--declared', str(folder / 'model.yaml'),
-                 '--output', str(folder / 'report'), '--quiet']
-    error = io.StringIO()
+    options = close_loop.make_parser().parse_args([
+        str(folder / 'machine.npz'), '--declared', str(folder / 'model.yaml'),
+        '--output', str(folder / 'report'), '--quiet'])
+    item, error = case.machine, io.StringIO()
     start = time.perf_counter()
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
-            status, report = _closed(arguments, pictures)
-    except Exception as crash:  # a crash is a finding, too
-        status, report = 1, {}
-        error.write(f'crashed: {crash!r}')
+            loop = loop_run.run(options, Progress('close_loop', quiet=True))
+            if pictures:
+                loop.write(options.output)
+        status = 0
+    except Exception as failure:  # a crash is a finding, too
+        status = 2 if isinstance(failure, SaJitterError) else 1
+        error.write(repr(failure))
     seconds = time.perf_counter() - start
-    item = case.machine
     text = (f'fs {item.sample_rate:g}, {item.speed:.1f} Hz, r {item.cycle_length:.3g} '
             f'({item.pulses_per_trigger}/{item.pulses_per_revolution}), '
             f'{item.trigger_cycles}x{item.acquisitions}, {len(item.peaks)} ch, '
@@ -123,45 +150,38 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
             f'{item.top / item.keyphasor_rate:.2f}, top {item.top / item.sample_rate:.2f}, '
             f'noise {item.noise_std:.2g}/{item.noise_colour:.1f}'
             f'{", reference" * item.reference}{", waveform" * item.waveform}')
+    run = Run(effects, seed, text, item.cycle_length, seconds, status, error.getvalue().strip())
     if status:
-        nan = float('nan')
-        return Run(effects, seed, text, item.cycle_length, seconds, status,
-                   error.getvalue().strip(), '', False, (), (), (), (), nan, nan, nan, nan, {})
+        return run
+    report, (trace,) = loop.report, loop.traces.values()
     found = report['missing_effects']
-    chi2 = [float('nan') if value is None else value for value in (
-        report[when]['chi2_per_dof'] for when in ('error_before', 'error_after'))]
-    return Run(
-        effects, seed, text, item.cycle_length, seconds, status, error.getvalue().strip(),
-        report['verdict'],
-        item.noise_colour > 0.0, tuple(one['name'] for one in found),
-        tuple(one['name'] for one in report['present']),
-        tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
-        tuple(one['name'] for one in found if item.waveform and one['name'] in _OF_PULSES
-              and one['parameters']['std']['value'] < _SAMPLED / item.sample_rate),
-        _rms(report['error_before']), _rms(report['error_after']),
-        *chi2,
-        {f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
-         for one in found for name, value in one['parameters'].items()
-         if name in truth.get(one['name'], {}) and value['standard_error'] is not None})
+    oracle = UNDEFINED if set(effects) & set(UNKNOWN) else _oracle(
+        trace, read(folder / 'machine.npz'), truth)
+    return replace(
+        run, verdict=report['verdict'], noisy=item.noise_colour > 0.0,
+        found=tuple(one['name'] for one in found),
+        present=tuple(one['name'] for one in report['present']),
+        rivals=tuple(sorted({name for one in found for name in one['indistinguishable_from']})),
+        sampling=tuple(one['name'] for one in found if item.waveform and one['name'] in _OF_PULSES
+                       and one['parameters']['std']['value'] < _SAMPLED / item.sample_rate),
+        before=_score(trace.before), after=_score(trace.after), oracle=_score(oracle),
+        errors={f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
+                for one in found for name, value in one['parameters'].items()
+                if name in truth.get(one['name'], {}) and value['standard_error'] is not None})
 
 
-def _closed(arguments: Sequence[str], pictures: bool) -> tuple[int, Mapping[str, Any]]:
-    """Run the command; return its exit status and report."""
-    options = close_loop.make_parser().parse_args(arguments)
-    if pictures:
-        status = close_loop.main(arguments)
-        return status, {} if status else json.loads((options.output / 'report.json').read_text())
-    try:
-        return 0, loop_run.run(options, Progress('close_loop', quiet=True)).report
-    except SaJitterError as error:
-        print(error, file=sys.stderr)
-        return 2, {}
+def _oracle(trace: Trace, recording: Recording, truth: Mapping[str, Mapping[str, Any]]
+            ) -> Residual:
+    """Return the residual of the same held-out acquisitions with the true effects declared."""
+    if not trace.lines.count:
+        return UNDEFINED
+    bench = make_bench(trace.observation, [trace.observation], [recording],
+                       declared_effects(truth))
+    return bench.score((), unsteadiness=bench.unsteadiness(()))
 
 
-def _rms(error: Mapping[str, Any]) -> float:
-    if error['rms'] is None:  # no line is compared
-        return float('nan')
-    return float(np.sqrt(max(error['rms']**2 - error['rms_standard_error']**2, 0.0)))
+def _score(item: Residual) -> Score:
+    return Score(item.rms, item.chi2_per_dof, item.coverage)
 
 
 def _standard_errors(stated: Mapping[str, Any], truth: Any) -> float:
@@ -177,29 +197,49 @@ def _standard_errors(stated: Mapping[str, Any], truth: Any) -> float:
 
 
 def table(runs: Sequence[Run]) -> str:
-    """Return the confusion matrix and what became of the numbers, in Markdown."""
-    lines = ['| undeclared | runs | right | found | RMS before, after (median) | five-fold | '
-             'chi2 per dof before, after (median) | parameters within 3 standard errors |',
-             '|---|---|---|---|---|---|---|---|']
-    for effects in dict.fromkeys(run.effects for run in runs):
-        rows = [run for run in runs if run.effects == effects]
+    """Return the confusion matrix and what became of the parameters, in Markdown."""
+    lines = ['| undeclared | runs | right | found | parameters within 3 standard errors |',
+             '|---|---|---|---|---|']
+    for effects, rows in _by_effects(runs).items():
         found = Counter(f'exit {run.status}' if run.status else (
             '+'.join(run.found) or '-') + {'unexplained': ' *unexplained*'}.get(run.verdict, '')
             for run in rows)
-        good = [run for run in rows if not run.status]
-        errors = [z for run in good for z in run.errors.values() if np.isfinite(z)]
-        fall = [run.after <= 0.2 * run.before for run in good]
-        numbers = np.median(np.array([[run.before, run.after, run.chi2_before, run.chi2_after]
-                                      for run in good] or [[np.nan] * 4]), axis=0)
+        errors = [z for run in rows for z in run.errors.values() if np.isfinite(z)]
         lines.append(
-            f'| {" + ".join(effects) or "declared model"} | {len(rows)} | '
-            f'{sum(run.right for run in rows)} | '
+            f'| {effects} | {len(rows)} | {sum(run.right for run in rows)} | '
             f'{", ".join(f"{count} {name}" for name, count in found.most_common())} | '
-            f'{numbers[0]:.4f}, {numbers[1]:.4f} | '
-            f'{"-" if set(effects) <= {*_SCATTER, *UNKNOWN} else f"{sum(fall)} of {len(fall)}"} | '
-            f'{numbers[2]:.3g}, {numbers[3]:.3g} | '
             f'{f"{sum(abs(z) < 3 for z in errors)} of {len(errors)}" if errors else "-"} |')
     return '\n'.join(lines)
+
+
+def scores(runs: Sequence[Run]) -> str:
+    """
+    Return how well held-out acquisitions were predicted, in Markdown.
+
+    Only machines of which a line is compared count: medians of RMS, means of chi2 and coverage.
+    """
+    lines = ['| undeclared | machines | RMS before, after, oracle | near | chi2 per degree of '
+             'freedom before, after, oracle | coverage of 95 % before, after, oracle |',
+             '|---|---|---|---|---|---|']
+    for effects, rows in _by_effects(runs).items():
+        rows = [run for run in rows if np.isfinite(run.oracle.rms)]
+        if not rows:
+            continue
+        found = np.array([[astuple(score) for score in (run.before, run.after, run.oracle)]
+                          for run in rows])
+        rms, (chi2, coverage) = np.median(found[..., 0], axis=0), found[..., 1:].mean(axis=0).T
+        lines.append(
+            f'| {effects} | {len(rows)} | {", ".join(f"{value:.4f}" for value in rms)} | '
+            f'{sum(run.near for run in rows)} | {", ".join(f"{value:.3g}" for value in chi2)} | '
+            f'{", ".join(f"{value:.1%}" for value in coverage)} |')
+    return '\n'.join(lines)
+
+
+def _by_effects(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        found.setdefault(' + '.join(run.effects) or 'declared model', []).append(run)
+    return found
 
 
 def summary(runs: Sequence[Run]) -> str:
@@ -254,8 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                             pictures=options.pictures, scale=scale, share=options.share)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
-    print(table(runs))
-    print(summary(runs))
+    print(table(runs), scores(runs), summary(runs), sep='\n\n')
     return 0
 
 

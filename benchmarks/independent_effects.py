@@ -76,14 +76,15 @@ def target_geometry(rng: Generator, machine: Machine) -> Sized:
 
 def speed_fluctuation(rng: Generator, machine: Machine) -> Sized:
     """Return a random acceleration that lasts about a trigger cycle or longer."""
-    waves = band(rng, 0.05 / machine.trigger_period, rng.uniform(0.25, 0.6)
-                 / machine.trigger_period)
+    width = rng.uniform(0.25, 0.6)
+    waves = band(rng, 0.05 / machine.trigger_period, width / machine.trigger_period)
 
     def sized(size: float) -> tuple[Disturbance, Mapping[str, Any]]:
         acceleration = size * machine.speed / machine.trigger_period**2
         ripple = Waves(waves.rate, waves.size * acceleration / (2.0 * np.pi * waves.rate) ** 2,
                        waves.phase)
-        return Disturbance(ripple=ripple), {'acceleration_std': 2.0 * np.pi * acceleration}
+        return Disturbance(ripple=ripple), {
+            'acceleration_std': 2.0 * np.pi * acceleration, 'bandwidth': min(width, 0.5)}
     return sized
 
 
@@ -99,11 +100,13 @@ def clock_skew(rng: Generator, machine: Machine) -> Sized:
 
 def phase_wander(rng: Generator, machine: Machine) -> Sized:
     """Return torsion between tach and gears."""
-    waves = band(rng, 0.0, rng.uniform(0.15, 0.45) / machine.trigger_period)
+    width = rng.uniform(0.15, 0.45)
+    waves = band(rng, 0.0, width / machine.trigger_period)
 
     def sized(size: float) -> tuple[Disturbance, Mapping[str, Any]]:
         cycles = size * machine.speed * machine.ratio
-        return Disturbance(wander=waves.scaled(cycles)), {'std': 2.0 * np.pi * cycles}
+        return Disturbance(wander=waves.scaled(cycles)), {
+            'std': 2.0 * np.pi * cycles, 'bandwidth': width}
     return sized
 
 
@@ -138,13 +141,15 @@ def additive_noise(rng: Generator, machine: Machine) -> Sized:
 
 def amplitude_modulation(rng: Generator, machine: Machine) -> Sized:
     """Return a load that varies slowly, and all orders with it."""
-    waves = band(rng, 0.0, rng.uniform(0.3, 3.0) / machine.average)
+    width = rng.uniform(0.3, 3.0)
+    waves = band(rng, 0.0, width / machine.average)
     time = machine.start_time + machine.average * (np.arange(machine.acquisitions)[:, None]
                                                    + np.linspace(0.0, 1.0, 40))
     share = float(waves(time).mean(axis=1).std())
 
     def sized(size: float) -> tuple[Disturbance, Mapping[str, Any]]:
-        return Disturbance(gain=waves.scaled(size / share)), {'std': size / share}
+        return Disturbance(gain=waves.scaled(size / share)), {
+            'std': size / share, 'bandwidth': width / machine.trigger_cycles}
     return sized
 
 

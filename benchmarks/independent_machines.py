@@ -115,6 +115,14 @@ class Machine:
         return float(self.orders.max() * self.ratio * self.speed)
 
     @property
+    def noise_at_orders(self) -> float:
+        """Return the standard deviation of white noise that is as dense at the middle order."""
+        angle = 2.0 * np.pi * self.orders * self.ratio * self.speed / self.sample_rate
+        pole = self.noise_colour
+        gain = np.sqrt(1.0 - pole**2) / np.abs(1.0 - pole * np.exp(-1j * angle))
+        return float(self.noise_std * np.median(gain))
+
+    @property
     def levels(self) -> Array:
         """Return the peaks (channel, order) of the declared orders."""
         return np.abs(self.peaks[:, :self.orders.size])

@@ -202,8 +202,10 @@ def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, ef
     run = confusion.judge(effects, seed, tmp_path)
     assert run.right, run
     assert all(abs(z) < 4.0 for z in run.errors.values())
-    assert run.after < 0.5 * run.before or not effects  # six acquisitions to fit
+    assert run.after.rms < 0.5 * run.before.rms or not effects  # six acquisitions to fit
+    assert run.near
     assert row in confusion.table([run])
+    assert row.split('|')[1] in confusion.scores([run])
 
 
 def test_page_without_a_section_is_refused(benchmark):
