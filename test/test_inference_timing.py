@@ -12,15 +12,17 @@
 
 from dataclasses import replace
 
-from limit_coverage import limit_of, machine, MODEL, UNIT
+from limit_coverage import limit_of, lines, machine, MODEL, UNIT
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
+from sa_jitter_ros.effects.effect import largest_power
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.lattice import smooth_on_grid
 from sa_jitter_ros.effects.timing import MOTION
+from sa_jitter_ros.inference import limits
 from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing, refitted
 from sa_jitter_ros.inference.timing_choice import Chooser
@@ -44,7 +46,7 @@ CASES = {
     'correlated_jitter': ({'excess': 1.2, 'rho': 0.7}, ('std', 1.2 * UNIT)),
     'clock_skew': ({'skew': 2e-5}, ('skew', 2e-5)),
     'phase_wander': ({'wander': 1.0}, ('std', 2.0 * np.pi * MODEL.fundamental_frequency * UNIT)),
-    'path_delay': ({'delay': 0.02}, ('delay', 0.02)),
+    'path_delay': ({'delay': 0.02, 'swing': 2e-3}, ('delay', 0.02)),
 }
 
 
@@ -159,6 +161,58 @@ def test_limit_holds_as_often_as_it_says(name):
             for seed in range(24)]
     # 95 %, with four standard errors of such a count
     assert 0.95 - np.mean(held) < 4.0 * np.sqrt(0.95 * 0.05 / len(held))
+
+
+@pytest.mark.parametrize(('name', 'sizes'), [
+    ('excess_jitter', {'excess': 0.4}), ('phase_wander', {'wander': 0.5}),
+    ('correlated_jitter', {'excess': 0.5, 'rho': 0.7})])
+def test_score_of_the_true_power_is_normal(name, sizes):
+    """The power of uniform errors scatters less than that of normal ones."""
+    power = 2.0 * np.log(max(sizes.get('excess', 0.0), sizes.get('wander', 0.0)))
+    scores = []
+    for seed in range(40):
+        chooser = Chooser([machine(900 + seed, count=300, **sizes)])
+        fit = chooser.fit(frozenset([name]), held={(name, 0): power})
+        more, seen = fit.more_than_held(name, chooser.shapes.kurtosis)
+        assert seen > 0.25
+        scores.append(more)
+    assert abs(np.mean(scores)) < 4.0 / np.sqrt(len(scores))
+    assert np.std(scores) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * len(scores)))
+
+
+def test_power_has_a_limit_as_often_above_it_as_said(rng):
+    power, noise, count, draws = 0.5, 1.0, 60, 4000
+    values = (noise + power) * rng.chisquare(count, draws) / count - noise
+    held = np.mean([largest_power(value, count, noise, noise**2, 1.0) >= power
+                    for value in values])
+    # that powers are skewed makes it more: by 1.5 % of so few squares
+    assert 0.95 - 4.0 * np.sqrt(0.05 * 0.95 / draws) < held < 0.975
+    assert largest_power(1.0, 4, noise, noise**2, 1.0) == np.inf
+
+
+def test_sizes_of_a_pattern_have_one_limit_together(rng):
+    draws, truth = 4000, np.array([0.8, -1.2, 0.4])
+    covariance = 0.5 * (np.eye(3) + 1.0)
+    values = rng.multivariate_normal(truth, covariance, draws)
+    weight = np.linalg.inv(covariance)
+    far = np.array([limits._farthest(value, covariance) for value in values])
+    held = np.mean(np.einsum('di,ij,dj->d', far, weight, far) >= truth @ weight @ truth)
+    assert held == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / draws))
+
+
+@pytest.mark.parametrize(('name', 'sizes'), [
+    ('additive_noise', {'std': 0.6}), ('amplitude_modulation', {'gain': 0.4})])
+def test_limits_from_the_lines_hold_as_often_as_they_say(name, sizes):
+    draws, (size,) = 300, sizes.values()
+    held = np.mean([limit_of(lines(seed, **sizes), name) >= size for seed in range(draws)])
+    assert held == pytest.approx(0.95, abs=4.0 * np.sqrt(0.05 * 0.95 / draws))
+
+
+def test_so_few_losses_are_as_rare_as_said():
+    evidence = lines(1, lost=0.02)
+    lost, seen = int(evidence.record_missing.sum()), evidence.record_missing.size
+    assert stats.binom.cdf(lost, lost + seen, limit_of(evidence, 'missing_pulses')) == (
+        pytest.approx(0.05))
 
 
 def test_noise_that_hides_any_jitter_leaves_no_limit():

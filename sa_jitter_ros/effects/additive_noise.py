@@ -16,7 +16,7 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter)
+    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -69,10 +69,11 @@ class AdditiveNoise(DirectEffect):
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
         """Return the noise beyond the declared one that the noise around the lines allows."""
-        _, value, error = cls._power(evidence)
-        if not math.isfinite(value):
+        known, value, error = cls._power(evidence)
+        if not 0.0 < error < math.inf:
             return None
-        return cls(math.sqrt(max(value, 0.0) + ONE_SIDED * error))
+        power = largest_power(value, 2.0 * ((known + value) / error) ** 2, known, known**2, 1.0)
+        return None if math.isinf(power) else cls(math.sqrt(power))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

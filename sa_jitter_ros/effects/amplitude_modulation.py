@@ -13,14 +13,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+import math
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import (
-    fading, flat_band_correlation, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
+    fading, flat_band_correlation, memory, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter)
+    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -97,9 +98,11 @@ class AmplitudeModulation(DirectEffect):
         """Return the modulation that the amplitudes of the lines together allow."""
         if evidence.lines.radial.shape[2] < 2:
             return None
-        rows = _together(evidence)[2].mean(axis=1)
-        error = float(rows.std(ddof=1) / np.sqrt(len(rows)))
-        return cls(min(float(np.sqrt(max(rows.mean(), 0.0) + ONE_SIDED * error)), 1.0))
+        _, weight, product = _together(evidence)
+        pairs = weight.sum() ** 2 - np.sum(weight**2)
+        power = largest_power(float(product.mean()), product.size, 1.0 / weight.sum(),
+                              1.0 / pairs, memory(SLOW_BAND))
+        return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

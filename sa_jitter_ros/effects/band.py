@@ -79,6 +79,11 @@ def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
                       / (high - low))
 
 
+def memory(band: tuple[float, float]) -> float:
+    """Return the sum of squared autocorrelations at all lags of a flat spectrum in `band`."""
+    return 0.5 / (band[1] - band[0])
+
+
 def recovered_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
     """
     Return the autocovariance, at whole `lag`, of the pulse errors recovered from a unit motion.

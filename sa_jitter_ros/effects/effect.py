@@ -32,6 +32,8 @@ Array = NDArray[Any]
 
 #: What a normal variable exceeds with 5 %, in standard deviations.
 ONE_SIDED = 1.6449
+#: Standard errors of a power, where there is none, below which no limit is.
+SEEN = 0.25
 _MOST_ERRORS = 4_000_000  # of pulses in all scenarios
 
 
@@ -65,6 +67,22 @@ class ParameterRange:
 def parameter(default: Any, description: str, unit: str, **limits: Any) -> Any:
     """Return the dataclass field of a parameter; `limits` are those of `ParameterRange`."""
     return field(default=default, metadata={'range': ParameterRange(description, unit, **limits)})
+
+
+def largest_power(value: float, count: float, noise: float, square: float, memory: float
+                  ) -> float:
+    """
+    Return the 95 % limit of a random power of which `value` is an estimate, infinite for none.
+
+    An estimate of a power p by `count` squares has the variance 2 / count times (`square`
+    + 2 `noise` p + `memory` p^2); that of the limit is a value as low as this once in 20 times.
+    """
+    chance = 2.0 * ONE_SIDED**2 / count
+    left, middle = 1.0 - chance * memory, value + chance * noise
+    if left <= 0.0:
+        return math.inf
+    beyond = math.sqrt(max(middle**2 + left * (chance * square - value**2), 0.0))
+    return max((middle + beyond) / left, SEEN * math.sqrt(2.0 * square / count))
 
 
 def most_scenarios(model: DeclaredModel, wanted: int) -> int:

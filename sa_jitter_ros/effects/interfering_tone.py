@@ -32,9 +32,9 @@ class InterferingTone(DirectEffect):
     meaning: ClassVar[str] = 'a tone that no shaft makes leaks into the averages'
     remedy: ClassVar[str] = 'average more cycles (trigger_cycles), or remove its source'
     scatters: ClassVar[bool] = True
-    frequency: float = parameter(50.0, 'frequency of the tone', 'Hz', above=0.0)
     amplitude: float = parameter(0.0, "peak amplitude in units of the component's", '1',
                                  minimum=0.0)
+    frequency: float = parameter(50.0, 'frequency of the tone', 'Hz', above=0.0)
 
     def line_variance(self, model: DeclaredModel) -> Array:
         """Return the power that the comb filter of the average passes (Eq. 8)."""
@@ -51,7 +51,7 @@ class InterferingTone(DirectEffect):
         tone = evidence.lines.tone
         if tone is None or not tone.standard_error >= 0.0:
             return None
-        return cls(tone.frequency, tone.amplitude + ONE_SIDED * tone.standard_error)
+        return cls(tone.amplitude + ONE_SIDED * tone.standard_error, tone.frequency)
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -62,6 +62,6 @@ class InterferingTone(DirectEffect):
                           p_value=1.0 if tone is None else tone.p_value)
         text = (f'a line of amplitude {tone.amplitude:.3g} at {tone.frequency:.6g} Hz '
                 'that is no order of the shaft')
-        return Finding(cls.name, cls(tone.frequency, tone.amplitude),
+        return Finding(cls.name, cls(tone.amplitude, tone.frequency),
                        {'frequency': tone.frequency_error, 'amplitude': tone.standard_error},
                        tone.p_value, text)

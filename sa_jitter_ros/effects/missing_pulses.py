@@ -31,11 +31,10 @@ from sa_jitter_ros.prediction.angle_error import (
 from sa_jitter_ros.prediction.influence import mean_period, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
-from scipy.special import spherical_jn
+from scipy import special
 
 _SCENARIOS, _SEED = 256, 4
 _RULE = unit_nodes(20)
-_NONE_SEEN = 3.0  # expected losses of which none is seen once in twenty times
 _RARE = 1e-12  # probability of the losses that are left out
 
 
@@ -91,8 +90,10 @@ class MissingPulses(DirectEffect):
 
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
-        """Return the probability of losses of which these pulses could show none."""
-        return cls(min(_NONE_SEEN / max(evidence.record_missing.size, 1), 0.9))
+        """Return the probability of which as few losses are as rare as 5 % (Clopper, Pearson)."""
+        missing = evidence.record_missing
+        return cls(min(float(special.betaincinv(
+            missing.sum() + 1.0, max(missing.size, 1), 0.95)), 0.9))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -160,7 +161,7 @@ def _fourier_weights(omega: Array) -> Array:
     u, w = _RULE
     degree = np.arange(u.size)
     polynomials = legendre.legvander(2.0 * u - 1.0, u.size - 1)  # (u, degree)
-    bessel = spherical_jn(degree, 0.5 * omega[..., None])
+    bessel = special.spherical_jn(degree, 0.5 * omega[..., None])
     transforms = (2 * degree + 1) * 1j**degree * bessel * np.exp(0.5j * omega)[..., None]
     return np.asarray(transforms @ (polynomials * w[:, None]).T)
 

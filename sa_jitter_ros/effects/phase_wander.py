@@ -45,7 +45,8 @@ class PhaseWander(Effect):
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,
         tuple((0.0, float(np.log(edge)), 0.7) for edge in (_NARROW, 0.15, 0.4)),
-        (-9.0, None, 0.0), (14.0, float(np.log(0.5)), 2.0))
+        (-9.0, None, 0.0), (14.0, float(np.log(0.5)), 2.0),
+        limited=(-9.0, float(np.log(_NARROW)), 0.0))
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
     bandwidth: float = parameter(

@@ -59,7 +59,8 @@ class Spectrum:
 
     `starts` are values of its parameters from which a fit begins, one after the other: the first
     parameter is the logarithm of its power. `lower` and `upper` are bounds; `lower` None stands
-    for the lowest frequency that a recording resolves, as a logarithm.
+    for the lowest frequency that a recording resolves, as a logarithm. `limited` are those from
+    which on limits are stated, where they are others than `lower`.
     """
 
     direction: str
@@ -67,6 +68,7 @@ class Spectrum:
     starts: tuple[tuple[float, ...], ...]
     lower: tuple[float | None, ...]
     upper: tuple[float, ...]
+    limited: tuple[float | None, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -14,36 +14,37 @@
 """
 Limits: how large an effect that was not found could still be, at 95 %.
 
-Limits are one-sided. Of a random effect it is where the profile of the likelihood, all other
-parameters at their best, has fallen by what a normal variable exceeds once in twenty times; of a
-pattern, whose size has either sign, it is the size of which an estimate as small is as rare.
+Limits are one-sided. Of a random effect it is the power beside which the data show, all other
+parameters at their best, as little as a normal variable falls short by once in twenty times; of a
+pattern, whose sizes have either sign, it is the size of which estimates as small are as rare.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import DirectEffect, parameter_ranges
+from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
+from sa_jitter_ros.effects.effect import (
+    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Pattern, Spectrum
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
-from scipy import optimize, special
+from scipy import special
 
 Array = NDArray[Any]
 
 _CONFIDENCE = 0.95
-_FALL = float(special.ndtri(_CONFIDENCE)) ** 2
 _TWO_SIDED = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
 _LEAST = -9.0  # logarithm of a power that is nothing
-_STEP, _EXACT = 1.5, 0.02  # of a logarithm of power
+_STEPS, _EXACT = 20, 0.01  # of a logarithm of power
+_SLOWEST = 0.2  # share of a step by which the next one is shorter
 _RESOLUTION = 4.0  # spacings of a number: finer grids are its own
 
 
@@ -104,59 +105,61 @@ def _size(effect: Effect | None) -> float | None:
 def largest(timing: Timing, name: str) -> Effect | None:
     """Return the largest effect on the timing of some name that the data allow, None for none."""
     chooser, choice, kind = timing.chooser, timing.choice, EFFECTS[name]
-    names = choice.best | {name}
     if isinstance(kind.timing, Pattern):
         if name not in chooser.patterns:
             return None
-        fit = chooser.fit(names, choice.fit.starts)
-        sizes, covariance = fit.pattern(name)
-        error = np.sqrt(np.diag(covariance))
-        wide = np.array([_folded(*pair) for pair in zip(np.abs(sizes), error)])
-        return kind.of_timing(wide, covariance, choice.setting)[0]
+        sizes, covariance = chooser.fit(choice.best | {name}, choice.fit.starts).pattern(name)
+        return kind.of_timing(_farthest(sizes, covariance), covariance, choice.setting)[0]
     if not isinstance(kind.timing, Spectrum):
         return None
+    found = _bound(timing, name, kind.timing.upper[0], ONE_SIDED)
+    return None if found is None else kind.of_timing(
+        found, np.zeros(len(kind.timing.upper)), choice.setting)[0]
+
+
+def _bound(timing: Timing, name: str, top: float, far: float) -> Array | None:
+    """
+    Return the parameters of a component that has `far` standard errors more power than is seen.
+
+    A negative number stands for less; None is returned where the logarithm is beyond `top`.
+    """
+    chooser, choice = timing.chooser, timing.choice
+    names, kurtosis = choice.best | {name}, chooser.shapes.kurtosis if chooser.shapes else 0.0
     fit = chooser.fit(names, choice.fit.starts)
-    best, start = max(fit.value, choice.fit.value), dict(fit.starts)
-
-    @cache  # fits start where others ended: another one may differ by a little
-    def fallen(log_power: float) -> float:
-        held = chooser.fit(names, start, held={(name, 0): log_power})
-        start.update(held.starts)
-        return 2.0 * (best - held.value) - _FALL
-
-    low = max(float(fit.starts[name][0]), _LEAST)
-    high, top = low + _STEP, kind.timing.upper[0]
-    while high < top and fallen(high) < 0.0:
-        low, high = high, high + _STEP
-    high = min(high, top)
-    if fallen(high) < 0.0:  # however large it is
-        return None
-    at = float(optimize.brentq(
-        fallen, low, high, xtol=_EXACT, disp=False)) if fallen(low) < 0.0 else low
-    held = chooser.fit(names, start, held={(name, 0): at})
-    return kind.of_timing(held.starts[name], np.zeros(len(kind.timing.upper)), choice.setting)[0]
+    at, low, high = max(float(fit.starts[name][0]), _LEAST), -math.inf, top
+    last: tuple[float, float] | None = None
+    for _ in range(_STEPS):
+        fit = chooser.fit(names, fit.starts, held={(name, 0): at})
+        more, seen = fit.more_than_held(name, kurtosis)
+        # where the power that is seen, and its standard error, do not depend on the one held
+        step = math.log(max(seen + more + far, SEEN) / seen)
+        if abs(step) < _EXACT:
+            return fit.starts[name]
+        low, high = (at, high) if step > 0.0 else (low, at)
+        turn = 1.0 if last is None else (last[1] - step) / (at - last[0])
+        last, to = (at, step), at + step / float(np.clip(turn, _SLOWEST, 1.0))
+        at = to if low < to < high else 0.5 * (max(low, at + step) + high)
+    return fit.starts[name] if high < top else None
 
 
-def _folded(size: float, error: float) -> float:
-    """Return the size of which an estimate of at most `size`, either sign, is as rare as 5 %."""
-    def missed(true: float) -> float:
-        return float(special.ndtr(size / error - true) - special.ndtr(-size / error - true)) - (
-            1.0 - _CONFIDENCE)
+def _farthest(sizes: Array, covariance: Array) -> Array:
+    """
+    Return the sizes of a pattern of which estimates as near to 0 as these are as rare as 5 %.
 
-    if error <= 0.0 or not math.isfinite(error):
-        return size
-    if missed(1.0) < 0.0:  # never below a standard error
-        return error
-    return error * float(optimize.brentq(missed, 1.0, size / error + 10.0))
+    How far estimates are from 0, in squared standard errors, has a noncentral chi2 distribution.
+    """
+    distance = float(sizes @ np.linalg.pinv(covariance) @ sizes)
+    if not 0.0 < distance < math.inf:
+        return sizes
+    true = max(float(special.chndtrinc(distance, sizes.size, 1.0 - _CONFIDENCE)), 1.0)
+    return np.asarray(sizes * math.sqrt(true / distance))
 
 
-def _of_scale(timing: Timing) -> tuple[float, Effect]:
+def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
     """Return the interval of the size of the declared jitter."""
-    choice = timing.choice
-    fit = timing.chooser.fit(choice.best | {JITTER}, choice.fit.starts)
-    middle, error = float(fit.starts[JITTER][0]), float(fit.standard_errors(JITTER)[0])
-    low, high = (math.exp(0.5 * (middle + sign * _TWO_SIDED * error)) for sign in (-1.0, 1.0))
-    return low, JitterScale(high)
+    low, high = (_bound(timing, JITTER, -_LEAST, sign * _TWO_SIDED) for sign in (-1.0, 1.0))
+    return (None if low is None else math.exp(0.5 * low[0]),
+            None if high is None else JitterScale(math.exp(0.5 * high[0])))
 
 
 def _of_speed(timing: Timing) -> Effect | None:
@@ -166,9 +169,10 @@ def _of_speed(timing: Timing) -> Effect | None:
         return None
     bends = np.concatenate([item.bends for item in parts])
     noise = float(np.mean([item.bend_std**2 for item in parts]))
-    power = max(float(np.mean(bends**2)) - noise, 0.0)
-    power += math.sqrt(_FALL * 2.0 / bends.size) * (noise + power)
-    return SpeedFluctuation.of_ripple(math.sqrt(power), timing.choice.setting.model)
+    power = largest_power(float(np.mean(bends**2)) - noise, bends.size, noise, noise**2,
+                          memory(ACCELERATION_BAND))
+    return None if math.isinf(power) else SpeedFluctuation.of_ripple(
+        math.sqrt(power), timing.choice.setting.model)
 
 
 def _coarsest_clock(times: Array) -> float | None:

@@ -18,7 +18,7 @@ were tried give each effect its probability.
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, product
 import math
@@ -284,6 +284,9 @@ class Chooser:
             elif name not in names and name in self.patterns:
                 known = known + self.patterns[name][1] @ sizes
         spectra = {name: self.spectra[name] for name in sorted(names & self.spectra.keys())}
+        for name, _ in held or ():
+            if name in spectra and spectra[name].limited:
+                spectra[name] = replace(spectra[name], lower=spectra[name].limited)
         patterns = {name: self.patterns[name] for name in sorted(names) if name in self.patterns}
         new = [[(name, np.array(first)) for first in item.starts] for name, item in spectra.items()
                if name not in start]

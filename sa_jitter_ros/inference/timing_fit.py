@@ -39,6 +39,7 @@ _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # logarithm of the noise power
 _ROUNDS, _FIRST_STEPS, _STEPS, _SAME = 4, 150, 60, 0.05
 _STEP, _CURVED = 1e-5, 1e-3
+_NOTHING = 1e-12  # information
 _LOW, _HIGH = -16.0, 16.0
 
 
@@ -261,6 +262,39 @@ class TimingFit:
     def standard_errors(self, name: str) -> Array:
         """Return the standard errors of the parameters of a random component."""
         return np.asarray(np.sqrt(np.diag(self._covariance)[self.place[name]]))
+
+    def more_than_held(self, name: str, kurtosis: float) -> tuple[float, float]:
+        """
+        Return how much more power than a held one the data show, and how much it is more than 0.
+
+        Both are in standard errors of the efficient score (Rao 1948): the slope of the likelihood
+        by the logarithm of the power, less what the free parameters make of it. `kurtosis` is that
+        of the declared errors beyond a normal one's 3: so much more their power scatters.
+        """
+        at, size = self.parameters, self.data.size
+        chosen = np.append(self.place[name].start,
+                           np.flatnonzero((self.lower < at) & (at < self.upper)))
+        steps = _CURVED * np.eye(at.size)[chosen]
+        change = np.stack([self.inverse @ (self.spectrum(at + step) - self.spectrum(at - step))
+                           for step in steps]) / (2.0 * _CURVED)
+        prior = np.stack([self._prior(at + step)[1] - self._prior(at - step)[1]
+                          for step in steps]) / (2.0 * _CURVED)
+        known = prior[:, chosen] + np.einsum('f,afij,bfji->ab', size, change, change).real
+        known[1:, 1:] += np.diag(12.0 / (self.upper - self.lower)[chosen[1:]] ** 2)
+        share = np.append(1.0, -np.linalg.solve(known[1:, 1:], known[1:, 0]))
+        information = max(float(share @ known[0]), _NOTHING)
+        weight = np.einsum('a,afij->fij', share, change)
+        declared = np.einsum('f,fij,fji->', size, weight @ self.inverse, self._at_zero(PULSES)
+                             ).real * self.data.measured
+        if JITTER in self.place:  # more may be of normal errors beside
+            power = float(at[self.place[JITTER]][0])
+            declared *= math.exp(power if name == JITTER else min(power, 0.0))
+        error = math.sqrt(information + 0.5 * kurtosis * declared**2 / np.sum(size))
+        # powers of few frequencies are skewed: a gamma variable by the root of its cube is normal
+        skewness = 2.0 * np.einsum('f,fij,fjk,fki->', size, *3 * [weight]).real
+        few = float(skewness) / information**1.5 / 6.0
+        more = float(-share @ self._cost(at)[1][chosen]) / error
+        return float(np.cbrt(1.0 + 3.0 * few * more) - 1.0) / few + few, information / error
 
     def pattern(self, name: str) -> tuple[Array, Array]:
         """Return the sizes of the columns of a pattern and their covariance."""

@@ -55,11 +55,16 @@ def errors_left(item: Stretch, unit: float, known: Array) -> Array:
 
 
 class Shapes:
-    """Distributions of single errors that are a declared one, of any size, and normal ones."""
+    """
+    Distributions of single errors that are a declared one, of any size, and normal ones.
+
+    `kurtosis` is that of the declared one beyond a normal one's 3.
+    """
 
     def __init__(self, distribution: PulseErrorDistribution) -> None:
         draws = np.asarray(distribution.draw(np.random.default_rng(_SEED), (_DRAWN,)))
         draws = (draws - draws.mean()) / draws.std()
+        self.kurtosis = float(np.mean(draws**4)) - 3.0
         self.edges = np.quantile(draws, np.linspace(0.0, 1.0, _PARTS + 1))
 
     def gain(self, fit: TimingFit, errors: list[Array], power: float) -> float:
