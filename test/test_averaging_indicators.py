@@ -343,6 +343,13 @@ class TestStandardErrors:
                     for item in (before, running.get())]
         assert relative[1] == pytest.approx(relative[0], rel=0.2)
 
+    def test_a_channel_of_zeros_has_none_and_warns_of_nothing(self, recwarn):
+        running, parts = RunningIndicators(GearSettings([19])), np.zeros((3, 1, 64))
+        for _ in range(2):
+            running.update(parts[0], WaveformParts(np.ones(3), parts))
+        assert np.isnan(running.get().standard_errors).all()
+        assert not list(recwarn)
+
     def test_without_parts_there_are_none(self, rng):
         running = RunningIndicators()
         running.update(rng.normal(size=(1, 64)))

@@ -307,8 +307,8 @@ class RunningIndicators:
         if parts is not None and len(replicates):
             with np.errstate(divide='ignore', invalid='ignore'):
                 logarithms = np.log(values)
-            error = self._error(logarithms[0], self._history.variance + jackknife_variance(
-                logarithms[0], logarithms[1:], parts.counts))
+                error = self._error(logarithms[0], self._history.variance + jackknife_variance(
+                    logarithms[0], logarithms[1:], parts.counts))
         self._latest = ConditionIndicators(values[0], count + 1, error)
 
     def _error(self, logarithm: Array, variance: Array) -> Array:
