@@ -13,12 +13,14 @@
 from dataclasses import replace
 
 import numpy as np
-from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader, AverageMessage
+from sa_jitter_ros.averaging.results import (
+    AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.monitoring.monitor import Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import monitored
 
 ORDERS, LEVELS = (1.0, 19.0, 38.0), np.array([0.2, 1.0, 0.5])
 NAMES, INDICATORS = ('rms', 'kurtosis', 'm8a'), np.array([0.8, 1.8, 100.0])
+BEARINGS = np.array([4.9])
 CHANNELS, SECONDS = 2, 60.0  # between averages
 SETTINGS = Settings(learning_averages=200)
 
@@ -29,18 +31,20 @@ class DrawnMachine:
 
     `keyphasor` is the noise that the correction adds, times that of the vibration; `bias` what it
     leaves of the loss, relative, and says so in its standard error; `load` is a relative factor of
-    all amplitudes that scatters, `gain` (channel, order) multiplies the amplitudes.
+    all amplitudes that scatters, `gain` (channel, order) multiplies the amplitudes, `damage` the
+    indicators, `strikes` (channel, bearing order) the depth of the modulation by a bearing.
     """
 
     def __init__(self, seed, *, noise=0.01, load=0.002, keyphasor=0.0, bias=0.0):
-        self.rng = np.random.default_rng(seed)
+        self.rng, self.bearing_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
         self.noise, self.load, self.keyphasor, self.bias = noise, load, keyphasor, bias
         self.gain = np.ones((CHANNELS, len(ORDERS)))
         self.damage = np.ones((CHANNELS, len(NAMES)))
+        self.strikes = np.ones((CHANNELS, len(BEARINGS)))
         self.speed, self.sequence, self.corrected = 16.6, 0, True
 
     def messages(self):
-        """Return order amplitudes, indicators and their errors of the next average."""
+        """Return order amplitudes, indicators, their errors and the envelope of an average."""
         rng, shape = self.rng, (CHANNELS, len(ORDERS))
         start = self.sequence * SECONDS
         header = AverageHeader(start, start + 2.0, self.sequence, 30, 72, self.speed)
@@ -61,7 +65,16 @@ class DrawnMachine:
             scatter * rng.standard_normal((CHANNELS, len(NAMES))))
         return (AverageMessage(header, table, AMPLITUDE_FIELDS),
                 AverageMessage(header, indicators, NAMES),
-                AverageMessage(header, scatter * indicators, NAMES))
+                AverageMessage(header, scatter * indicators, NAMES),
+                AverageMessage(header, self._envelope(), ENVELOPE_FIELDS))
+
+    def _envelope(self):
+        """Return squared-envelope amplitudes, which a load of 30 % moves with their mean."""
+        rng = self.bearing_rng
+        mean = np.exp(0.3 * rng.standard_normal())
+        depth = 0.1 * self.strikes * np.exp(0.05 * rng.standard_normal(self.strikes.shape))
+        return np.stack(np.broadcast_arrays(BEARINGS, BEARINGS, mean * depth, mean * 0.005, mean),
+                        axis=-1)
 
     def average(self):
         """Return what is monitored of the next average."""

@@ -303,7 +303,7 @@ def test_missing_numbers_cost_themselves_alone():
     machine = Machine(10)
     monitor = machine.monitor()
     for number in range(700):
-        orders, indicators, errors = machine.messages()
+        orders, indicators, errors, _ = machine.messages()
         orders.values[0, 2, 3:] = np.nan  # an order that never has an amplitude
         if number % 3 == 0:
             orders.values[1, 1, 3:] = np.nan
@@ -324,14 +324,29 @@ def test_averages_that_are_not_corrected_or_overlap_are_left_out():
     machine.run(monitor, 10)
     machine.corrected = False
     machine.run(monitor, 10)
-    assert (monitor.averages, monitor.uncorrected) == (10, 10)
+    assert (monitor.averages, monitor.uncorrected) == (20, 10)
+    # the envelope of the residual signal needs no correction
+    assert monitor.baseline(16.6).averages[0].tolist() == [10.0] * 6 + [20.0]
     machine.corrected = True
     average = machine.average()
-    for shift in (0.0, 0.5, 1.0, 1.9, 2.0):  # sliding averages of 2 s
-        header = replace(average.header, start_time=average.header.start_time + shift,
-                         end_time=average.header.end_time + shift)
+    for later in range(31):  # sliding averages of 30 cycles
+        header = replace(average.header, sequence=average.header.sequence + later,
+                         start_time=average.header.start_time + later / 15.0,
+                         end_time=average.header.end_time + later / 15.0)
         monitor.update(replace(average, header=header))
-    assert (monitor.averages, monitor.overlapping) == (12, 3)
+    assert (monitor.averages, monitor.overlapping) == (22, 29)
+
+
+def test_recordings_whose_times_begin_anew_do_not_overlap():
+    """One average of each of them: start and length differ a little from day to day."""
+    machine, rng = Machine(16), np.random.default_rng(16)
+    monitor = machine.monitor()
+    for sequence in range(40):
+        start, seconds = rng.uniform(0.0, 0.06), rng.uniform(1.8, 2.2)
+        average = machine.average()
+        monitor.update(replace(average, header=replace(
+            average.header, sequence=sequence, start_time=start, end_time=start + seconds)))
+    assert (monitor.averages, monitor.overlapping) == (40, 0)
 
 
 def test_raw_amplitudes_are_monitored_on_request():
@@ -354,6 +369,46 @@ def test_raw_amplitudes_are_monitored_on_request():
     assert monitor.monitors['input'].uncorrected == 1
 
 
+def test_a_bearing_order_changes_alone_whatever_load_and_correction():
+    machine = Machine(17)
+    monitor = machine.monitor()
+    machine.corrected = False
+    assert machine.run(monitor, 400) == []
+    machine.strikes[1] = 1.2
+    line, = machine.run(monitor, 100)
+    assert line.startswith('bearing order 4.9 of input, channel 1: +')
+    found, = monitor.changes()
+    assert (found.kind, found.name, found.keyphasor_share) == ('bearing', '4.9', 0.0)
+    assert found.change == pytest.approx(0.2, abs=4.0 * found.standard_error)
+
+
+def test_shaft_without_bearing_orders_waits_for_none_once_it_is_known():
+    monitor = MachineMonitor('pump 3', ['input'], SETTINGS)
+    taken = []
+    machine = Machine(18)
+    for _ in range(6):
+        for kind, array in zip(KINDS[:3], machine.messages()):
+            monitor.take('input', kind, array)
+        taken.append(monitor.averages)
+    assert taken == [0, 0, 0, 0, 5, 6]
+    later = MachineMonitor('pump 3', ['input'], SETTINGS)
+    for kind, array in zip(KINDS[:3], machine.messages()):
+        later.take('input', kind, array)
+    later.finish()
+    assert later.averages == 1
+
+
+def test_bearing_orders_that_the_baseline_lacks_are_refused():
+    machine = Machine(19)
+    orders, indicators, errors, envelope = machine.messages()
+    monitor = MachineMonitor('pump 3', ['input'], SETTINGS)
+    monitor.take_average('input', monitored(orders, indicators, errors))
+    with pytest.raises(ParameterError, match=r'3 indicators, bearing orders 4\.9, its baseline'):
+        monitor.take_average('input', machine.average())
+    with pytest.raises(MessageError, match='1 channels of the envelope and 2 of orders'):
+        monitored(orders, indicators, errors, replace(envelope, values=envelope.values[:1]))
+
+
 def test_average_without_indicators_keeps_none_waiting():
     machine, monitor = Machine(15), MachineMonitor('pump 3', ['input'], SETTINGS)
     for number in range(20):
@@ -364,7 +419,7 @@ def test_average_without_indicators_keeps_none_waiting():
 
 
 def test_arrays_that_do_not_fit_are_refused():
-    orders, indicators, errors = Machine(12).messages()
+    orders, indicators, errors, _ = Machine(12).messages()
     with pytest.raises(MessageError, match='1 channels of indicators and 2 of orders'):
         monitored(orders, replace(indicators, values=indicators.values[:1]), errors)
     with pytest.raises(ParameterError, match='learn at least 8 groups, 40 averages'):
@@ -465,7 +520,7 @@ def test_baseline_of_another_machine_is_refused(kept):
         read_baseline(path, 'pump 4', SETTINGS)
     with pytest.raises(RecordingError, match='was learnt with group_averages 5, now it is 4'):
         read_baseline(path, 'pump 3', replace(SETTINGS, group_averages=4))
-    orders, indicators, errors = machine.messages()
+    orders, indicators, errors, _ = machine.messages()
     orders.values[..., 0] += 1.0
     with pytest.raises(ParameterError, match=r'orders 2, 20, 39 .* another machine'):
         monitor.update(monitored(orders, indicators, errors))

@@ -94,6 +94,17 @@ def test_learns_then_names_the_change(ros_graph):
     assert b.diagnostics()[0] == WARN
 
 
+def test_speeds_that_are_never_learnt_are_said(ros_graph):
+    b, machine = MonitorBench(ros_graph), DrawnMachine(13)
+    for number in range(24):
+        machine.speed = (16.6, 20.0, 24.0)[number % 3]
+        b.play(machine, 2)
+    assert b.diagnostics()[:2] == (
+        OK, 'learning: 16 of 40 averages of input at 24.53 Hz, of 48 at all speeds: a larger '
+        'speed_bin learns sooner')
+    assert not b.change()['baseline']['complete']
+
+
 def test_late_subscriber_gets_the_last_answer(ros_graph):
     b = MonitorBench(ros_graph)
     b.play(DrawnMachine(2), 12)
@@ -120,7 +131,7 @@ def test_missing_correction_is_said(ros_graph):
     assert level == WARN
     assert text.startswith('comparison of input: without 3 of the latest 10 averages, '
                            'order_amplitude has no corrected amplitudes')
-    assert (values['uncorrected'], values['baseline_averages']) == ('3', '8')
+    assert (values['uncorrected'], values['baseline_averages']) == ('3', '11')
     machine.corrected = True
     b.play(machine, 9)
     assert b.diagnostics()[1].startswith('comparison of input: without 1 of the latest 10 ')
@@ -153,9 +164,9 @@ def test_averager_without_indicators_is_monitored(ros_graph):
 
 def test_wrong_messages_cost_themselves(ros_graph):
     b, machine = MonitorBench(ros_graph), DrawnMachine(8)
-    orders, indicators, errors = machine.messages()
+    orders, indicators, errors, envelope = machine.messages()
     b.send('input/order_amplitude', Float64MultiArray())
-    for kind, array in zip(KINDS, (orders, indicators, errors)):
+    for kind, array in zip(KINDS, (orders, indicators, errors, envelope)):
         message = messages.encode_average(kind, array)
         if kind == 'condition_indicator':  # of one channel
             message.layout.dim[0].size = 1
@@ -306,9 +317,9 @@ def test_baseline_of_another_machine_is_refused_and_kept(learned):
         assert (level, "machine 'pump 3', this one is 'pump 4'" in text) == (ERROR, True)
         b.play(machine, 10)
     with running(baseline_file=str(path)) as b:
-        orders, indicators, errors = machine.messages()
+        orders, indicators, errors, envelope = machine.messages()
         orders.values[..., 0] += 1.0
-        for kind, array in zip(KINDS, (orders, indicators, errors)):
+        for kind, array in zip(KINDS, (orders, indicators, errors, envelope)):
             b.send(f'input/{kind}', messages.encode_average(kind, array))
         level, text, _ = b.diagnostics()
         assert (level, 'orders 2, 20, 39' in text) == (ERROR, True)

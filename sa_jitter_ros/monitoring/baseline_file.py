@@ -159,7 +159,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 def _restored(shaft: str, layout: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]],
               settings: Settings, share: float) -> ShaftMonitor:
     monitor = ShaftMonitor(shaft, Layout(
-        int(layout['channels']), tuple(layout['orders']), tuple(layout['indicators'])),
+        int(layout['channels']), tuple(layout['orders']), tuple(layout['indicators']),
+        tuple(layout.get('bearings', ()))),  # older files have none
         settings, share=share)
     monitor.restore({name.partition('/')[2]: array for name, array in arrays.items()
                      if name.partition('/')[0] == shaft})

@@ -11,20 +11,24 @@
 """The change monitor of a machine: arrays of results in, changes of all its shafts out."""
 
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from sa_jitter_ros.averaging.results import AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
-from sa_jitter_ros.errors import MessageError, RecordingError
+from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.monitoring.baseline_file import (
     lock_baseline, read_baseline, write_baseline)
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
-from sa_jitter_ros.monitoring.quantities import monitored, MonitoredAverage
+from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
 
 #: Topics of a shaft whose arrays make one average, by the names of their arrays.
-KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error')
+KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
+         'envelope_amplitude')
 # Averages that wait for arrays that are on their way; older ones do without.
 _WAITING = 4
 # Averages without indicators after which a shaft is taken to have none.
@@ -36,11 +40,16 @@ class Pairing:
     Puts the arrays of one average together, which come on topics of their own.
 
     Each topic keeps its order: when an average is complete, those before it will not become more.
-    With `allow_uncorrected` raw amplitudes count where there are no corrected ones.
+    Which kinds a shaft has is known from its `layout`, or when an average has waited in vain for
+    the others. With `allow_uncorrected` raw amplitudes count where there are no corrected ones.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, layout: Layout | None = None) -> None:
         self.allow_uncorrected = False
+        self._kinds = {*KINDS} if layout is None else {
+            KINDS[0], *(KINDS[1:3] if layout.indicators else ()),
+            *(KINDS[3:] if layout.bearings else ())}
+        self._came: set[str] = set()
         self._waiting: dict[tuple[int, float], dict[str, AverageMessage]] = {}
 
     def add(self, kind: str, message: AverageMessage) -> list[MonitoredAverage]:
@@ -51,12 +60,22 @@ class Pairing:
         """
         key = message.header.sequence, message.header.start_time
         self._waiting.setdefault(key, {})[kind] = message
+        self._came.add(kind)
         keys = [*self._waiting]
         count = max(len(keys) - _WAITING, 0)
-        if len(self._waiting[key]) == len(KINDS):
+        if count:
+            self._kinds = self._came.copy()
+        if self._waiting[key].keys() >= self._kinds:
             count = max(count, keys.index(key) + 1)
-        ready = [self._waiting.pop(item) for item in keys[:count]]
-        return [monitored(parts[KINDS[0]], parts.get(KINDS[1]), parts.get(KINDS[2]),
+        return self._take(count)
+
+    def flush(self) -> list[MonitoredAverage]:
+        """Return the averages that still wait, when no more arrays come."""
+        return self._take(len(self._waiting))
+
+    def _take(self, count: int) -> list[MonitoredAverage]:
+        ready = [self._waiting.pop(item) for item in [*self._waiting][:count]]
+        return [monitored(parts[KINDS[0]], *(parts.get(kind) for kind in KINDS[1:]),
                           allow_uncorrected=self.allow_uncorrected)
                 for parts in ready if KINDS[0] in parts]
 
@@ -84,13 +103,22 @@ class MachineMonitor:
                 raise
             self.monitors = {shaft: found[shaft] for shaft in shafts if shaft in found}
             self._others = {name: item for name, item in found.items() if name not in shafts}
-        self._pairings = {shaft: Pairing() for shaft in shafts}
+        self._pairings = {
+            shaft: Pairing(self.monitors[shaft].layout if shaft in self.monitors else None)
+            for shaft in shafts}
         self._without = dict.fromkeys(shafts, 0)
         self.use(settings)
         #: How many of the latest averages of each shaft had no corrected amplitudes.
         self.uncorrected = {shaft: Shortfall() for shaft in shafts}
         #: Whether the file lacks what is known now.
         self.unsaved = False
+
+    def finish(self) -> None:
+        """Take the averages that still wait for arrays, and fit."""
+        for shaft, pairing in self._pairings.items():
+            with suppress(MessageError, ParameterError):
+                for average in pairing.flush():
+                    self.take_average(shaft, average)
 
     def close(self) -> None:
         """Let others use the file."""
@@ -112,21 +140,24 @@ class MachineMonitor:
         Raises MessageError for arrays that do not fit each other, ParameterError for those that
         do not fit the baseline.
         """
-        lines: list[str] = []
-        for average in self._pairings[shaft].add(kind, message):
-            self.uncorrected[shaft].add(not average.is_known)
-            monitor = self.monitors.get(shaft) or self._begin(shaft, average)
-            if monitor is not None:
-                lines += monitor.update(average)
-                self.unsaved = True
-        return lines
+        return [line for average in self._pairings[shaft].add(kind, message)
+                for line in self.take_average(shaft, average)]
+
+    def take_average(self, shaft: str, average: MonitoredAverage) -> list[str]:
+        """Take a whole average, as `take` does its arrays."""
+        self.uncorrected[shaft].add(not average.is_corrected)
+        monitor = self.monitors.get(shaft) or self._begin(shaft, average)
+        if monitor is None:
+            return []
+        self.unsaved = True
+        return monitor.update(average)
 
     def _begin(self, shaft: str, average: MonitoredAverage) -> ShaftMonitor | None:
         """Return a new monitor, or None while it is not known what the shaft has."""
         if not average.layout.channels:
             raise MessageError('average of no channel: publish at least one')
         self._without[shaft] += 1
-        if not (average.is_known and (average.layout.indicators
+        if not (np.isfinite(average.values).any() and (average.layout.indicators
                                       or self._without[shaft] >= _WITHOUT)):
             return None
         self.monitors[shaft] = ShaftMonitor(
@@ -151,12 +182,9 @@ class MachineMonitor:
 
     def report(self) -> dict[str, Any]:
         """Return the object of the topic `change`, without NaN and infinities."""
-        names = ('shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_sequence',
-                 'since_time', 'keyphasor_share', 'p_value')
         found: dict[str, Any] = json_values({
             'baseline': {'averages': self.averages, 'complete': self.is_complete},
-            'changes': [{name: getattr(item, name) for name in names}
-                        for item in self.changes()]})
+            'changes': [asdict(item) for item in self.changes()]})
         return found
 
     def save(self) -> None:

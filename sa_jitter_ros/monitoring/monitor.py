@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
-from sa_jitter_ros.monitoring.quantities import Layout, MonitoredAverage
+from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import Parameter, Values
 from scipy import special
@@ -35,6 +36,8 @@ YEAR = 365.25 * 86400.0  # s
 _MOST_BINS = 64
 # Intervals between averages of which the median counts.
 _INTERVALS = 256
+# Difference in trigger cycles up to which an average follows another in one run.
+_SAME_RUN = 0.1
 # Deviations beyond so many standard deviations say nothing of the covariance.
 _FARTHEST = 4.0
 
@@ -115,14 +118,16 @@ class Change:
         >>> str(change).partition('; ')[2]
         'the keyphasor explains 0.3 %'
         """
-        what = f'order {self.name}' if self.kind == 'order' else self.name
+        return self.words(f'average {self.since_sequence}')
+
+    def words(self, since: str) -> str:
+        """Return the change in words, with what it is `since`."""
         error = 100.0 * self.standard_error
         known = math.isfinite(error) and error > 0.0
         digits = min(max(-math.floor(math.log10(error)), 0), 6) if known else 1
-        return (f'{what} of {self.shaft}, channel {self.channel}: '
-                f'{100.0 * self.change:+.{digits}f} +- {error:.{digits}f} %, since average '
-                f'{self.since_sequence}; the keyphasor explains '
-                f'{100.0 * self.keyphasor_share:.1f} %')
+        return (f'{in_words(self.kind, self.name)} of {self.shaft}, channel {self.channel}: '
+                f'{100.0 * self.change:+.{digits}f} +- {error:.{digits}f} %, since {since}; '
+                f'the keyphasor explains {100.0 * self.keyphasor_share:.1f} %')
 
 
 @dataclass(frozen=True)
@@ -157,6 +162,17 @@ def _of_amplitude(change: float, error: float, doubt: float, square: float, leas
         2.0 * unit**2)
 
 
+def _slides(before: AverageHeader, now: AverageHeader) -> bool:
+    """
+    Return whether an average is as many trigger cycles after another as it is numbers.
+
+    So are averages that share cycles. Where the source began again, its times are others.
+    """
+    cycle = (now.end_time - now.start_time) / max(now.trigger_cycles + now.discarded_cycles, 1)
+    return all(abs(later / cycle - (now.sequence - before.sequence)) < _SAME_RUN for later in (
+        now.start_time - before.start_time, now.end_time - before.end_time))
+
+
 class _Group:
     """Sums over consecutive averages in one bin of speed."""
 
@@ -183,15 +199,16 @@ class ShaftMonitor:
     """
     Learns the baseline of a shaft and tests new averages against it.
 
-    `share` is the part of the false alarms that this shaft may cause. Averages with other channels
-    or orders raise ParameterError; indicators may be missing.
+    `share` is the part of the false alarms that this shaft may cause, `memory` as in `ChangeTest`.
+    Averages with other channels or orders raise ParameterError; indicators may be missing.
     """
 
-    def __init__(self, shaft: str, layout: Layout, settings: Settings, *, share: float = 1.0
-                 ) -> None:
+    def __init__(self, shaft: str, layout: Layout, settings: Settings, *, share: float = 1.0,
+                 memory: float = 0.0) -> None:
         self.shaft, self.layout, self.settings, self._share = shaft, layout, settings, share
         channels, count = layout.shape
-        self._test = ChangeTest((1, channels * count), learning=settings.learning_groups)
+        self._test = ChangeTest((1, channels * count), learning=settings.learning_groups,
+                                memory=memory)
         # Sums of products of scores of a channel, and their numbers.
         self._products: FloatArray = np.zeros((2, channels, count, count))
         self._groups: dict[int, _Group] = {}
@@ -199,6 +216,7 @@ class ShaftMonitor:
         self._bin = 0
         self._intervals: list[float] = []
         self._end = math.nan
+        self._last: AverageHeader | None = None
         #: Averages taken, at all speeds, and those left out.
         self.averages = self.overlapping = self.uncorrected = self.beyond = 0
 
@@ -212,11 +230,14 @@ class ShaftMonitor:
                 f'{self.shaft} has {average.layout}, its baseline {self.layout}: is it that of '
                 'another machine? give another baseline_file, or remove this one to learn again')
         average = fitted
-        if header.start_time < self._end - 1e-9 and header.end_time > self._end:
+        last, self._last = self._last, header
+        if header.start_time < self._end - 1e-9 and header.end_time > self._end and (
+                last is None or _slides(last, header)):
             self.overlapping += 1
             return []
-        if not average.is_known:
+        if not average.is_corrected:
             self.uncorrected += 1
+        if not np.isfinite(average.values).any():
             return []
         key = self._bin_of(header.mean_trigger_speed)
         if key is None:
@@ -265,8 +286,9 @@ class ShaftMonitor:
                                            self.scores_per_alarm())
         lines = []
         if changed.any():
-            lines = [str(item) for item in self.changes() if changed.reshape(
-                self.layout.shape)[item.channel, self._place(item)]]
+            lines = [str(item) for item in self.changes()
+                     if changed.reshape(self.layout.shape)[
+                         item.channel, self.layout.quantities.index((item.kind, item.name))]]
         return lines + [f'{self._words(place)} is back at its baseline'
                         for place in np.flatnonzero(ended[0]).tolist()]
 
@@ -284,16 +306,9 @@ class ShaftMonitor:
                 np.concatenate((2.0 * np.sqrt(square + own) * doubt[:, :count],
                                 doubt[:, count:]), axis=1))
 
-    def _place(self, change: Change) -> int:
-        names = [self.layout.name(item) for item in range(self.layout.shape[1])]
-        offset = 0 if change.kind == 'order' else len(self.layout.orders)
-        return names.index(change.name, offset)
-
     def _words(self, place: int) -> str:
         channel, quantity = divmod(place, self.layout.shape[1])
-        name = self.layout.name(quantity)
-        what = f'order {name}' if self.layout.kind(quantity) == 'order' else name
-        return f'{what} of {self.shaft}, channel {channel}'
+        return f'{in_words(*self.layout.quantities[quantity])} of {self.shaft}, channel {channel}'
 
     # --- the baseline ---
 
@@ -377,8 +392,8 @@ class ShaftMonitor:
             if not (math.isfinite(change) and math.isfinite(sequence)):
                 continue
             found.append(Change(
-                self.shaft, channel, self.layout.kind(quantity), self.layout.name(quantity),
-                change, error, int(sequence), time, doubt, min(chance * independent, 1.0)))
+                self.shaft, channel, *self.layout.quantities[quantity], change, error,
+                int(sequence), time, doubt, min(chance * independent, 1.0)))
         return sorted(found, key=lambda item: item.p_value)
 
     def _independent(self) -> float:

@@ -9,19 +9,22 @@
 # the License.
 
 """
-The numbers of an average that are monitored: corrected order amplitudes and condition indicators.
+The numbers of an average that are monitored: orders, condition indicators and bearing orders.
 
-Amplitudes are monitored by their squares less those that the noise alone makes. These do not
-depend on the noise, also for weak and absent orders, where more noise makes a larger amplitude.
-Indicators are monitored by their logarithms, because they are ratios and moments, whose scatter is
-relative.
+Amplitudes of orders, corrected ones, are monitored by their squares less those that the noise
+alone makes. These do not depend on the noise, also for weak and absent orders, where more noise
+makes a larger amplitude. Indicators are monitored by their logarithms, because they are ratios and
+moments, whose scatter is relative. So are bearing orders: by the depth of the modulation, the
+amplitude of the squared envelope over its mean, because both follow load and speed alike.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader, AverageMessage
+from sa_jitter_ros.averaging.results import (
+    AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.errors import MessageError
 
 FloatArray = NDArray[np.float64]
@@ -31,36 +34,48 @@ FloatArray = NDArray[np.float64]
 _POWERS = {'kurtosis': 4.0, 'fm4': 4.0, 'm6a': 6.0, 'm8a': 8.0, 'na4': 4.0, 'na4_star': 4.0,
            'nb4': 4.0, 'm6a_star': 6.0, 'm8a_star': 8.0}
 _FIELD = {name: place for place, name in enumerate(AMPLITUDE_FIELDS)}
+_OF_BEARING = {name: place for place, name in enumerate(ENVELOPE_FIELDS)}
+_NOUNS = {'order': 'order ', 'indicator': '', 'bearing': 'bearing order '}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is monitored of a shaft: number of channels, orders, and names of the indicators."""
+    """What is monitored of a shaft: number of channels, orders, indicators, bearing orders."""
 
     channels: int
     orders: tuple[float, ...]
     indicators: tuple[str, ...] = ()
+    bearings: tuple[float, ...] = ()
+
+    @property
+    def quantities(self) -> tuple[tuple[str, str], ...]:
+        """Return kind (`order`, `indicator` or `bearing`) and name of the quantities."""
+        return (*(('order', f'{order:.6g}') for order in self.orders),
+                *(('indicator', name) for name in self.indicators),
+                *(('bearing', f'{order:.6g}') for order in self.bearings))
 
     @property
     def shape(self) -> tuple[int, int]:
         """Return the number of channels and of quantities of each."""
-        return self.channels, len(self.orders) + len(self.indicators)
-
-    def kind(self, quantity: int) -> str:
-        """Return what a quantity is, `order` or `indicator`."""
-        return 'order' if quantity < len(self.orders) else 'indicator'
-
-    def name(self, quantity: int) -> str:
-        """Return the order, or the name of the indicator."""
-        count = len(self.orders)
-        return (f'{self.orders[quantity]:.6g}' if quantity < count
-                else self.indicators[quantity - count])
+        return self.channels, len(self.orders) + len(self.indicators) + len(self.bearings)
 
     def __str__(self) -> str:
         """Return the layout in words."""
-        orders = ', '.join(self.name(place) for place in range(len(self.orders)))
+        orders, bearings = (', '.join(f'{order:.6g}' for order in some)
+                            for some in (self.orders, self.bearings))
         return (f'{self.channels} channels, orders {orders or "none"} and '
-                f'{len(self.indicators)} indicators')
+                f'{len(self.indicators)} indicators'
+                + (f', bearing orders {bearings}' if bearings else ''))
+
+
+def in_words(kind: str, name: str) -> str:
+    """
+    Return a quantity in words.
+
+    >>> in_words('bearing', '9.46')
+    'bearing order 9.46'
+    """
+    return f'{_NOUNS[kind]}{name}'
 
 
 @dataclass(frozen=True)
@@ -68,9 +83,10 @@ class MonitoredAverage:
     """
     The monitored quantities of one average, each array (channel, quantity), NaN where unknown.
 
-    `values` are squares of amplitudes without noise, then logarithms of indicators; `noise` are
-    the published variances of amplitudes and logarithms without, and `doubt` the published errors
-    of the correction for the keyphasor alone.
+    `values` are squares of amplitudes without noise, then logarithms of indicators and of the
+    depths of modulation at the bearing orders; `noise` are the published variances of amplitudes
+    and logarithms without, and `doubt` the published errors of the correction for the keyphasor
+    alone.
     """
 
     header: AverageHeader
@@ -80,41 +96,42 @@ class MonitoredAverage:
     doubt: FloatArray
 
     @property
-    def is_known(self) -> bool:
+    def is_corrected(self) -> bool:
         """Return whether the average has amplitudes that can be monitored."""
         return bool(np.isfinite(self.values[:, :len(self.layout.orders)]).any())
 
     def fitted(self, layout: Layout) -> 'MonitoredAverage | None':
         """
-        Return the average with the indicators of a layout, NaN where it lacks them.
+        Return the average with the quantities of a layout, NaN where it lacks them.
 
-        None if channels or orders differ.
+        None if channels or orders differ, or if the layout lacks one of the bearing orders.
         """
-        if self.layout == layout:
+        own = self.layout
+        if own == layout:
             return self
-        if (self.layout.channels, self.layout.orders) != (layout.channels, layout.orders):
+        if (own.channels, own.orders) != (layout.channels, layout.orders) or (
+                not {*own.bearings} <= {*layout.bearings}):
             return None
-        count, names = len(layout.orders), self.layout.indicators
+        places = {quantity: place for place, quantity in enumerate(own.quantities)}
         found = []
         for array in (self.values, self.noise, self.doubt):
             rows = np.full(layout.shape, np.nan)
-            rows[:, :count] = array[:, :count]
-            for place, name in enumerate(layout.indicators):
-                if name in names:
-                    rows[:, count + place] = array[:, count + names.index(name)]
+            for place, quantity in enumerate(layout.quantities):
+                if quantity in places:
+                    rows[:, place] = array[:, places[quantity]]
             found.append(rows)
         return MonitoredAverage(self.header, layout, *found)
 
 
 def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
-              errors: AverageMessage | None = None, *, allow_uncorrected: bool = False
-              ) -> MonitoredAverage:
+              errors: AverageMessage | None = None, envelope: AverageMessage | None = None, *,
+              allow_uncorrected: bool = False) -> MonitoredAverage:
     """
     Return what is monitored of the arrays of one average.
 
-    Without corrected amplitudes all is unknown, because what is not corrected shows the keyphasor,
-    too. With `allow_uncorrected` the raw ones, with their standard errors, take their place.
-    Raises MessageError for arrays whose channels or indicators differ.
+    Without corrected amplitudes, these and the indicators are unknown, because what is not
+    corrected shows the keyphasor, too. With `allow_uncorrected` the raw ones, with their standard
+    errors, take their place. Raises MessageError for arrays whose channels or indicators differ.
     """
     table = amplitudes.values
     channels, count, _ = table.shape
@@ -143,12 +160,45 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
         (channels, 1), np.bool_)
     own = np.nan_to_num(noise) ** 2
     square = amplitude**2 - 2.0 * own
-    found = MonitoredAverage(
+    lines = envelope.values if envelope is not None else np.empty((channels, 0, len(_OF_BEARING)))
+    if len(lines) != channels:
+        raise MessageError(f'{len(lines)} channels of the envelope and {channels} of orders: '
+                           'publish the same channels')
+    bearings = np.fmax.reduce(lines[..., _OF_BEARING['order']], initial=np.nan)
+    lines = lines[:, np.isfinite(bearings)]
+    amplitude, error, mean = (
+        np.where(lines[..., _OF_BEARING[name]] > 0.0, lines[..., _OF_BEARING[name]], np.nan)
+        for name in ('amplitude', 'standard_error', 'mean'))
+    parts = ((square, np.log(values), np.log(amplitude / mean)),
+             (own, variance, (error / amplitude) ** 2),
+             (doubt, relative * power, np.zeros(amplitude.shape)))
+    found = [np.concatenate(part, axis=1) for part in parts]
+    known = np.concatenate((np.broadcast_to(corrected, (channels, count + len(names))),
+                            np.ones(amplitude.shape, np.bool_)), axis=1)
+    for array in found:
+        array[~(np.isfinite(array) & known)] = np.nan
+    return MonitoredAverage(
         amplitudes.header, Layout(channels, tuple(table[0, :, 0].tolist()) if channels else (),
-                                  names),
-        np.concatenate((square, np.log(values)), axis=1),
-        np.concatenate((own, variance), axis=1),
-        np.concatenate((doubt, relative * power), axis=1))
-    for array in (found.values, found.noise, found.doubt):
-        array[~(np.isfinite(array) & corrected)] = np.nan
-    return found
+                                  names, tuple(bearings[np.isfinite(bearings)].tolist())), *found)
+
+
+def mean_of(averages: Sequence[MonitoredAverage]) -> MonitoredAverage:
+    """
+    Return the mean of consecutive averages of one layout, NaN where most are missing.
+
+    Its header is that of all of them, with the mean speed; its noise is that of the mean.
+    """
+    rows = np.array([(item.values, item.noise, item.doubt) for item in averages])
+    known = np.isfinite(rows)
+    number = known.sum(axis=0)
+    means = np.where(2 * number >= len(averages),
+                     np.where(known, rows, 0.0).sum(axis=0) / np.maximum(number, 1), np.nan)
+    means[1] /= np.maximum(number[0], 1)
+    first, last = averages[0].header, averages[-1].header
+    header = replace(
+        first, end_time=last.end_time,
+        trigger_cycles=sum(item.header.trigger_cycles for item in averages),
+        fundamental_cycles=sum(item.header.fundamental_cycles for item in averages),
+        mean_trigger_speed=float(np.mean([item.header.mean_trigger_speed for item in averages])),
+        discarded_cycles=sum(item.header.discarded_cycles for item in averages))
+    return MonitoredAverage(header, averages[0].layout, *means)

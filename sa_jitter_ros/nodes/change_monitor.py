@@ -84,6 +84,7 @@ class ChangeMonitor(MonitoringNode):
     def destroy_node(self) -> None:
         """Keep the baseline and destroy the node."""
         if self._monitor is not None:
+            self._monitor.finish()
             if self._monitor.unsaved:
                 self._save(self._monitor)
             self._monitor.close()
@@ -191,8 +192,11 @@ class ChangeMonitor(MonitoringNode):
             return 'no average received yet', values
         if not monitor.is_complete:
             shaft, item = min(found.items(), key=lambda each: each[1].learned)
-            return (f'learning: {item.learned} of {self._values["learning_averages"]} averages of '
-                    f'{shaft} at {item.speed:.4g} Hz', values)
+            enough = self._values['learning_averages']
+            return (f'learning: {item.learned} of {enough} averages of {shaft} at '
+                    f'{item.speed:.4g} Hz' + (
+                        f', of {item.averages} at all speeds: a larger speed_bin learns sooner'
+                        if item.averages > enough else ''), values)
         return (f'{changes} changes' if changes else
                 f'no change in {monitor.averages} averages'), values
 

@@ -18,6 +18,7 @@ from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.health import Flow
 
 AVERAGE = 'order_amplitude'
+_OPTIONAL = ('envelope_amplitude',)  # of shafts with bearing orders
 _ATTENUATION = AMPLITUDE_FIELDS.index('attenuation')
 
 
@@ -26,7 +27,7 @@ class ResultFlows:
     The averages of each of the `shafts` that a node takes, and the kinds `beside` them.
 
     The averager publishes these others with every corrected average, so that their silence counts
-    while such averages come.
+    while such averages come; that of the envelope, if it has come before.
     """
 
     def __init__(self, node: MonitoringNode, shafts: Sequence[str], beside: Sequence[str] = ()
@@ -40,7 +41,8 @@ class ResultFlows:
                                           'has it vibration and pulses? (see its status)'),
                 **{kind: node.watch_input(f'{prefix}{kind}', f'{shaft}/{kind}',
                                           'averages come without it (see its status)',
-                                          after=(average,), judged=False) for kind in beside}}
+                                          after=(average,), judged=False,
+                                          optional=kind in _OPTIONAL) for kind in beside}}
 
     def came(self, shaft: str, kind: str, message: AverageMessage) -> None:
         """Note that a result came."""

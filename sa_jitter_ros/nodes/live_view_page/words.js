@@ -150,8 +150,8 @@ export function drawAttention() {
     return [age > 5 ? 3 : node.level, name, age > 5 ? `no status for ${age.toFixed(0)} s`
       : node.message];
   }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
-  const changed = [...changes()].sort((a, b) => a.p_value - b.p_value).map(item => [1, item.kind === 'order' ? `order ${item.name}`
-    : item.name.replaceAll('_', ' '), `of ${item.shaft}, ${channelName(item.channel)}: `
+  const changed = [...changes()].sort((a, b) => a.p_value - b.p_value).map(item => [1, item.kind === 'indicator'
+    ? item.name.replaceAll('_', ' ') : `${item.kind === 'bearing' ? 'bearing ' : ''}order ${item.name}`, `of ${item.shaft}, ${channelName(item.channel)}: `
       + `${changeText(item)} since average ${item.since_sequence}`
       + (known(item.keyphasor_share) ? '; the keyphasor explains '
         + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
