@@ -14,6 +14,7 @@ False alarms of the change monitor, and how soon it finds a growing fault.
 `python benchmarks/change_monitor.py` prints the tables of `docs/change_monitor.md`. The averages
 of many machines are drawn from their laws, one every ten minutes: amplitudes of orders with
 complex noise, indicators with normal and with skewed scatter, and a load that moves the orders.
+The last table is of `average --baseline`: one value a day, six weeks long.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.monitoring.change_test import ChangeTest
+from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
 from sa_jitter_ros.monitoring.monitor import Settings, YEAR
 
 FloatArray = NDArray[np.float64]
@@ -40,6 +41,7 @@ AMPLITUDES = {'order, noise 1 %': 1.0, 'order, noise 10 %': 0.1, 'absent order':
 NOISE = 0.01
 INDICATORS = {'indicator, scatter 1 %': 0.01, 'indicator, skewed, scatter 30 %': 0.3}
 KINDS = (*AMPLITUDES, *INDICATORS)
+_SIX_WEEKS, _BEGIN = 45, 20  # days, and the day on which a fault begins
 _SHAPE = 11.0  # of the gamma distribution of skewed indicators: scatter 0.3, skewness 0.6
 
 
@@ -233,6 +235,58 @@ def _days(value: float) -> str:
     return f'{value:.1f} d' if math.isfinite(value) else 'later'
 
 
+def six_weeks(kept: float, learning: int, count: int, seed: int) -> tuple[float, float]:
+    """
+    Return the share of machines with a false alarm in 45 days, and the days to find a fault.
+
+    There is one value of each quantity a day, which keeps a part of the deviation of the day
+    before, half of it with all others. The fault grows from day 20 on in one quantity, by 0.7 of
+    its scatter a day.
+    """
+    rng, shape = np.random.default_rng(seed), (count, 20)
+    own, common = rng.standard_normal(shape), rng.standard_normal((count, 1))
+    values = np.empty((_SIX_WEEKS, *shape))
+    for day in range(_SIX_WEEKS):
+        values[day] = math.sqrt(0.5) * (own + common)
+        own, common = (kept * item + math.sqrt(1.0 - kept**2) * rng.standard_normal(item.shape)
+                       for item in (own, common))
+    memory = np.array([memory_of(values[:learning, unit]) for unit in range(count)])[:, None]
+    alarmed, days = (
+        np.array([*_of_days(values + fault * growth, learning, memory)])
+        for fault, growth in ((0.0, 0.0), (0.7, _growth(shape))))
+    late = days[_BEGIN + 1:, :, 0]
+    return float(alarmed.any(axis=(0, 2)).mean()), float(np.median(
+        np.where(late.any(axis=0), 1.0 + late.argmax(axis=0), math.inf)))
+
+
+def _growth(shape: tuple[int, int]) -> FloatArray:
+    """Return days since the fault began (day, unit, quantity), in the first quantity."""
+    found = np.zeros((_SIX_WEEKS, *shape))
+    found[_BEGIN:, :, 0] = np.arange(_SIX_WEEKS - _BEGIN)[:, None]
+    return found
+
+
+def _of_days(values: FloatArray, learning: int, memory: FloatArray
+             ) -> Iterator[NDArray[np.bool_]]:
+    """Iterate over what is found changed (unit, quantity) on each day."""
+    unknown = np.full(values.shape[1:], np.nan)
+    test = ChangeTest(unknown.shape, learning=learning, memory=memory)
+    for day, value in enumerate(values):
+        yield test.update(0, value, unknown, unknown, (day, day), YEAR / 86400.0)[0]
+
+
+def six_weeks_table(count: int, seed: int) -> Iterator[str]:
+    """Iterate over the lines of the table of a value a day."""
+    baselines = (8, 10, 15, 20)
+    yield '| a day keeps of the one before | ' + ' | '.join(
+        f'baseline of {number}' for number in baselines) + ' |'
+    yield '|---|' + '---|' * len(baselines)
+    for kept in (0.0, 0.3, 0.6):
+        cells = [six_weeks(kept, number, count, seed) for number in baselines]
+        yield f'| {kept:g} | ' + ' | '.join(
+            f'{100.0 * alarms:.0f} %, {days:.0f} d' for alarms, days in cells) + ' |'
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -240,6 +294,8 @@ def main() -> None:
                         help='simulated months of each row; 0: no table')
     parser.add_argument('--years', type=float, default=4.0, help='years that a machine runs')
     parser.add_argument('--faults', type=int, default=400, help='growing faults; 0: no table')
+    parser.add_argument('--weeks', type=int, default=1000,
+                        help='machines with a value a day for six weeks; 0: no table')
     parser.add_argument('--seed', type=int, default=2024)
     options = parser.parse_args()
     if options.months:
@@ -248,6 +304,9 @@ def main() -> None:
         print()
     if options.faults:
         print('\n'.join(detection_table(options.faults, options.seed)), flush=True)
+    if options.weeks:
+        print()
+        print('\n'.join(six_weeks_table(options.weeks, options.seed)), flush=True)
 
 
 if __name__ == '__main__':

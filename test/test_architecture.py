@@ -49,7 +49,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop',
-        'matplotlib', 'parameter_file', 'parameters', 'pulses', 'recordings', 'samples'},
+        'matplotlib', 'monitoring', 'parameter_file', 'parameters', 'pulses', 'recordings',
+        'samples'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},

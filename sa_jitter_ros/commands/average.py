@@ -13,11 +13,13 @@ Command `average`: synchronous averages of recordings, all that the averager doe
 
 Each recording gets a folder with averages.npz, averages.csv and figures; averages.csv and
 recordings.csv beside these folders cover all recordings. Recordings that were finished before are
-skipped. A folder counts for all recordings below it.
+skipped. A folder counts for all recordings below it. --baseline N says whether the machine has
+changed since the first N recordings, in changes.json and changes.png.
 """
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 import os
 from pathlib import Path
 import sys
@@ -26,9 +28,12 @@ from sa_jitter_ros.commands.command_line import (
     add_fleet_options, add_recording_options, few_collections, Parser, read_options, show)
 from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.monitoring.change_test import LEAST_LEARNED
+from sa_jitter_ros.monitoring.monitor import Settings
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
+from sa_jitter_ros.offline.changes import Changes, find_changes, SETTINGS, settings_of
 from sa_jitter_ros.offline.settings import MachineFile
-from sa_jitter_ros.offline.tables import RECORDINGS, write_tables
+from sa_jitter_ros.offline.tables import RECORDINGS, write_changes, write_tables
 from sa_jitter_ros.recordings.fields import fields_of
 
 
@@ -44,6 +49,10 @@ def make_parser() -> Parser:
     parser.add_argument('-p', '--param', action='append', default=[], dest='given',
                         metavar='NAME:=VALUE', help='parameter of synchronous_averager, as in '
                         'trigger_cycles:=60; overrides the file; may be repeated')
+    parser.add_argument('--baseline', type=_learning, metavar='N',
+                        help='the recordings are those of one machine, in order of time, and the '
+                        'first N of them (at least 8) its normal state: say what has changed '
+                        f'since; -p also takes {", ".join(SETTINGS)}')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for the results')
     parser.add_argument('--no-figures', action='store_true', help='write arrays and tables only')
@@ -51,6 +60,26 @@ def make_parser() -> Parser:
     add_fleet_options(parser)
     add_recording_options(parser)
     return parser
+
+
+def _learning(text: str) -> int:
+    """Return a number of recordings; argparse says which option is wrong."""
+    if not (text.isdecimal() and int(text) >= LEAST_LEARNED):
+        raise argparse.ArgumentTypeError(f'{text!r}: give a whole number, {LEAST_LEARNED} or more')
+    return int(text)
+
+
+def settings_for_changes(options: argparse.Namespace) -> Settings | None:
+    """
+    Return the settings of the change monitor, None without a baseline; raises ParameterError.
+
+    Its parameters are taken out of the given ones.
+    """
+    if options.baseline is None:
+        return None
+    of_monitor = [text for text in options.given if text.partition(':=')[0] in SETTINGS]
+    options.given = [text for text in options.given if text not in of_monitor]
+    return settings_of(options.params, of_monitor, options.baseline)
 
 
 def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
@@ -68,8 +97,13 @@ def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
             Row(item.name, str(item.path), item.error) for item in found if item.error]
 
 
-def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
-    """Average the recordings and write the tables; raises SaJitterError, OSError."""
+def run(options: argparse.Namespace, progress: Progress, *, changes: list[Changes]) -> list[Row]:
+    """
+    Average the recordings and write the tables; raises SaJitterError, OSError.
+
+    With a baseline, what has changed is added to `changes`.
+    """
+    settings = settings_for_changes(options)
     jobs, rows = jobs_of(options)
 
     def alone(job: AverageJob) -> Row:
@@ -85,11 +119,19 @@ def run(options: argparse.Namespace, progress: Progress) -> list[Row]:
     finally:
         if any(row.averages for row in rows):
             write_tables(options.output, rows)
+    if settings is not None:
+        averaged = {row.recording for row in rows if row.averages}
+        found = find_changes(
+            options.output, [job.name for job in jobs if job.name in averaged], settings)
+        write_changes(options.output, found, figure=not options.no_figures)
+        changes.append(found)
+        for line in found.warnings():
+            progress.say(f'warning: {line}')
     return rows
 
 
-def tell(options: argparse.Namespace, rows: list[Row]) -> int:
-    """Say how many recordings were averaged; return 2 if none could be."""
+def tell(options: argparse.Namespace, rows: list[Row], *, changes: list[Changes]) -> int:
+    """Say how many recordings were averaged, and what changed; return 2 if none could be."""
     averaged = [row for row in rows if row.averages]
     if not averaged:
         return 2
@@ -98,6 +140,7 @@ def tell(options: argparse.Namespace, rows: list[Row]) -> int:
                 f'recording{"s" * (len(averaged) > 1)}'
                 + (f'; {failed} could not be averaged, or not wholly: see {RECORDINGS}'
                    if failed else ''),
+                *(line for found in changes for line in found.lines()),
                 f'written: {options.output}')
 
 
@@ -105,7 +148,9 @@ def tell(options: argparse.Namespace, rows: list[Row]) -> int:
 def main(args: Sequence[str] | None = None) -> int:
     """Average recordings; return 0, or 2 after one line if none could be averaged."""
     options = make_parser().parse_args(args)
-    return run_to_end(run, tell, options, Progress('average', quiet=options.quiet))
+    changes: list[Changes] = []
+    return run_to_end(partial(run, changes=changes), partial(tell, changes=changes), options,
+                      Progress('average', quiet=options.quiet))
 
 
 if __name__ == '__main__':

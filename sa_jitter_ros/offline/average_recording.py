@@ -218,7 +218,7 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
             raise averager.none()
         remarks += [*averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
         row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
-        row = replace(row, remarks=tuple(remarks[:_MOST_REMARKS]))
+        row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {'settings': settings, 'row': asdict(row)})
         if job.figures:
             from sa_jitter_ros.offline.figures import write_figures

@@ -69,7 +69,7 @@ class MachineFile:
         detector: dict[str, Any] = {}
         if params is not None:
             values = read_parameters(params, AVERAGER)
-            detector = read_parameters(params, DETECTOR) if _has(params, DETECTOR) else {}
+            detector = section(params, DETECTOR)
         overrides = {}
         for text in given:
             name, separator, value = text.partition(':=')
@@ -95,12 +95,12 @@ class MachineFile:
                    '' if params is None else str(params), tuple(unknown))
 
 
-def _has(params: Path, node: str) -> bool:
+def section(params: Path | None, node: str) -> dict[str, Any]:
+    """Return the parameters of a node in a machine file, {} where it has none."""
     try:
-        read_parameters(params, node)
+        return read_parameters(params, node) if params is not None else {}
     except ParameterError:
-        return False
-    return True
+        return {}
 
 
 def _specifications(values: Mapping[str, Any]) -> dict[str, Parameter]:

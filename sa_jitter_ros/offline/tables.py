@@ -8,13 +8,15 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""The tables of a run: all rows of all recordings, and a row for each recording."""
+"""The files of a run: rows of all recordings, a row for each, and what has changed in them."""
 
 from collections.abc import Sequence
+import json
 from pathlib import Path
 
 from sa_jitter_ros.offline.average_recording import Row
-from sa_jitter_ros.offline.files import join_tables, TABLE, write_rows
+from sa_jitter_ros.offline.changes import CHANGES, Changes
+from sa_jitter_ros.offline.files import join_tables, TABLE, write_lines, write_rows
 
 RECORDINGS = 'recordings.csv'
 
@@ -30,3 +32,12 @@ def write_tables(output: Path, rows: Sequence[Row]) -> None:
     join_tables(output / TABLE, [output / row.recording for row in ordered if row.averages],
                 [(row.recording, row.error) for row in ordered if row.error])
     write_rows(output / RECORDINGS, ordered)
+
+
+def write_changes(output: Path, changes: Changes, *, figure: bool) -> None:
+    """Write `changes.json`, and `changes.png` with a `figure`; raises OSError."""
+    text = json.dumps(changes.report(), indent=1, allow_nan=False)
+    write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
+    if figure:
+        from sa_jitter_ros.offline.change_figure import changes_figure
+        changes_figure(changes).savefig((output / CHANGES).with_suffix('.png'), dpi=110)

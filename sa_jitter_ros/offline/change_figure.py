@@ -1,0 +1,94 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Figure of what has changed: the trends of the quantities over all recordings."""
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+import numpy as np
+from sa_jitter_ros.monitoring.quantities import in_words
+from sa_jitter_ros.offline.changes import Changes, Key, key_of
+from sa_jitter_ros.offline.plotting import Array, legend_under, MARK, MEASURED
+
+_PANELS = 6
+_MOST_TICKS = 12
+
+
+def changes_figure(changes: Changes) -> Figure:
+    """Draw what has changed, the most certain first, then what is farthest from its baseline."""
+    chosen = _chosen(changes)
+    figure = Figure(figsize=(9.0, 1.5 * len(chosen) + 1.2), layout='constrained')
+    panels = figure.subplots(len(chosen), sharex=True, squeeze=False)[:, 0]
+    for axes, key in zip(panels, chosen):
+        _draw(axes, changes, key)
+    names = [item.name for item in changes.recordings]
+    places = np.arange(0, len(names), -(-len(names) // _MOST_TICKS))
+    panels[-1].set_xticks(places, [names[place] for place in places], rotation=30, ha='right',
+                          fontsize='small')
+    legend_under(panels[-1])
+    panels[-1].get_legend().set_bbox_to_anchor((0.5, -0.65))
+    figure.suptitle(changes.lines()[0].rstrip(':'), fontsize='medium')
+    return figure
+
+
+def _chosen(changes: Changes) -> list[Key]:
+    """Return the quantities that are drawn."""
+    keys = [key_of(item) for item in changes.changes]
+    far = []
+    for shaft, monitor in changes.monitors.items():
+        for channel in range(monitor.layout.channels):
+            for quantity in monitor.layout.quantities:
+                key = shaft, channel, *quantity
+                values, mean, scatter = _trend(changes, key)
+                late = np.abs(values[changes.learning:] - mean) / scatter
+                if np.isfinite(late).any():
+                    far.append((float(np.nanmedian(late)), key))
+    return [*dict.fromkeys([*keys, *(key for _, key in sorted(far, reverse=True))])][:_PANELS]
+
+
+def _trend(changes: Changes, key: Key) -> tuple[Array, float, float]:
+    """Return the values of all recordings, and mean and scatter of the baseline."""
+    shaft, channel, *quantity = key
+    monitor = changes.monitors[shaft]
+    place = monitor.layout.quantities.index(tuple(quantity))
+    rows = [item.means[shaft].fitted(monitor.layout) if shaft in item.means else None
+            for item in changes.recordings]
+    values = np.array([np.nan if row is None else row.values[channel, place] for row in rows])
+    known = monitor.baseline(1.0)
+    assert known is not None
+    return values, float(known.mean[channel, place]), float(known.scatter[channel, place])
+
+
+def _draw(axes: Axes, changes: Changes, key: Key) -> None:
+    values, mean, scatter = _trend(changes, key)
+    shaft, channel, kind, name = key
+
+    def unit(value: Array | float) -> Array:
+        return np.sqrt(np.maximum(value, 0.0)) if kind == 'order' else np.exp(value)
+
+    low, middle, high = unit(np.array([mean - 2.0 * scatter, mean, mean + 2.0 * scatter]))
+    axes.axvspan(-0.5, changes.learning - 0.5, color='0.93', linewidth=0.0, label='baseline')
+    axes.axhspan(low, high, color='tab:blue', alpha=0.15, linewidth=0.0,
+                 label='its mean ± 2 standard deviations')
+    axes.axhline(middle, color='tab:blue', linewidth=0.8)
+    axes.plot(np.arange(values.size), unit(values), '.-', color=MEASURED, linewidth=0.6,
+              markersize=4.0)
+    title = f'{in_words(kind, name)} of {shaft}, channel {channel}'
+    change = next((item for item in changes.changes if key_of(item) == key), None)
+    if change is not None:
+        names = [item.name for item in changes.recordings]
+        axes.axvline(change.since_sequence - 0.5, color=MARK, linestyle='--', linewidth=1.2,
+                     label='changed since')
+        axes.axvline(names.index(changes.found[key]), color=MARK, linewidth=1.2, label='found')
+        title = change.words(changes.since(change)).partition(';')[0]
+    axes.set_title(title, fontsize='small', loc='left')
+    axes.set_ylabel({'order': 'amplitude', 'bearing': 'depth'}.get(kind, 'value'),
+                    fontsize='small')
+    axes.margins(x=0.01)

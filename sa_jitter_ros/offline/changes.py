@@ -1,0 +1,285 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Has the machine changed: the change monitor over the finished averages of its recordings.
+
+One value of a recording is tested, the mean of its averages: these have one load and one
+temperature, and show nothing of how the machine scatters from recording to recording.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.monitoring.change_test import memory_of
+from sa_jitter_ros.monitoring.machine_monitor import KINDS
+from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
+from sa_jitter_ros.monitoring.quantities import (
+    in_words, mean_of, monitored, MonitoredAverage)
+from sa_jitter_ros.offline.files import ARRAYS
+from sa_jitter_ros.offline.settings import section
+from sa_jitter_ros.parameter_file import value_of
+
+CHANGES = 'changes.json'
+MONITOR = 'change_monitor'
+#: Parameters of the node that count here, too.
+SETTINGS = {item.name: item for item in PARAMETERS
+            if item.name in ('false_alarms_per_year', 'speed_bin', 'allow_uncorrected')}
+Key = tuple[str, int, str, str]  # shaft, channel, kind and name of a quantity
+_INTERVAL = 86400.0  # s between recordings that do not say their time
+_MOST_LINES = 6
+# Fields of `AverageHeader`, and ends of the names of names, as they are in `averages.npz`.
+_HEADER = ('start_time', 'end_time', 'sequence', 'trigger_cycles', 'fundamental_cycles',
+           'trigger_speed', 'discarded_cycles')
+_NAMES = ('_names', '_fields')
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """
+    A recording: its `name`, `start` and `end` (s), `speed` (Hz), and numbers of its channels.
+
+    `means` are those of the averages of each shaft.
+    """
+
+    name: str
+    start: float
+    end: float
+    speed: float
+    channels: tuple[int, ...]
+    means: Mapping[str, MonitoredAverage]
+
+
+@dataclass(frozen=True)
+class Event:
+    """What changed, or is back at its baseline, with which recording this was `found`."""
+
+    found: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Changes:
+    """
+    What the monitors of the shafts found in `recordings`, in order of time.
+
+    The first `learning` are the baseline. `left_out` are reasons by the names of recordings;
+    `found` are those with which the present `changes` were found.
+    """
+
+    learning: int
+    recordings: tuple[Recorded, ...]
+    left_out: Mapping[str, str]
+    monitors: Mapping[str, ShaftMonitor]
+    events: tuple[Event, ...]
+    found: Mapping[Key, str]
+
+    @property
+    def changes(self) -> list[Change]:
+        """Return what has changed, the most certain first."""
+        return sorted((item for monitor in self.monitors.values() for item in monitor.changes()),
+                      key=lambda item: item.p_value)
+
+    def since(self, change: Change) -> str:
+        """Return the recording with which a change began."""
+        return self.recordings[change.since_sequence].name
+
+    def report(self) -> dict[str, Any]:
+        """Return the content of `changes.json`."""
+        found: dict[str, Any] = json_values({
+            'baseline': {'averages': self.learning, 'complete': all(
+                monitor.is_complete for monitor in self.monitors.values())},
+            'changes': [{**asdict(item), 'channel': self.recordings[0].channels[item.channel],
+                         'since_recording': self.since(item),
+                         'found_recording': self.found[key_of(item)]} for item in self.changes],
+            'events': [{'recording': item.found, 'text': item.text} for item in self.events],
+            'recordings': [item.name for item in self.recordings],
+            'left_out': dict(self.left_out)})
+        return found
+
+    def warnings(self) -> list[str]:
+        """Return what is not compared, and what to do about it."""
+        missing = sum(not mean.is_corrected for item in self.recordings
+                      for mean in item.means.values())
+        return [*(f'{name} is not compared: it {reason}' for name, reason in
+                  self.left_out.items()),
+                *(f'no bearing of {shaft} is watched, and averages do not show its faults: give '
+                  f'{shaft}.bearing_orders' for shaft, monitor in self.monitors.items()
+                  if not monitor.layout.bearings),
+                *([f'orders and indicators of {missing} of {len(self.recordings)} recordings '
+                   'are not compared, because they are not corrected: '
+                   '-p allow_uncorrected:=true compares raw ones'] if missing else [])]
+
+    def lines(self) -> list[str]:
+        """Return the answer in a few lines."""
+        tested, changes = len(self.recordings) - self.learning, self.changes
+        after = f'{tested} recordings after the baseline of {self.learning}'
+        compared = [f'compared: {monitor.layout} of {shaft}'
+                    for shaft, monitor in self.monitors.items()]
+        if not changes:
+            return [f'no change in {after}', *compared]
+        more = len(changes) - _MOST_LINES
+        return [f'the machine has changed in {after}:', *(
+            f'  {item.words(self.since(item))}; found with {self.found[key_of(item)]}'
+            for item in changes[:_MOST_LINES]), *(
+                [f'  and {more} more: see {CHANGES}'] if more > 0 else []), *compared]
+
+
+def key_of(change: Change) -> Key:
+    """Return what tells a quantity from the others: shaft, channel, kind and name."""
+    return change.shaft, change.channel, change.kind, change.name
+
+
+def settings_of(params: Path | None, given: Sequence[str], learning: int) -> Settings:
+    """
+    Return the settings for a baseline of so many recordings; raises ParameterError.
+
+    They are those of `change_monitor` in a machine file, and of texts `NAME:=VALUE`.
+    """
+    values = {name: value for name, value in section(params, MONITOR).items() if name in SETTINGS}
+    for text in given:
+        name, _, value = text.partition(':=')
+        values[name] = value_of(value)
+    return Settings(learning_averages=learning, group_averages=1, **{
+        name: SETTINGS[name].convert(value) for name, value in values.items()})
+
+
+def find_changes(output: Path, names: Sequence[str], settings: Settings) -> Changes:
+    """
+    Return what has changed in recordings that are averaged in the folders `names` of `output`.
+
+    Raises RecordingError if too few of them can be compared.
+    """
+    if not names:
+        raise _too_few(names, settings.learning_averages)
+    tables = {name: _tables(output / name / ARRAYS) for name in names}
+    orders = _common_orders(tables.values())
+    recorded = [_recorded(name, arrays, orders, settings) for name, arrays in tables.items()]
+    left_out: dict[str, str] = {}
+    usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
+    for item in recorded:
+        if item.channels != usual:
+            left_out[item.name] = (f'has the channels {_listed(item.channels)}, most have '
+                                   f'{_listed(usual)}')
+    recorded = [item for item in recorded if item.name not in left_out]
+    apart = _in_time(recorded)
+    recorded = apart or recorded
+    learning = settings.learning_averages
+    speeds = [item.speed for item in recorded[:learning]]
+    low, high = min(speeds), max(speeds)
+    for item in recorded[learning:]:
+        if not low / (1.0 + settings.speed_bin) <= item.speed <= high * (1.0 + settings.speed_bin):
+            left_out[item.name] = (f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to '
+                                   f'{high:.4g} Hz: a longer baseline, or a larger speed_bin, '
+                                   'compares it')
+    recorded = [item for item in recorded if item.name not in left_out]
+    if len(recorded) <= learning:
+        raise _too_few(recorded, learning)
+    return _watched(recorded, left_out, settings, clock=bool(apart))
+
+
+def _too_few(recorded: Sequence[Any], learning: int) -> RecordingError:
+    return RecordingError(f'{len(recorded)} recordings can be compared, and {learning} are the '
+                          f'baseline: give {learning + 1} or more; their averages are written')
+
+
+def _tables(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a recording, without those over the angle."""
+    with np.load(path) as arrays:
+        return {name: arrays[name] for name in arrays.files if name.endswith(
+            (*KINDS, *_HEADER, *_NAMES)) or name in ('shafts', 'channels')}
+
+
+def _common_orders(tables: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, list[float]]:
+    """Return the orders of each shaft that all recordings have."""
+    found: dict[str, list[float]] = {}
+    for arrays in tables:
+        for shaft in arrays['shafts'].tolist():
+            own = arrays[f'{shaft}_order_amplitude'][0, 0, :, 0].tolist()
+            found[shaft] = [order for order in found.get(shaft, own) if order in own]
+    return found
+
+
+def _recorded(name: str, arrays: Mapping[str, NDArray[Any]], orders: Mapping[str, list[float]],
+              settings: Settings) -> Recorded:
+    means = {}
+    for shaft in arrays['shafts'].tolist():
+        tables = {kind: arrays[f'{shaft}_{kind}'] for kind in KINDS if f'{shaft}_{kind}' in arrays}
+        labels = {kind: next(tuple(arrays[f'{shaft}_{kind}{name}'].tolist()) for name in _NAMES
+                             if f'{shaft}_{kind}{name}' in arrays) for kind in tables}
+        kept = np.isin(tables[KINDS[0]][0, 0, :, 0], orders[shaft])
+        tables[KINDS[0]] = tables[KINDS[0]][:, :, kept]
+        headers = [AverageHeader(*row) for row in zip(*(
+            arrays[f'{shaft}_{part}'].tolist() for part in _HEADER))]
+        parts = [{kind: AverageMessage(header, table[place], labels[kind])
+                  for kind, table in tables.items()} for place, header in enumerate(headers)]
+        means[shaft] = mean_of([
+            monitored(part[KINDS[0]], *(part.get(kind) for kind in KINDS[1:]),
+                      allow_uncorrected=settings.allow_uncorrected) for part in parts])
+    return Recorded(name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
+                    float(arrays['trigger_speed'].mean()), tuple(arrays['channels'].tolist()),
+                    means)
+
+
+def _listed(channels: Sequence[int]) -> str:
+    return ', '.join(map(str, channels))
+
+
+def _in_time(recorded: Sequence[Recorded]) -> list[Recorded]:
+    """Return the recordings in order of time, [] where they overlap: each has its own clock."""
+    ordered = sorted(recorded, key=lambda item: item.start)
+    return [] if any(later.start < before.end for before, later in pairwise(ordered)) else ordered
+
+
+def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings: Settings, *,
+             clock: bool) -> Changes:
+    """Return what the monitors of all shafts find."""
+    shafts = dict.fromkeys(shaft for item in recorded for shaft in item.means)
+    monitors = {}
+    for shaft in shafts:
+        layout = max((item.means[shaft].layout for item in recorded if shaft in item.means),
+                     key=lambda layout: layout.shape)
+        baseline = [fitted.values.ravel() for item in recorded[:settings.learning_averages]
+                    if shaft in item.means and (fitted := item.means[shaft].fitted(layout))]
+        monitors[shaft] = ShaftMonitor(shaft, layout, settings, share=1.0 / len(shafts),
+                                       memory=memory_of(np.array(baseline)))
+    events: list[Event] = []
+    found: dict[Key, str] = {}
+    for number, item in enumerate(recorded):
+        for shaft, monitor in monitors.items():
+            if shaft not in item.means:
+                continue
+            mean = item.means[shaft]
+            # Which speeds compare is decided already: all are in one bin.
+            monitor.update(replace(mean, header=replace(
+                mean.header, sequence=number, mean_trigger_speed=1.0,
+                start_time=item.start if clock else math.nan,
+                end_time=item.end if clock else number * _INTERVAL)))
+            now = {key_of(change): change for change in monitor.changes()}
+            for key in now.keys() - found.keys():
+                found[key] = item.name
+                since = recorded[now[key].since_sequence].name
+                events.append(Event(item.name, now[key].words(since)))
+            for key in [key for key in found if key[0] == shaft and key not in now]:
+                del found[key]
+                events.append(Event(item.name, f'{in_words(*key[2:])} of {shaft}, channel '
+                                               f'{key[1]} is back at its baseline'))
+    return Changes(settings.learning_averages, tuple(recorded), left_out, monitors, tuple(events),
+                   found)

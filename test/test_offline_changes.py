@@ -1,0 +1,222 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Has the machine changed, over recordings of days: what is found, and what a bad day costs."""
+
+import json
+import signal
+
+from matplotlib.image import imread
+import numpy as np
+import pytest
+from sa_jitter_ros.commands import average
+from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
+from sa_jitter_ros.offline.change_figure import changes_figure
+from sa_jitter_ros.offline.changes import find_changes, settings_of
+from sa_jitter_ros.offline.tables import write_changes
+
+RATE, SECONDS, BEARING = 6000.0, 3.0, 4.87
+DAYS, LEARNING, BEGIN = 18, 9, 13
+SETTINGS = ('-p', 'shaft.orders:=[1.0, 19.0]', '-p', f'shaft.bearing_orders:=[{BEARING}]',
+            '-p', 'trigger_cycles:=16', '-p', 'correct_jitter:=false', '-p',
+            'allow_uncorrected:=true')
+
+
+def day(number, *, speed=None, depth=None, channels=1, rate=RATE):
+    """Return a recording of a day: mesh, load, noise, and a bearing that strikes from `BEGIN`."""
+    rng = np.random.default_rng([7, number])
+    time = np.arange(round(rate * SECONDS)) / rate
+    turn = (speed or rng.uniform(19.5, 20.5)) * time
+    load = np.exp(0.2 * rng.standard_normal())
+    depth = max(number - BEGIN + 1, 0) * 0.1 if depth is None else depth
+    noise = load * rng.standard_normal((channels, time.size))
+    vibration = noise * np.sqrt(1.0 + depth * np.cos(2.0 * np.pi * BEARING * turn)) + load * (
+        0.2 * np.cos(2.0 * np.pi * turn) + np.cos(2.0 * np.pi * 19.0 * turn))
+    return {'vibration': vibration, 'sample_rate': rate,
+            'pulse_times': np.interp(np.arange(0.5, turn[-1]), turn, time)}
+
+
+def write(folder, days):
+    """Write recordings by the numbers of their days."""
+    folder.mkdir(exist_ok=True)
+    for number, content in days.items():
+        np.savez(folder / f'day_{number:02d}.npz', **content)
+    return folder
+
+
+def run(*arguments):
+    """Run the command in this process, return its exit status."""
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        return average.main([*map(str, arguments), '--quiet'])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def answer(out):
+    """Return what the file says."""
+    return json.loads((out / 'changes.json').read_text(), parse_constant=pytest.fail)
+
+
+@pytest.fixture(scope='module')
+def weeks(tmp_path_factory):
+    """Return a folder of recordings and one of their averages."""
+    place = tmp_path_factory.mktemp('weeks')
+    write(place / 'in', {number: day(number) for number in range(1, DAYS + 1)})
+    assert run(place / 'in', '--output', place / 'out', '--baseline', LEARNING, *SETTINGS,
+               '--no-figures') == 0
+    return place / 'in', place / 'out'
+
+
+def test_a_bearing_fault_is_found_with_the_day_on_which_it_began(weeks):
+    found = answer(weeks[1])
+    assert found['baseline'] == {'averages': LEARNING, 'complete': True}
+    change, = found['changes']
+    assert (change['kind'], change['name'], change['since_time']) == ('bearing', '4.87', None)
+    assert change['change'] > 1.0
+    assert change['since_recording'] in {f'day_{BEGIN + late:02d}' for late in (-1, 0, 1)}
+    assert change['found_recording'] in {f'day_{BEGIN + late:02d}' for late in (2, 3, 4)}
+    assert [event['recording'] for event in found['events']] == [change['found_recording']]
+    assert found['recordings'] == [f'day_{number:02d}' for number in range(1, DAYS + 1)]
+
+
+def test_the_figure_shows_what_changed_first(weeks, tmp_path):
+    names = [f'day_{number:02d}' for number in range(1, DAYS + 1)]
+    changes = find_changes(weeks[1], names, settings_of(
+        None, ['allow_uncorrected:=true'], LEARNING))
+    write_changes(tmp_path, changes, figure=True)
+    assert imread(tmp_path / 'changes.png').ndim == 3
+    first, *others = changes_figure(changes).axes
+    assert first.get_title(loc='left').startswith('bearing order 4.87 of shaft, channel 0: +')
+    assert len(others) == 5
+
+
+def test_a_second_run_only_looks_again(weeks, capsys):
+    folder, out = weeks
+    before = (out / 'day_01' / 'averages.npz').stat().st_mtime_ns
+    text = (out / 'changes.json').read_text()
+    assert run(folder, '--output', out, '--baseline', LEARNING, *SETTINGS, '--no-figures') == 0
+    assert (out / 'day_01' / 'averages.npz').stat().st_mtime_ns == before
+    assert (out / 'changes.json').read_text() == text
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1] == f'the machine has changed in 9 recordings after the baseline of {LEARNING}:'
+    assert lines[2].startswith('  bearing order 4.87 of shaft, channel 0: +')
+
+
+def test_healthy_days_show_no_change(weeks, capsys):
+    folder, out = weeks
+    days = [folder / f'day_{number:02d}.npz' for number in range(1, BEGIN)]
+    assert run(*days, '--output', out, '--baseline', 8, *SETTINGS, '--no-figures') == 0
+    assert 'no change in 4 recordings after the baseline of 8' in capsys.readouterr().out
+    assert answer(out)['changes'] == answer(out)['events'] == []
+
+
+def test_a_bad_day_costs_itself_and_is_named(tmp_path, capsys):
+    days = {number: day(number) for number in range(1, DAYS + 1)}
+    days[3] = day(3, channels=2)
+    days[5] = {**day(5), 'pulse_times': np.array([])}
+    days[11] = day(11, rate=2.0 * RATE)  # is no bad one
+    days[15] = day(15, speed=25.0)
+    folder, out = write(tmp_path / 'in', days), tmp_path / 'out'
+    (folder / 'day_07.npz').write_bytes((folder / 'day_07.npz').read_bytes()[:5000])
+    assert run(folder, '--output', out, '--baseline', LEARNING, *SETTINGS, '--no-figures') == 0
+    found, told = answer(out), capsys.readouterr()
+    assert found['left_out'].keys() == {'day_03', 'day_15'}
+    assert 'day_03 is not compared: it has the channels 0, 1, most have 0' in told.err
+    assert 'day_15 is not compared: it turns at 25 Hz, the baseline at 19.' in told.err
+    assert '2 could not be averaged' in told.out
+    assert [item['name'] for item in found['changes']] == ['4.87']
+    assert 'day_11' in found['recordings']
+    assert not {'day_05', 'day_07'} & {*found['recordings']}
+
+
+@pytest.mark.machines
+def test_recordings_of_one_clock_are_in_its_order(tmp_path):
+    days = {}
+    for number in range(1, DAYS + 1):
+        content, start = day(number), 1e6 + 3600.0 * number
+        days[DAYS - number] = {**content, 'start_time': start,
+                               'pulse_times': content['pulse_times'] + start}
+    folder, out = write(tmp_path / 'in', days), tmp_path / 'out'
+    assert run(folder, '--output', out, '--baseline', LEARNING, *SETTINGS, '--no-figures') == 0
+    found = answer(out)
+    assert found['recordings'] == [f'day_{number:02d}' for number in range(DAYS - 1, -1, -1)]
+    change, = found['changes']
+    assert change['since_time'] == pytest.approx(
+        1e6 + 3600.0 * (DAYS - int(change['since_recording'][-2:])), abs=0.2)
+
+
+def test_too_few_recordings_and_wrong_settings_are_one_line(weeks, capsys):
+    folder, out = weeks
+    few = [folder / f'day_{number:02d}.npz' for number in range(1, 9)]
+    assert run(*few, '--output', out, '--baseline', 8, *SETTINGS, '--no-figures') == 2
+    assert capsys.readouterr().err == (
+        'average: 8 recordings can be compared, and 8 are the baseline: give 9 or more; their '
+        'averages are written\n')
+    assert (out / 'averages.csv').exists()
+    assert run(folder, '--output', out, '--baseline', 8, '-p', 'speed_bin:=-1.0') == 2
+    assert capsys.readouterr().err.startswith('average: speed_bin is -1.0: give at least')
+    with pytest.raises(SystemExit):
+        run(folder, '--output', out, '--baseline', 7)
+    assert capsys.readouterr().err == (
+        "average: argument --baseline: '7': give a whole number, 8 or more\n")
+
+
+def test_refused_corrections_are_said(weeks, capsys):
+    folder, out = weeks
+    assert run(folder, '--output', out, '--baseline', LEARNING, *SETTINGS[:-2],
+               '--no-figures') == 0
+    assert (f'orders and indicators of {DAYS} of {DAYS} recordings are not compared'
+            in capsys.readouterr().err)
+    assert {item['kind'] for item in answer(out)['changes']} == {'bearing'}
+
+
+def test_settings_of_the_machine_file_count(weeks, tmp_path):
+    folder, out = weeks
+    machine = tmp_path / 'machine.yaml'
+    machine.write_text(f"""
+/**/synchronous_averager:
+  ros__parameters: {{shaft.orders: [1.0, 19.0], trigger_cycles: 16, correct_jitter: false,
+                     shaft.bearing_orders: [{BEARING}]}}
+/**/change_monitor:
+  ros__parameters: {{learning_averages: 200, allow_uncorrected: true, speed_bin: 0.01}}
+""")
+    assert run(folder, '--params', machine, '--output', out, '--baseline', 8,
+               '--no-figures') == 0
+    found = answer(out)
+    assert found['baseline']['averages'] == 8
+    assert [item['kind'] for item in found['changes']] == ['bearing']
+
+
+def alarms(kept, learning, *, known):
+    """Return the share of series of 45 days, which remember a part of the day before, with one."""
+    rng, units, quantities = np.random.default_rng(9), 200, 12
+    shape, state, days = (units, quantities), 0.0, []
+    state = rng.standard_normal(shape)
+    for _ in range(45):
+        state = kept * state + np.sqrt(1.0 - kept**2) * rng.standard_normal(shape)
+        days.append(state)
+    found, unknown = 0, np.full((1, quantities), np.nan)
+    for values in np.array(days).swapaxes(0, 1)[:, :, None]:
+        memory = memory_of(values[:learning, 0]) if known else 0.0
+        test = ChangeTest((1, quantities), learning=learning, memory=memory)
+        found += any(test.update(0, value, unknown, unknown, (0.0, 0.0), 365.25)[0].any()
+                     for value in values)
+    return found / units
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('kept', [0.0, 0.3, 0.6])
+def test_days_that_follow_each_other_are_no_change(kept):
+    expected = 35.0 / 365.25
+    error = np.sqrt(expected * (1.0 - expected) / 200)
+    assert alarms(kept, 10, known=True) <= expected + 3.0 * error
+    if kept == 0.6:
+        assert alarms(kept, 10, known=False) > 0.5
