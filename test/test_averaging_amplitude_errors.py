@@ -13,7 +13,8 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
-from sa_jitter_ros.averaging.amplitude_errors import Repeatability, upper_limit
+from sa_jitter_ros.averaging.amplitude_errors import (kurtosis, Repeatability, Scatter,
+                                                      upper_limit)
 
 ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
 AMPLITUDES = np.array([1.0, 0.3, 0.5, 0.0, 0.0])
@@ -22,16 +23,19 @@ ABSENT, WEAK = 3, 4
 STRONG = slice(0, 3)
 
 
-def cycles_of(rng, count, *, noise, turn, orders=ORDERS, weak=None):
+def cycles_of(rng, count, *, noise, turn, orders=ORDERS, weak=None, errors=None):
     """
     Return amplitudes (cycle, 1, order) of single trigger cycles between jittery pulses, and true.
 
     Between wrong pulses the orders leak into each other. `noise` is that of the mean of all,
-    `turn` (rad) the standard deviation of order 16's phase.
+    `turn` (rad) the standard deviation of order 16's phase. `errors` (count + 1,) of the pulses
+    are uniform unless given.
     """
     true = AMPLITUDES * np.exp(1j * PHASES)
     true[WEAK] = (weak or 10 ** 0.5 * noise) * np.exp(1j * PHASES[WEAK])
-    errors = rng.uniform(-1.0, 1.0, count + 1) * np.sqrt(3.0) * turn / (2.0 * np.pi * orders[0])
+    if errors is None:
+        errors = rng.uniform(-1.0, 1.0, count + 1) * np.sqrt(3.0)
+    errors = errors * turn / (2.0 * np.pi * orders[0])
     u = np.linspace(0.0, 1.0, 257)
     weight = np.full(u.size, 1.0 / 256) * np.where((u == 0.0) | (u == 1.0), 0.5, 1.0)
     angle = u + errors[:-1, None] * (1.0 - u) + errors[1:, None] * u
@@ -80,6 +84,34 @@ def test_raw_errors_are_the_scatter_from_average_to_average(count, noise, turn):
     limits = np.array(upper)
     assert np.mean(limits[:, WEAK] > np.sqrt(10.0) * noise) > 0.92
     assert np.all(limits[:, ABSENT] > 0.0)
+
+
+@pytest.mark.parametrize(('count', 'turn'), [(20, 0.3), (20, 0.6), (40, 0.6)])
+@pytest.mark.parametrize('shape', ['uniform', 'normal'])
+def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
+    """The correction tells the size and the kurtosis of the pulse errors, and the noise."""
+    trials, rng, noise = 800, np.random.default_rng(count + int(10 * turn)), 0.01
+    size, along, phase, turned, absent = [], [], [], [], []
+    for _ in range(trials):
+        errors = (rng.standard_normal(count + 1) if shape == 'normal'
+                  else rng.uniform(-1.0, 1.0, count + 1) * np.sqrt(3.0))
+        cycles, true = cycles_of(rng, count, noise=noise, turn=turn, errors=errors)
+        white = rng.standard_normal((count, 1, ORDERS.size, 2)) @ (1.0, 1.0j)
+        aligned = true + noise * np.sqrt(count) * white
+        mean = cycles.mean(axis=0)
+        found = Repeatability.of(
+            cycles, cycles, ORDERS, jitter=turn / (2.0 * np.pi * ORDERS[0]),
+            kurtosis=kurtosis(errors - errors.mean()), corrected=Scatter.of(aligned, aligned)
+        ).errors(mean)
+        size.append(np.abs(mean[0]))
+        along.append(found.amplitude[0])
+        phase.append(found.phase[0])
+        turned.append(np.angle(mean[0] * np.conj(true)))
+        absent.append(mean[0, ABSENT].real)
+    along = np.array(along)
+    assert hold(shares(((size - np.mean(size, axis=0)) / along)[:, STRONG]), trials).all()
+    assert hold(shares((np.array(turned) / phase)[:, STRONG]), trials).all()
+    assert hold(shares(absent / along[:, ABSENT]), trials).all()
 
 
 @pytest.mark.parametrize(('count', 'turn', 'weak'), [(20, 0.3, 0.1), (40, 0.8, 0.03)])
@@ -141,7 +173,7 @@ def test_upper_limit_without_correction_is_that_before_the_loss():
         upper.append(Repeatability.of(cycles, cycles, ORDERS).errors(cycles.mean(axis=0)).upper_95)
     assert np.all(np.mean(np.array(upper)[:, 0] >= AMPLITUDES, axis=0) > 0.92)
     # which the declared jitter tells, too, where no order shows it
-    quiet = Repeatability.of(cycles, cycles, ORDERS, 0.0)
+    quiet = Repeatability.of(cycles, cycles, ORDERS, jitter=0.0)
     declared = 0.8 / (2.0 * np.pi * ORDERS)
     ratio = [quiet.errors(cycles.mean(axis=0), jitter).upper_95[0, line]
              / quiet.errors(cycles.mean(axis=0)).upper_95[0, line]

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from scipy import fft
+from sa_jitter_ros.averaging.noise import row_medians
 from scipy.special import chndtrix, erf
 
 FloatArray = NDArray[np.float64]
@@ -45,12 +46,12 @@ _ROBUST_FROM, _OUTLIER = 8, 10.0
 # Power of the mean over its noise from which on an order shows jitter, and of one cycle from
 # which on its phase is that of its mean phasor.
 _SHOWS, _CLEAR = 10.0, 10.0
-# Uniform jitter shortens the mean phasor: so much of the square of its variance across is variance
-# along the radius (exact moments up to 0.4 turns; Monte Carlo for the mean of a few cycles, whose
-# own turn is no jitter to it), as a sum over all pairs of cycles, over that of a single cycle.
-_ALONG, _OWN, _COMMON = 0.12, 1.6, 1.62
-# The standard deviation of a phase of which nothing is known.
-_UNKNOWN_PHASE = pi / np.sqrt(3.0)
+# The standard deviation of a phase of which nothing is known, and by how much one is larger than
+# the error across over the amplitude, times the cube of this (Monte Carlo: intervals of 68 % and
+# 95 % hold to 3 points for jitter up to 1.6 rad, and for orders at 0 dB and more above noise).
+_UNKNOWN_PHASE, _TURNED = pi / np.sqrt(3.0), 0.6
+# Kurtosis of uniform pulse errors, and its range.
+_UNIFORM, _KURTOSES = 1.8, (1.2, 3.0)
 # Leakage is at an unknown angle to the amplitude.
 _ANY_ANGLE = 0.6
 # What the model of the correction is off by, relative to the amplitude.
@@ -61,18 +62,15 @@ _LOWEST_LIMIT = 0.5
 _ROUNDING = 1e-9
 # No limit is more than so many times the amplitude: jitter that leaves less leaves no information.
 _LEAST_LEFT = 0.02
-# Uniform errors of a pulse by quadrature; jitter that leaves less than a share leaves an order
-# whose amplitude is not known.
-_NODES, _WEIGHTS = (item * scale for item, scale in zip(legendre.leggauss(4), (1.0, 0.5)))
+# Jitter that leaves less than this share leaves an order whose amplitude is not known.
 _LEAST_SHARE = 0.3
 # Jitter that cannot leak more than so much of the noise into a cycle does not matter.
 _NO_LEAK = 0.01
+_STEADY = 1e-4
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
 # Noise of a weak order beside leakage that jitter explains: least share of its scatter, and rounds
 # of its estimate.
 _LEAST_NOISE, _ROUNDS = 0.03, 8
-# Degrees of freedom of what jitter shortens, the square of its variance, for each of the variance.
-_GUESSED = 0.67
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -154,9 +152,8 @@ def _phase_error(amplitude: FloatArray, across: FloatArray) -> FloatArray:
     Where the phase is unknown it is that of any phase, pi / sqrt(3).
     """
     ratio = across / np.maximum(amplitude, _TINY)
-    # The sine of the error of the phase is the error across over the measured amplitude.
-    return np.where(1.96 * ratio < 1.0, np.arcsin(np.minimum(ratio, 1.0)), np.where(
-        np.isnan(ratio), np.nan, _UNKNOWN_PHASE))
+    known = np.minimum(ratio, 1.0)
+    return np.asarray(np.minimum(known / (1.0 - _TURNED * known**2), _UNKNOWN_PHASE))
 
 
 @dataclass(frozen=True)
@@ -185,12 +182,13 @@ class Scatter:
         known = size > _TINY
         turned = clean * np.conj(np.where(known, mean, 1.0) / np.where(known, size, 1.0))
         radial, tangential = turned.real - size, turned.imag
-        noise, freedom, tones = _white(radial)
-        both = 0.5 * (noise + _white(tangential)[0])
+        noises, freedoms, tones = _white(np.stack((radial, tangential), axis=1))
+        both = noises.mean(axis=0)
         weak = len(cycles) * size**2 < _SHOWS * both
-        noise, freedom = np.where(weak, both, noise), np.where(weak, 2.0, 1.0) * freedom
+        noise = np.where(weak, both, noises[0])
+        freedom = np.where(weak, 2.0, 1.0) * freedoms[0]
         noise = np.maximum(noise, (_ROUNDING * size) ** 2 + _TINY)
-        leaked = np.hypot(_ANY_ANGLE * np.abs(cycles.mean(axis=0) - mean), np.sqrt(tones))
+        leaked = np.hypot(_ANY_ANGLE * np.abs(cycles.mean(axis=0) - mean), np.sqrt(tones[0]))
         return cls(mean, noise, freedom, leaked, radial, tangential)
 
 
@@ -213,7 +211,7 @@ def _white(series: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         variance = np.sum(series**2, axis=0) / (count - 1)
         return variance, np.full(variance.shape, count - 1.0), np.zeros(variance.shape)
     power = _spectrum(series)
-    floor = np.median(power, axis=0) / np.log(2.0)
+    floor = row_medians(power.reshape(lines, -1).T).reshape(power.shape[1:]) / np.log(2.0)
     for _ in range(3):
         noise = power <= _OUTLIER * floor
         floor = np.sum(power, axis=0, where=noise) / np.maximum(noise.sum(axis=0), 1)
@@ -237,13 +235,15 @@ class Repeatability:
     jitter: float
 
     @classmethod
-    def of(cls, cycles: ComplexArray, clean: ComplexArray, orders: FloatArray,
-           jitter: float | None = None, *, cycle_length: float = 1.0) -> 'Repeatability':
+    def of(cls, cycles: ComplexArray, clean: ComplexArray, orders: FloatArray, *,
+           cycle_length: float = 1.0, jitter: float | None = None, kurtosis: float = _UNIFORM,
+           corrected: Scatter | None = None) -> 'Repeatability':
         """
         Return that of amplitudes (cycle, channel, order) of trigger cycles.
 
-        `clean` are the same without the leakage between the orders; `jitter` is known, or None:
-        the cycles show it. `cycle_length` is r. Errors are NaN for one cycle.
+        `clean` are the same without the leakage between the orders. `jitter` is known, or None:
+        the cycles show it; `kurtosis` is that of the pulse errors, and `corrected` the scatter of
+        the same cycles without them, if known. `cycle_length` is r. Errors are NaN for one cycle.
         """
         count = len(cycles)
         if count < 2:
@@ -253,38 +253,36 @@ class Repeatability:
         size = np.maximum(np.abs(scatter.mean), math.sqrt(_TINY))
         turn = 2.0 * pi * orders * size
         shows = count * size**2 > _SHOWS * scatter.noise
-        if count < _MANY:
-            variance = _shown_variance(scatter, turn, shows) if jitter is None else jitter**2
-            turned = turn**2 * variance * (1.0 - 0.5 / count)
-            across = turned + scatter.noise
-            guessed = turned**2 / (count - 1.0) if jitter is None else 0.0
-            freedom = across**2 / np.maximum(
-                guessed + scatter.noise**2 / scatter.freedom, _TINY)
+        if jitter is not None:
+            variance, known = jitter**2, np.inf
+        elif count < _MANY:
+            variance, known = _shown_variance(scatter, turn, shows), count - 1.0
         else:
+            variance, known = _total_variance(scatter, turn, shows), np.inf
+        noise, freedom = scatter.noise, scatter.freedom
+        along = across = np.zeros(size.shape)
+        if np.any(variance * np.sum(turn**2, where=shows) > _NO_LEAK * noise):
+            mean = scatter.mean
+            if corrected is not None:
+                mean, noise, freedom = corrected.mean, corrected.noise, corrected.freedom
+                shows = count * np.abs(mean) ** 2 > _SHOWS * noise
+            jittered = _Jittered.of(np.where(shows, mean, 0.0), orders, variance, kurtosis,
+                                    cycle_length, whole=corrected is not None)
+            radius = np.exp(1j * np.angle(mean))
+            # Many cycles show what errors of another shape than uniform ones shorten.
+            beside = (shows & (count >= _MANY)) | (corrected is None and count > 2)
+            if beside.any():
+                noise, freedom = (np.where(beside, *pair) for pair in zip(
+                    jittered.noise_beside(scatter, radius), (noise, freedom)))
+            along, across = jittered.of_mean(radius, count)
+        along = _together(noise / count, freedom, along, known)
+        across = _together(noise / count, freedom, across, known)
+        if count >= _MANY:
             lines = max(_LINES, round(_SHARE * count))
-            across = _spectrum(scatter.tangential)[:lines].mean(axis=0)
-            freedom = np.full(across.shape, 2.0 * lines)
-            turned = np.maximum(across - scatter.noise, 0.0)
-            variance = _total_variance(scatter, turn, shows) if jitter is None else jitter**2
-        # Jitter shortens a phasor in proportion to the square of its turn.
-        shortened = _ALONG * (1.0 - _OWN / count) * turned**2 / size**2
-        noise = np.maximum(scatter.noise - shortened / _COMMON, 0.0)
-        guessed_from = np.inf if jitter is not None or count >= _MANY else (
-            _GUESSED * (count - 1.0))
-        along = np.sqrt(widened(np.sqrt(noise / count), scatter.freedom) ** 2
-                        + widened(np.sqrt(shortened / count), guessed_from) ** 2
-                        + scatter.leaked**2)
-        across = np.hypot(widened(np.sqrt(across / count), freedom), scatter.leaked)
-        if count > 2 and np.any(
-                variance * np.sum(turn**2, where=shows) > _NO_LEAK * scatter.noise):
-            beside = np.hypot(
-                _own_noise(scatter, orders, shows, variance, cycle_length), scatter.leaked)
-            short = np.where(shows, widened(np.sqrt(shortened / count), guessed_from), 0.0)
-            along = np.minimum(along, np.hypot(beside, short))
-            turned = widened(turn * math.sqrt(variance / count), guessed_from / _GUESSED)
-            across = np.where(shows & (count >= _MANY), across,
-                              np.minimum(across, np.hypot(beside, turned)))
-        return cls(orders, along, across, float(np.sqrt(variance)))
+            near_zero = _spectrum(scatter.tangential)[:lines].mean(axis=0)
+            across = np.where(shows, widened(np.sqrt(near_zero / count), 2.0 * lines), across)
+        return cls(orders, np.hypot(along, scatter.leaked), np.hypot(across, scatter.leaked),
+                   math.sqrt(variance))
 
     def errors(self, amplitudes: ComplexArray, least_jitter: float = 0.0) -> AmplitudeErrors:
         """
@@ -327,64 +325,172 @@ def corrected_errors(cycles: ComplexArray, clean: ComplexArray, orders: FloatArr
     return AmplitudeErrors.of(amplitudes, along, np.hypot(noise, size * common), largest=largest)
 
 
-def _own_noise(scatter: Scatter, orders: FloatArray, shows: NDArray[np.bool_], variance: float,
-               cycle_length: float) -> FloatArray:
+def _together(noise: FloatArray, freedom: FloatArray, jitter: FloatArray, known: float
+              ) -> FloatArray:
     """
-    Return the standard errors (channel, order) of means that noise and leaking orders give.
+    Return the standard error of two variances that are known with so many degrees of freedom.
 
-    Jitter of a pulse makes an order that `shows` leak into all others, with opposite signs in the
-    two cycles beside it: the scatter of the cycles shows much of it, their mean little. What the
-    spectrum of the scatter has beyond it is noise (maximum likelihood), along the radius of an
-    order that shows, whose own jitter is across, else in both directions.
+    Those of their sum are by Satterthwaite (1946).
     """
-    count = len(scatter.radial)
-    power = _spectrum(scatter.radial)
-    power = np.where(shows, power, 0.5 * (power + _spectrum(scatter.tangential)))
-    alone, shared = _leaking(np.where(shows, scatter.mean, 0.0), orders, variance, cycle_length)
-    omega = 2.0 * pi * np.arange(1, len(power) + 1)[:, None, None] / count
-    expected = 0.5 * alone + shared * np.cos(omega)  # of a real part
-    mean = 0.5 / count**2 * (count * alone + 2.0 * (count - 1.0) * shared)
-    noise = np.maximum(power.mean(axis=0), _TINY)
-    least = _LEAST_NOISE * noise
-    for _ in range(_ROUNDS):
-        weight = np.where(power < _OUTLIER * (noise + expected), 1.0, 0.0) * (
-            noise / (noise + expected)) ** 2
-        noise = np.maximum(np.sum(weight * (power - expected), axis=0)
-                           / np.maximum(weight.sum(axis=0), _TINY), least)
-    freedom = np.where(shows, 2.0, 4.0) * np.sum((noise / (noise + expected)) ** 2, axis=0)
-    return np.hypot(widened(np.sqrt(noise / count), freedom), np.sqrt(np.maximum(mean, 0.0)))
+    both = noise + jitter
+    return widened(np.sqrt(both), both**2 / np.maximum(
+        noise**2 / freedom + jitter**2 / known, _TINY))
 
 
-def _leaking(sources: ComplexArray, orders: FloatArray, variance: float, cycle_length: float
-             ) -> tuple[FloatArray, FloatArray]:
+def kurtosis(errors: FloatArray) -> float:
     """
-    Return what jitter of the pulses makes `sources` (channel, order) leak into the other orders.
+    Return the kurtosis of pulse errors (pulse,) of mean 0, as far as intervals need it.
 
-    The results are the variance (channel, order) of what leaks into a cycle, and its covariance
-    with what leaks into the next one. Pulse errors are uniform with this `variance`, and may be
-    large.
+    NaN are left out. It is at least 1.2, and at most that of normal errors.
+
+    >>> round(kurtosis(np.linspace(-1.0, 1.0, 1001)), 3)
+    1.8
     """
-    error = np.sqrt(3.0 * variance) * _NODES
-    begin, end = error[:, None], error
-    strong = np.flatnonzero(sources.any(axis=0))
-    signed = np.concatenate((orders[strong], -orders[strong]))[:, None, None, None]
-    # The integral of exp(j 2 pi (signed begin + angle u)) over the cycle.
-    angle = cycle_length * (signed - orders[:, None, None]) + signed * (end - begin)
-    share = np.exp(1j * pi * (angle + 2.0 * signed * begin)) * np.sinc(angle)
-    own = np.arange(strong.size), strong
-    left = np.abs(share[own] @ _WEIGHTS @ _WEIGHTS)
-    share[own] = 0.0
-    share -= (share @ _WEIGHTS @ _WEIGHTS)[..., None, None]
-    size = sources[:, strong] / np.maximum(left, _LEAST_SHARE)
-    size = np.concatenate((size, np.conj(size)), axis=1)
-    # Sources whose phases turn alike from cycle to cycle leak together.
-    turns, alike = np.unique(np.mod(np.round(cycle_length * signed.ravel(), 6), 1.0),
-                             return_inverse=True)
-    groups = np.where(alike == np.arange(turns.size)[:, None, None], size, 0.0)
-    leaked = np.tensordot(groups, share, axes=1)  # (group, channel, order, begin, end)
-    turn = np.exp(2j * pi * (cycle_length * orders - turns[:, None]))[:, None]
-    shared = np.conj(_WEIGHTS @ leaked) * (leaked @ _WEIGHTS) @ _WEIGHTS * turn
-    return (np.abs(leaked) ** 2 @ _WEIGHTS @ _WEIGHTS).sum(axis=0), shared.real.sum(axis=0)
+    squares = errors[np.isfinite(errors)] ** 2
+    mean = float(squares.mean()) if squares.size else 0.0
+    if not mean:
+        return _UNIFORM
+    return float(np.clip(np.mean((squares / mean) ** 2), *_KURTOSES))
+
+
+def _nodes(kurtosis: float) -> tuple[FloatArray, FloatArray]:
+    """
+    Return nodes and weights of the mean over errors of a standard deviation of 1.
+
+    It is exact up to the seventh power for a symmetric beta distribution of this `kurtosis`, which
+    is uniform for 1.8, and normal for 3.
+
+    >>> error, weight = _nodes(1.8)
+    >>> [round(float(weight @ error**power), 3) for power in (2, 4, 6)]
+    [1.0, 1.8, 3.857]
+    """
+    sixth = 5.0 * kurtosis**2 / (6.0 - kurtosis)
+    total = (sixth - kurtosis) / (kurtosis - 1.0)
+    apart = math.sqrt(0.25 * total**2 - total + kurtosis)
+    squares = 0.5 * total + np.array([-apart, apart])
+    weight = 0.25 + 0.5 * (1.0 - 0.5 * total) * np.array([-0.5, 0.5]) / apart
+    error = np.sqrt(squares)
+    return np.concatenate((-error, error)), np.concatenate((weight, weight))
+
+
+def _share_of_length(count: int, kurtosis: float) -> float:
+    """
+    Return which share of the variance along a mean of `count` cycles is that of its length.
+
+    Errors of the pulses turn and shorten a phasor by a quadratic form of them; what turns all
+    cycles together shortens nothing.
+    """
+    weight = np.ones(count + 1) / count
+    weight[[0, -1]] *= 0.5
+    own, beside = 2.0 / 3.0 * weight, 1.0 / (6.0 * count)
+    squares = np.sum(own**2) + 2.0 * count * beside**2
+    product = np.sum(own * weight**2) + 2.0 * beside * np.sum(weight[1:] * weight[:-1])
+    length = 2.0 * (squares - 2.0 * product + np.sum(weight**2) ** 2) + (kurtosis - 3.0) * np.sum(
+        (own - weight**2) ** 2)
+    return float(length / (2.0 * squares + (kurtosis - 3.0) * np.sum(own**2)))
+
+
+@dataclass(frozen=True)
+class _Jittered:
+    """
+    What jitter of the pulses adds to amplitudes of single trigger cycles.
+
+    `both` (2, channel, order) is the variance of the complex amplitude, and its covariance with
+    the next cycle, `lean` the complex means of the products without a conjugate: what jitter adds
+    lies along one direction more than across it. `own` are `both` of what an order does to itself
+    along its radius, `shows` which orders do so.
+    """
+
+    shows: NDArray[np.bool_]
+    both: FloatArray
+    lean: ComplexArray
+    own: FloatArray
+    kurtosis: float
+
+    @classmethod
+    def of(cls, means: ComplexArray, orders: FloatArray, variance: float, kurtosis: float,
+           cycle_length: float, *, whole: bool) -> '_Jittered':
+        """
+        Return what it does to `means` (channel, order), 0 of orders that do not show.
+
+        It turns them, and makes them leak into all others. `whole` means are those without
+        jitter. Pulse errors have this `variance`, which may be large, and `kurtosis`.
+        """
+        error, weight = _nodes(kurtosis)
+        error = math.sqrt(variance) * error
+        begin, end = error[:, None], error
+        strong = np.flatnonzero(means.any(axis=0))
+        signed = np.concatenate((orders[strong], -orders[strong]))[:, None, None, None]
+        # The integral of exp(j 2 pi (signed begin + angle u)) over the cycle.
+        angle = cycle_length * (signed - orders[:, None, None]) + signed * (end - begin)
+        share = np.exp(1j * pi * (angle + 2.0 * signed * begin)) * np.sinc(angle)
+        left = share @ weight @ weight
+        share -= left[..., None, None]
+        turned = np.arange(strong.size), strong
+        size = means[:, strong]
+        if not whole:
+            size = size / np.maximum(np.abs(left[turned]), _LEAST_SHARE)
+        own = np.zeros((2, *means.shape))
+        alone = share[turned].real
+        own[0][:, strong] = np.abs(size) ** 2 * (alone**2 @ weight @ weight)
+        own[1][:, strong] = np.abs(size) ** 2 * ((weight @ alone) * (alone @ weight) @ weight)
+        size = np.concatenate((size, np.conj(size)), axis=1)
+        # Sources whose phases turn alike from cycle to cycle leak together.
+        turns, alike = np.unique(np.mod(np.round(cycle_length * signed.ravel(), 6), 1.0),
+                                 return_inverse=True)
+        groups = np.where(alike == np.arange(turns.size)[:, None, None], size, 0.0)
+        leaked = np.tensordot(groups, share, axes=1)  # (group, channel, order, begin, end)
+        turn = np.exp(2j * np.pi * (cycle_length * orders - turns[:, None]))[:, None]
+        steady = np.abs(turn - 1.0) < _STEADY
+        ended, begun = weight @ leaked, leaked @ weight  # what one and the same pulse does to both
+        both = np.stack((np.abs(leaked) ** 2 @ weight @ weight,
+                         (np.conj(ended) * begun @ weight * turn).real))
+        lean = np.stack((leaked**2 @ weight @ weight * steady, ended * begun @ weight * steady))
+        return cls(means != 0.0, both.sum(axis=1), lean.sum(axis=1), own, kurtosis)
+
+    def seen(self, direction: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Return variance and covariance (2, channel, order) along and across unit phasors."""
+        more = (self.lean * np.conj(direction) ** 2).real
+        return 0.5 * (self.both + more), 0.5 * (self.both - more)
+
+    def of_mean(self, radius: ComplexArray, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the variances (channel, order) of the length of the mean, and across it."""
+        def mean(pair: FloatArray) -> FloatArray:
+            return np.asarray((count * pair[0] + 2.0 * (count - 1.0) * pair[1]) / count**2)
+
+        along, across = self.seen(radius)
+        turned = (1.0 - _share_of_length(count, self.kurtosis)) * mean(self.own)
+        return np.maximum(mean(along) - turned, 0.0), np.maximum(mean(across), 0.0)
+
+    def noise_beside(self, scatter: Scatter, radius: ComplexArray
+                     ) -> tuple[FloatArray, FloatArray]:
+        """
+        Return the variance (channel, order) of noise in one cycle, and its freedom.
+
+        Jitter of a pulse makes an order leak with opposite signs into the two cycles beside it,
+        and always along one direction: the scatter of the cycles shows much of it, their mean
+        little. What the spectrum of the scatter has beyond it is noise (maximum likelihood), along
+        the radius of an order that shows, else along and across that direction.
+        """
+        count = len(scatter.radial)
+        axis = np.where(self.shows, radius, np.exp(0.5j * np.angle(self.lean[0])))
+        series = (scatter.radial + 1j * scatter.tangential) * np.where(
+            self.shows, 1.0, radius * np.conj(axis))
+        power = np.concatenate((_spectrum(series.real), _spectrum(series.imag)))
+        lines = len(power) // 2
+        cosine = 2.0 * np.cos(2.0 * pi * np.arange(1, lines + 1) / count)[:, None, None]
+        expected = np.concatenate([
+            variance + covariance * cosine for variance, covariance in self.seen(axis)])
+        used = np.ones(power.shape, np.bool_)
+        used[lines:] = ~self.shows
+        noise = np.maximum(power.mean(axis=0, where=used), _TINY)
+        least = _LEAST_NOISE * noise
+        for _ in range(_ROUNDS):
+            both = noise + expected
+            weight = (noise / both) ** 2 * (used & (power < _OUTLIER * both))
+            noise = np.maximum(np.sum(weight * (power - expected), axis=0)
+                               / np.maximum(weight.sum(axis=0), _TINY), least)
+        return noise, 2.0 * np.sum((noise / (noise + expected)) ** 2, axis=0, where=used)
 
 
 def _total_variance(scatter: Scatter, turn: FloatArray, shows: NDArray[np.bool_]) -> float:

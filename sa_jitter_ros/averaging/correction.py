@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected_errors,
-                                                      Repeatability)
+                                                      kurtosis, Repeatability, Scatter)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.channel_gaps import ChannelGaps, telling
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
@@ -182,11 +182,13 @@ class CorrectingAverager:
         errors = average.amplitude_errors
         if correction.accepted:
             # The vibration and the declaration together know the jitter better than a few cycles.
-            raw = average.cycle_amplitudes
+            raw, aligned = average.cycle_amplitudes, correction.cycle_amplitudes
             errors = Repeatability.of(
                 raw, _clean(average, raw, self.settings), average.orders,
-                _in_cycles(correction.jitter_std, average, self.settings),
-                cycle_length=self.settings.cycle_length).errors(
+                cycle_length=self.settings.cycle_length,
+                jitter=_in_cycles(correction.jitter_std, average, self.settings),
+                kurtosis=kurtosis(correction.pulse_errors),
+                corrected=Scatter.of(aligned, _clean(average, aligned, self.settings))).errors(
                     average.amplitudes)
         return replace(average, correction=correction, amplitude_errors=errors)
 
