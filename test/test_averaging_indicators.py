@@ -306,7 +306,8 @@ class TestOffset:
 
 class TestStandardErrors:
 
-    @pytest.mark.parametrize(('noise', 'damage'), [(0.1, 0.0), (1.0, 0.0), (0.1, 0.5)])
+    @pytest.mark.parametrize(('noise', 'damage'), [
+        (0.1, 0.0), (1.0, 0.0), (0.1, 0.5), (0.02, 0.5)])
     def test_they_hold(self, rng, noise, damage):
         """Of averages of parts of different size, from the ninth average on, with an offset."""
         points, channels = 512, 250
