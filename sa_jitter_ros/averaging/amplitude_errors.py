@@ -191,6 +191,11 @@ class Scatter:
         leaked = np.hypot(_ANY_ANGLE * np.abs(cycles.mean(axis=0) - mean), np.sqrt(tones[0]))
         return cls(mean, noise, freedom, leaked, radial, tangential)
 
+    @property
+    def error_of_mean(self) -> FloatArray:
+        """Return the standard error (channel, order) of the mean along the radius."""
+        return np.hypot(widened(np.sqrt(self.noise / len(self.radial)), self.freedom), self.leaked)
+
 
 def _spectrum(series: FloatArray) -> FloatArray:
     """Return the power of real series (cycle, ...) without frequency zero and Nyquist's."""
@@ -304,23 +309,19 @@ def _left(turn: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(np.minimum(normal, uniform), _LEAST_LEFT))
 
 
-def corrected_errors(cycles: ComplexArray, clean: ComplexArray, orders: FloatArray, *,
-                     amplitudes: ComplexArray, unsure: FloatArray, largest: FloatArray,
-                     jitter: float) -> AmplitudeErrors:
+def corrected_errors(scatter: Scatter, orders: FloatArray, *, amplitudes: ComplexArray,
+                     unsure: FloatArray, largest: FloatArray, jitter: float) -> AmplitudeErrors:
     """
     Return the standard errors of corrected `amplitudes` (channel, order): how far from the truth.
 
-    `cycles` (cycle, channel, order) between corrected pulses show the noise, `clean` are the same
-    without the leakage between the orders; `unsure` (channel, order) is the relative standard
-    error of the correction, `largest` the amplitudes that it may have made smaller. The mean of
-    the pulse errors, whose standard deviation is `jitter` (fundamental cycles), cannot be
-    recovered: it turns all orders. NaN where the amplitude is.
+    `scatter` is that of the cycles between corrected pulses, which shows the noise; `unsure`
+    (channel, order) is the relative standard error of the correction, `largest` the amplitudes
+    that it may have made smaller. The mean of the pulse errors, whose standard deviation is
+    `jitter` (fundamental cycles), cannot be recovered: it turns all orders. NaN where the
+    amplitude is.
     """
-    scatter = Scatter.of(cycles, clean)
-    size = np.abs(amplitudes)
-    noise = np.hypot(widened(np.sqrt(scatter.noise / len(cycles)), scatter.freedom),
-                     scatter.leaked)
-    common = 2.0 * pi * orders * jitter / np.sqrt(len(cycles) + 1.0)
+    size, noise = np.abs(amplitudes), scatter.error_of_mean
+    common = 2.0 * pi * orders * jitter / np.sqrt(len(scatter.radial) + 1.0)
     along = np.sqrt(noise**2 + size**2 * (unsure**2 + _MODEL**2))
     return AmplitudeErrors.of(amplitudes, along, np.hypot(noise, size * common), largest=largest)
 

@@ -230,14 +230,15 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     begins = np.flatnonzero(raw.used)
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
     turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
-    ratio, error = attenuation(raw.amplitudes, amplitudes, corrected.noise, turned)
     cycles_again = corrected.cycle_amplitudes
+    scatter = Scatter.of(cycles_again, _clean(raw, cycles_again, settings))
+    ratio, error = attenuation(raw.amplitudes, amplitudes, scatter.error_of_mean, turned)
     return Correction(
         corrected.waveform, amplitudes, corrected.noise,
         np.where(recovery.resolved, recovery.errors, np.nan), recovery.standard_errors, True, '',
         ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
-            cycles_again, _clean(raw, cycles_again, settings), raw.orders, amplitudes=amplitudes,
-            unsure=unsure, largest=whole, jitter=_in_cycles(recovery.std, raw, settings)),
+            scatter, raw.orders, amplitudes=amplitudes, unsure=unsure, largest=whole,
+            jitter=_in_cycles(recovery.std, raw, settings)),
         corrected.parts, recovery.std, refitted,
         _envelope(corrected, _between(raw, cycles, corrected.pulses), settings))
 
