@@ -13,7 +13,7 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
-from sa_jitter_ros.averaging.amplitude_errors import (kurtosis, Repeatability, Scatter,
+from sa_jitter_ros.averaging.amplitude_errors import (kurtosis_of, Repeatability, Scatter,
                                                       upper_limit)
 
 ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
@@ -101,7 +101,7 @@ def test_errors_of_known_jitter_hold_for_both_shapes_of_it(count, turn, shape):
         mean = cycles.mean(axis=0)
         found = Repeatability.of(
             cycles, cycles, ORDERS, jitter=turn / (2.0 * np.pi * ORDERS[0]),
-            kurtosis=kurtosis(errors - errors.mean()), corrected=Scatter.of(aligned, aligned)
+            kurtosis=kurtosis_of(errors - errors.mean()), corrected=Scatter.of(aligned, aligned)
         ).errors(mean)
         size.append(np.abs(mean[0]))
         along.append(found.amplitude[0])
@@ -154,6 +154,25 @@ def test_corrected_errors_are_the_distance_from_the_truth():
     assert hold(shares(np.array(amplitude)[:, :3]), trials).all()
     assert hold(shares(np.array(phase)[:, :2]), trials).all()
     assert np.all(np.mean(limits, axis=0) > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials))
+
+
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+@pytest.mark.parametrize(
+    ('count', 'turn', 'ratio'), [(10, 0.3, 1.0), (40, 0.8, 1.0), (10, 0.3, 2.4)])
+def test_errors_of_a_waveform_hold_the_jitter_that_neighbouring_cycles_share(count, turn, ratio):
+    rng, trials, rate, speed = np.random.default_rng(count), 120, 8000.0, 25.0
+    times = np.arange(round((count + 7) / speed * rate)) / rate
+    true, orders = (2.0 + np.arange(count + 4.0)) / speed, ORDERS[STRONG]
+    wave = (AMPLITUDES[STRONG] * np.exp(1j * PHASES[STRONG])) @ np.exp(
+        2j * np.pi * speed * ratio * np.outer(orders, times - true[0]))
+    std = turn / (2.0 * np.pi * orders[0] * speed * ratio)
+    found = [sa.average(wave.real + 0.05 * rng.standard_normal(times.size), rate,
+                        true + std * np.sqrt(3.0) * rng.uniform(-1.0, 1.0, true.size),
+                        ratio=ratio, orders=orders, trigger_cycles=count,
+                        interval_tolerance=0.45)[0] for _ in range(trials)]
+    waveforms = np.array([item.waveform[0] for item in found])
+    z = (waveforms - waveforms.mean(axis=0)) / [item.standard_error[0] for item in found]
+    assert hold(shares(z.ravel()), trials).all()
 
 
 @pytest.mark.parametrize('true', [0.5, 1.0, 2.0, 5.0])

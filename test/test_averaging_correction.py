@@ -117,6 +117,29 @@ def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds()
     assert change.mean() < 0.02 * raw.mean() + 3.0 * change.std() / np.sqrt(80.0)
 
 
+def test_attenuation_of_five_cycles_has_a_standard_error_that_holds():
+    orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 250
+    rng, rate, std = np.random.default_rng(8), 160.0 * SPEED, 0.3 / (2.0 * np.pi * 16.0 * SPEED)
+    times, true = np.arange(1920) / rate, (2.0 + np.arange(9)) / SPEED
+    wave = np.exp(2j * np.pi * SPEED * np.outer(orders, times - true[0]))
+    settings = {'orders': orders, 'trigger_cycles': cycles, 'interval_tolerance': 0.45}
+    z = []
+    for _ in range(trials):
+        clean = ((size * np.exp(2j * np.pi * rng.uniform(size=3))) @ wave).real
+        noisy = clean + 0.14 * rng.standard_normal(times.size)
+        pulses = true + np.sqrt(3.0) * std * rng.uniform(-1.0, 1.0, true.size)
+        exact, *_ = sa.average(clean, rate, pulses, **settings)
+        average, *_ = sa.average(noisy, rate, pulses, correct_jitter=True,
+                                 keyphasor_rate=1.0 / (np.sqrt(12.0) * std), **settings)
+        correction = average.correction
+        assert correction.accepted
+        z.append((correction.attenuation[0] - np.abs(exact.amplitudes[0]) / size)
+                 / correction.attenuation_standard_error[0])
+    for width, wanted in ((1.0, 0.683), (1.96, 0.95)):
+        error = np.sqrt(wanted * (1.0 - wanted) / np.size(z))
+        assert np.mean(np.abs(z) < width) == pytest.approx(wanted, abs=0.03 + 3.0 * error)
+
+
 def test_noise_does_not_raise_what_errors_leave_uncertain():
     found = averages_of(gearbox(2.40789, noise=6.0), ratio=2.40789, seconds=40.0)
     raw, corrected = (np.abs([item.amplitudes[0] for item in items]) for items in (

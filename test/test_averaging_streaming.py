@@ -19,6 +19,7 @@ from hypothesis import given, settings, strategies as st
 from machine import averager, feed, Machine
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.amplitude_errors import widened
 from sa_jitter_ros.averaging.average import AverageSettings, AVERAGING
 from sa_jitter_ros.averaging.cycle import CycleSamples
 from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
@@ -443,7 +444,8 @@ def test_standard_error_of_the_waveform_is_its_scatter(rng):
     assert len(found) == 100
     # some 40 independent points in each of 100 averages; errors have 15 degrees of freedom
     spread = np.sqrt(2.0 / (40 * 100) + 2.0 / (15 * 40 * 100))
-    assert (errors**2).mean() / waveforms.var() == pytest.approx(1.0, abs=4.0 * spread)
+    assert (errors**2).mean() / waveforms.var() == pytest.approx(
+        widened(1.0, 15.0)**2, abs=4.0 * spread)
 
 
 # --- kinds of average ----------------------------------------------------------------------------

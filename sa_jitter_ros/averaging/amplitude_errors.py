@@ -17,7 +17,8 @@ half of the variance of one cycle the covariance with the next, and the variance
 cycles is twice that of independent ones (Camerini et al. 2019, Eq. 32, leaves this out). From
 `_MANY` cycles on the spectrum of the scatter near frequency zero shows what the mean has,
 whatever its correlation; fewer cycles determine the standard deviation of one independent error
-for each pulse, with all channels and orders together.
+for each pulse, with all channels and orders together. A correction knows the pulse errors and the
+noise beside them.
 
 A few cycles show their scatter only roughly. The standard errors are enlarged by so much
 (`widened`) that 1 and 1.96 of them contain 68 % and 95 %, as those of a normal distribution do.
@@ -66,7 +67,8 @@ _LEAST_LEFT = 0.02
 _LEAST_SHARE = 0.3
 # Jitter that cannot leak more than so much of the noise into a cycle does not matter.
 _NO_LEAK = 0.01
-_STEADY = 1e-4
+# Phasors that are closer together than this turn alike.
+_ALIKE = 1e-4
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(8), (1.0, 0.0)))
 # Noise of a weak order beside leakage that jitter explains: least share of its scatter, and rounds
 # of its estimate.
@@ -118,6 +120,32 @@ def widened(error: FloatArray, freedom: FloatArray | float) -> FloatArray:
     array([1.2125])
     """
     return np.asarray(error * (1.0 + 0.85 / np.maximum(freedom, 1.0)))
+
+
+def waveform_error(waveform: FloatArray, error: FloatArray, count: int, jitter: float,
+                   cycle_length: float) -> FloatArray:
+    """
+    Return the standard error (angle, channel) of the mean `waveform` of `count` cycles.
+
+    `error` is their scatter over sqrt(count). An error of a pulse, whose standard deviation is
+    `jitter` (fundamental cycles), moves what is less than a trigger cycle, `cycle_length`, away
+    from it: neighbouring cycles move together.
+
+    >>> waveform = np.cos(2.0 * np.pi * np.arange(64) / 64)[:, None]
+    >>> error = waveform_error(waveform, np.full((64, 1), 1e-3), 100, 0.01, 1.0)
+    >>> error[[0, 16], 0].round(4)
+    array([0.001 , 0.0037])
+    """
+    if count < 2:
+        return error
+    lag = np.arange(1, min(math.ceil(2.0 * cycle_length), count))
+    apart = lag / cycle_length
+    # The mean of what two cycles so far apart have of a pulse in common is a cubic B-spline.
+    common = np.where(apart < 1.0, 2.0 / 3.0 - apart**2 * (1.0 - 0.5 * apart),
+                      (2.0 - apart) ** 3 / 6.0)
+    shared = 2.0 / count * np.sum(common * (1.0 - lag / count))
+    slope = 0.5 * len(waveform) * (np.roll(waveform, -1, axis=0) - np.roll(waveform, 1, axis=0))
+    return np.hypot(widened(error, count - 1.0), math.sqrt(shared) * jitter * slope)
 
 
 def upper_limit(amplitude: FloatArray, error: FloatArray) -> FloatArray:
@@ -338,13 +366,13 @@ def _together(noise: FloatArray, freedom: FloatArray, jitter: FloatArray, known:
         noise**2 / freedom + jitter**2 / known, _TINY))
 
 
-def kurtosis(errors: FloatArray) -> float:
+def kurtosis_of(errors: FloatArray) -> float:
     """
     Return the kurtosis of pulse errors (pulse,) of mean 0, as far as intervals need it.
 
     NaN are left out. It is at least 1.2, and at most that of normal errors.
 
-    >>> round(kurtosis(np.linspace(-1.0, 1.0, 1001)), 3)
+    >>> round(kurtosis_of(np.linspace(-1.0, 1.0, 1001)), 3)
     1.8
     """
     squares = errors[np.isfinite(errors)] ** 2
@@ -442,7 +470,7 @@ class _Jittered:
         groups = np.where(alike == np.arange(turns.size)[:, None, None], size, 0.0)
         leaked = np.tensordot(groups, share, axes=1)  # (group, channel, order, begin, end)
         turn = np.exp(2j * np.pi * (cycle_length * orders - turns[:, None]))[:, None]
-        steady = np.abs(turn - 1.0) < _STEADY
+        steady = np.abs(turn - 1.0) < _ALIKE
         ended, begun = weight @ leaked, leaked @ weight  # what one and the same pulse does to both
         both = np.stack((np.abs(leaked) ** 2 @ weight @ weight,
                          (np.conj(ended) * begun @ weight * turn).real))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import (AmplitudeErrors, corrected_errors,
-                                                      kurtosis, Repeatability, Scatter)
+                                                      kurtosis_of, Repeatability, Scatter)
 from sa_jitter_ros.averaging.average import Average, AverageSettings, Correction
 from sa_jitter_ros.averaging.channel_gaps import ChannelGaps, telling
 from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
@@ -187,7 +187,7 @@ class CorrectingAverager:
                 raw, _clean(average, raw, self.settings), average.orders,
                 cycle_length=self.settings.cycle_length,
                 jitter=_in_cycles(correction.jitter_std, average, self.settings),
-                kurtosis=kurtosis(correction.pulse_errors),
+                kurtosis=kurtosis_of(correction.pulse_errors),
                 corrected=Scatter.of(aligned, _clean(average, aligned, self.settings))).errors(
                     average.amplitudes)
         return replace(average, correction=correction, amplitude_errors=errors)

@@ -24,7 +24,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.amplitude_errors import Repeatability
+from sa_jitter_ros.averaging.amplitude_errors import Repeatability, waveform_error
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
@@ -477,6 +477,7 @@ class ShaftAverager:
         pulses, used, seconds = self._edges()
         cycles, numbers = self._window(), np.array(self._numbers)
         amplitudes, (noise, scatter) = self._amplitude_mean.mean, self._estimated_noise()
+        error = waveform_error(waveform, error, count, scatter.jitter, settings.cycle_length)
         average = Average(
             start_time=float(pulses[0]), end_time=float(pulses[-1]), sequence=self._sequence,
             trigger_cycles=len(cycles), fundamental_cycles=count,
