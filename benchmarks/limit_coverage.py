@@ -152,7 +152,8 @@ def lines(seed: int | Sequence[int], *, std: float = 0.0, gain: float = 0.0, los
     evidence = LineEvidence(
         none, none, none, density, modulation + rng.standard_normal(shape), np.ones(_LINES))
     return Evidence(
-        replace(MODEL, noise_std=1.0, sample_rate=20e3), (Pulses(none, 0, None),), none, none, none, np.nan, False, none,
+        replace(MODEL, noise_std=1.0, sample_rate=20e3), (Pulses(none),), none, none, none,
+        np.nan, False, none,
         rng.geometric(1.0 - lost, _COUNT) - 1, Clock(0.0, 0.0), evidence)
 
 
@@ -271,8 +272,8 @@ def main() -> None:
         covered = []
         for place, share in enumerate(_SIZES):
             size = share * median
-            hits = sum(case.covers(_limit(case.draw([2 + place, number, k], size), case.name), size)
-                       for k in seeds)
+            found = [_limit(case.draw([2 + place, number, k], size), case.name) for k in seeds]
+            hits = sum(case.covers(limit, size) for limit in found)
             covered.append(f'{100.0 * hits / options.draws:.1f} %')
         over = f'{median / case.fisher:.2f}' if np.isfinite(case.fisher) else '-'
         print(f'| {label} | {median:.3g} | {over} | {" | ".join(covered)} |', flush=True)
