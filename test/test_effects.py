@@ -263,6 +263,20 @@ def test_skew_is_a_delay_that_grows(rng):
     assert gain == pytest.approx(np.abs(np.sinc(frequency * 2e-4 * 0.8)), abs=1e-6)
 
 
+def test_marks_are_counted_from_the_one_that_a_recording_begins_with(rng):
+    model = replace(MODEL, pulses_per_revolution=3, pulses_per_trigger=2)
+    target = make_effect('target_geometry', pulse_angles=(0.01, -0.002, -0.008))
+    other = replace(target, pulse_angles=(-0.008, 0.01, -0.002))
+    index = 20 * np.arange(6)[:, None] + np.arange(21)
+    jitter = 2e-5 * rng.standard_normal(index.shape)
+    jitter[2, 5] = np.nan
+    for item in (target, other):
+        errors = jitter + item.pattern(model, Pulses(np.zeros(121)))[index]
+        errors -= np.nanmean(errors, axis=1, keepdims=True)
+        assert target.counted_anew(model, index, errors) == item
+    assert target.counted_anew(model, index, 100.0 * jitter) == target  # nothing shows
+
+
 def test_speed_fluctuation_has_the_closed_form_at_small_size():
     quiet = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e9})
     effect = make_effect('speed_fluctuation', acceleration_std=20.0)

@@ -162,6 +162,16 @@ def test_effect_on_the_mean_is_traced(name, values, parameter):
 
 
 @pytest.mark.machines
+def test_declared_speed_fluctuation_is_no_news():
+    effect = make_effects({'speed_fluctuation': {'acceleration_std': 90.0}})
+    recording = simulated(*effect)
+    first = trace([observe(recording, MODEL)], [recording])
+    again = trace([observe(recording, MODEL)], [recording],
+                  declared=[item.effect for item in first.findings])
+    assert (first.verdict, again.verdict) == ('traced', 'none')
+
+
+@pytest.mark.machines
 @pytest.mark.parametrize(('name', 'values', 'parameter', 'tolerance'), [
     ('additive_noise', {'std': 1.0}, 'std', 0.1),
     ('amplitude_modulation', {'std': 0.3}, 'std', 0.08),

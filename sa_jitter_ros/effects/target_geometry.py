@@ -16,7 +16,7 @@ trigger make.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import Any, ClassVar
 
@@ -27,6 +27,8 @@ from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
+
+_CERTAIN = 10.0  # gain of likelihood from which on a recording begins with another mark
 
 
 def _own(model: DeclaredModel) -> tuple[int, int]:
@@ -84,6 +86,23 @@ class TargetGeometry(Effect):
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
         """Return the errors of the pulses at hand."""
         return self._at(model, pulses.index) if self.pulse_angles else None
+
+    def counted_anew(self, model: DeclaredModel, index: Array, errors: Array) -> 'TargetGeometry':
+        """
+        Return the target counted from the mark with which a recording begins.
+
+        It is told by the `errors` in s of the trigger pulses `index`, both (acquisition, pulse);
+        the target is as declared where they do not tell.
+        """
+        angles, left = np.asarray(self.pulse_angles), []
+        turned = [replace(self, pulse_angles=tuple(np.roll(angles, -first).tolist()))
+                  for first in range(angles.size)]
+        for item in turned:
+            rest = errors - item._at(model, index)
+            left.append(np.nansum((rest - np.nanmean(rest, axis=1, keepdims=True)) ** 2))
+        best = int(np.argmin(left))
+        gain = 0.5 * np.isfinite(errors).sum() * math.log(left[0] / left[best])
+        return turned[best] if gain > _CERTAIN else self
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting

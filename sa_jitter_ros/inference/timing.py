@@ -197,7 +197,7 @@ def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,
     else:
         chooser.fit(names)
         choice = chooser.choice(names)
-    findings = tuple(_findings(chooser, choice))
+    findings = tuple(_findings(chooser, choice, declared))
     return Timing(findings, _probabilities(choice, findings), chooser, choice)
 
 
@@ -213,7 +213,7 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
     fit = chooser.fit(best, timing.choice.fit.starts)
     choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
                      setting=chooser.setting)
-    findings = tuple(_findings(chooser, choice))
+    findings = tuple(_findings(chooser, choice, declared))
     if [item.name for item in findings] != [item.name for item in timing.findings]:
         return timing
     return Timing(findings, timing.probabilities, chooser, choice)
@@ -239,7 +239,7 @@ def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
     return float(special.chdtrc(max(choice.fit.count - without.count, 1), 2.0 * gain))
 
 
-def _findings(chooser: Chooser, choice: Choice) -> list[Finding]:
+def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> list[Finding]:
     found = []
     for name in sorted(choice.best):
         if name == JITTER:
@@ -249,7 +249,7 @@ def _findings(chooser: Chooser, choice: Choice) -> list[Finding]:
     if _CLOCK in choice.fit.columns and JITTER not in choice.best:
         beside = _beside_the_clock(chooser, choice)
         found += [beside] if beside else []
-    speed = _of_speed(choice)
+    speed = _of_speed(choice, declared)
     return [*found, speed] if speed else found
 
 
@@ -335,8 +335,12 @@ def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
 
 
-def _of_speed(choice: Choice) -> Finding | None:
-    """Return the acceleration of the shaft that bends the angle inside the cycles, if it shows."""
+def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
+    """
+    Return the acceleration of the shaft that bends the angle inside the cycles, if it shows.
+
+    It is part of the `declared` model already where that one is as likely.
+    """
     fit, setting = choice.fit, choice.setting
     data = fit.data
     if data.series < 3:  # nothing is known of what happens inside the cycles
@@ -367,6 +371,12 @@ def _of_speed(choice: Choice) -> Finding | None:
     errors = {'acceleration_std': effect.acceleration_std * size_error / size}
     if low < high:  # not the widest band
         errors['bandwidth'] = 0.5 * (high - low)
+    for known in declared:
+        if known.name == _SPEED and 0.5 * sum(
+                ((effect.values[name] - known.values[name]) / value) ** 2
+                for name, value in errors.items()) < DECIDED + 0.5 * len(errors) * math.log(
+                    data.cycles):
+            return None
     return Finding(
         _SPEED, effect, errors, chance,
         'the speed changes within a trigger cycle: the angle between the pulses errs by '

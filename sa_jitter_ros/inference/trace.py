@@ -31,6 +31,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.effects.timing import SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
@@ -142,8 +143,19 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
             f'no line is compared: no declared order ({orders}) is coherent from cycle to cycle '
             'on any channel, so that no effect could have been seen; declare orders that the '
             'vibration holds'))
+    if len(observations) == 1:
+        declared = [_counted_anew(item, observation) for item in declared]
     return trace_bench(make_bench(observation, observations, recordings, declared),
                        progress=progress)
+
+
+def _counted_anew(effect: Effect, observation: Observation) -> Effect:
+    """Return the effect, a target counted from the mark with which the recording begins."""
+    if not isinstance(effect, TargetGeometry) or not effect.pulse_angles:
+        return effect
+    number = observation.pulses.number
+    index = np.array([number[item.first] + item.number for item in observation.acquisitions])
+    return effect.counted_anew(observation.model, index, observation.stacked('errors'))
 
 
 def _unresolved(observation: Observation) -> str:
