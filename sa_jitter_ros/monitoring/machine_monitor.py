@@ -157,8 +157,8 @@ class MachineMonitor:
         if not average.layout.channels:
             raise MessageError('average of no channel: publish at least one')
         self._without[shaft] += 1
-        if not (np.isfinite(average.values).any() and (average.layout.indicators
-                                      or self._without[shaft] >= _WITHOUT)):
+        known = bool(np.isfinite(average.values).any())
+        if not (known and (average.layout.indicators or self._without[shaft] >= _WITHOUT)):
             return None
         self.monitors[shaft] = ShaftMonitor(
             shaft, average.layout, self._settings, share=1.0 / len(self.shafts))
