@@ -116,8 +116,8 @@ class Changes:
 
     def warnings(self) -> list[str]:
         """Return what is not compared, and what to do about it."""
-        missing = sum(not mean.is_corrected for item in self.recordings
-                      for mean in item.means.values())
+        missing = sum(not all(mean.is_corrected for mean in item.means.values())
+                      for item in self.recordings)
         return [*(f'{name} is not compared: it {reason}' for name, reason in
                   self.left_out.items()),
                 *(f'no bearing of {shaft} is watched, and averages do not show its faults: give '
