@@ -223,6 +223,12 @@ def test_noise_that_hides_any_jitter_leaves_no_limit():
     assert largest(timing, 'excess_jitter') is None
 
 
+def test_no_motion_of_the_source_shows_against_a_reference_keyphasor():
+    part = replace(machine(1), referenced=True, bend_std=np.inf)
+    assert limit_of(part, 'phase_wander') == np.inf
+    assert limit_of(part, 'excess_jitter') < UNIT
+
+
 def test_short_or_missing_stretches_show_nothing():
     assert read_timing([]) is None
     assert read_timing([machine(0, count=12)]) is None

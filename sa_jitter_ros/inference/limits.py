@@ -45,6 +45,7 @@ _TWO_SIDED = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
 _LEAST = -9.0  # logarithm of a power that is nothing
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 _SLOWEST = 0.2  # share of a step by which the next one is shorter
+_CERTAIN = 1e8  # squared standard errors from 0
 _RESOLUTION = 4.0  # spacings of a number: finer grids are its own
 
 
@@ -131,15 +132,17 @@ def _bound(timing: Timing, name: str, top: float, far: float) -> Array | None:
     for _ in range(_STEPS):
         fit = chooser.fit(names, fit.starts, held={(name, 0): at})
         more, seen = fit.more_than_held(name, kurtosis)
-        # where the power that is seen, and its standard error, do not depend on the one held
+        if not seen > 0.0:
+            return None
+        # right if the power that is seen, and its standard error, do not depend on the one held
         step = math.log(max(seen + more + far, SEEN) / seen)
-        if abs(step) < _EXACT:
-            return fit.starts[name]
         low, high = (at, high) if step > 0.0 else (low, at)
+        if abs(step) < _EXACT or high - low < _EXACT:
+            break
         turn = 1.0 if last is None else (last[1] - step) / (at - last[0])
         last, to = (at, step), at + step / float(np.clip(turn, _SLOWEST, 1.0))
-        at = to if low < to < high else 0.5 * (max(low, at + step) + high)
-    return fit.starts[name] if high < top else None
+        at = to if low < to < high else 0.5 * (low + high)
+    return fit.starts[name] if abs(step) < _EXACT or high < top else None
 
 
 def _farthest(sizes: Array, covariance: Array) -> Array:
@@ -148,8 +151,8 @@ def _farthest(sizes: Array, covariance: Array) -> Array:
 
     How far estimates are from 0, in squared standard errors, has a noncentral chi2 distribution.
     """
-    distance = float(sizes @ np.linalg.pinv(covariance) @ sizes)
-    if not 0.0 < distance < math.inf:
+    distance = min(float(sizes @ np.linalg.pinv(covariance) @ sizes), _CERTAIN)
+    if not distance > 0.0:
         return sizes
     true = max(float(special.chndtrinc(distance, sizes.size, 1.0 - _CONFIDENCE)), 1.0)
     return np.asarray(sizes * math.sqrt(true / distance))

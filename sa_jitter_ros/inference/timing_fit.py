@@ -269,7 +269,8 @@ class TimingFit:
 
         Both are in standard errors of the efficient score (Rao 1948): the slope of the likelihood
         by the logarithm of the power, less what the free parameters make of it. `kurtosis` is that
-        of the declared errors beyond a normal one's 3: so much more their power scatters.
+        of the declared errors beyond a normal one's 3: so much more their power scatters. Both
+        are 0 where the data show nothing of it.
         """
         at, size = self.parameters, self.data.size
         chosen = np.append(self.place[name].start,
@@ -284,6 +285,8 @@ class TimingFit:
         share = np.append(1.0, -np.linalg.solve(known[1:, 1:], known[1:, 0]))
         information = max(float(share @ known[0]), _NOTHING)
         weight = np.einsum('a,afij->fij', share, change)
+        if not np.any(weight):  # a source that moves, against a reference keyphasor
+            return 0.0, 0.0
         declared = np.einsum('f,fij,fji->', size, weight @ self.inverse, self._at_zero(PULSES)
                              ).real * self.data.measured
         if JITTER in self.place:  # more may be of normal errors beside
