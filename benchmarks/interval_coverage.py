@@ -14,7 +14,7 @@ Shares of published intervals that contain the truth of a simulation.
 `python benchmarks/interval_coverage.py` prints the tables of `docs/theory.md` and
 `docs/condition_indicators.md`.
 The simulation knows no formula of the package: it adds cosines of known amplitude and white noise,
-and moves known pulse times by uniform errors.
+and moves known pulse times by uniform or normal errors.
 """
 
 import argparse
@@ -34,6 +34,8 @@ PERIOD, POINTS = 0.04, 160  # s of a trigger cycle, and samples in it
 #: Orders of the shaft: three strong ones, one 10 dB above its noise, one that is not there.
 STRONG, WEAK, ABSENT = (8.0, 16.0, 32.0), 21.0, 11.0
 AMPLITUDES = (0.5, 1.0, 0.3)
+#: Orders close to the noise, and how far above it (dB).
+CLOSE, LEVELS = (21.0, 11.0, 13.0, 5.0, 27.0), (-10.0, -5.0, 0.0, 5.0, 10.0)
 _SPARE = 3  # pulses that the validation may take to learn the interval
 
 
@@ -43,12 +45,14 @@ class Case:
     Averages of `cycles` trigger cycles.
 
     Order 16 stands `above` dB above the noise of the average, and the jitter turns it by `jitter`
-    rad (standard deviation); `correct` says whether pulses are corrected.
+    rad (standard deviation), by uniform or `normal` errors; `correct` says whether pulses are
+    corrected.
     """
 
     cycles: int
     above: float
     jitter: float
+    normal: bool = False
     correct: bool = True
 
 
@@ -70,26 +74,10 @@ class Coverage:
 
 def coverage(case: Case, trials: int, seed: int) -> tuple[Coverage, Coverage]:
     """Return the coverage of raw and of corrected values of so many averages."""
-    rng = np.random.default_rng(seed)
     error = 10.0 ** (-case.above / 20.0)
-    orders = np.array([*STRONG, WEAK, ABSENT])
     size = np.array([*AMPLITUDES, np.sqrt(10.0) * error, 0.0])
-    rate, noise = POINTS / PERIOD, np.sqrt(POINTS * case.cycles / 4.0) * error
-    std = case.jitter * PERIOD / (2.0 * np.pi * STRONG[1])
-    times = np.arange((case.cycles + 4 + _SPARE) * POINTS) / rate
-    pulses = PERIOD * (2.0 + np.arange(case.cycles + 1.0 + _SPARE))
-    wave = np.exp(2j * np.pi * np.outer(orders, (times - pulses[0]) / PERIOD))
     found: list[tuple[NDArray[np.complex128], ...]] = []
-    for _ in range(trials):
-        turn = np.exp(2j * np.pi * rng.uniform(size=orders.size))
-        samples = ((size * turn) @ wave).real + noise * rng.standard_normal(times.size)
-        late = pulses + rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0) * std
-        with warnings.catch_warnings():
-            warnings.simplefilter('ignore')
-            average, *_ = sa.average(
-                samples, rate, late, orders=orders, trigger_cycles=case.cycles,
-                correct_jitter=case.correct, keyphasor_rate=1.0 / (np.sqrt(12.0) * std),
-                interval_tolerance=0.45)
+    for average, turn in averages(case, (*STRONG, WEAK, ABSENT), size, trials, seed):
         row = []
         for source in (average, average.correction or average):
             errors = source.amplitude_errors
@@ -103,6 +91,30 @@ def coverage(case: Case, trials: int, seed: int) -> tuple[Coverage, Coverage]:
     raw = _coverage(columns[:4], None, size, 1.0)
     return raw, _coverage([item[accepted] for item in columns[4:]], size, size,
                           float(np.isfinite(columns[5]).all(axis=1).mean()))
+
+
+def averages(case: Case, orders: tuple[float, ...], size: FloatArray, trials: int, seed: int
+             ) -> Iterator[tuple[sa.Average, NDArray[np.complex128]]]:
+    """Iterate over averages of `orders` of this `size`, and the true phasors of the orders."""
+    rng = np.random.default_rng(seed)
+    rate = POINTS / PERIOD
+    noise = np.sqrt(POINTS * case.cycles / 4.0) * 10.0 ** (-case.above / 20.0)
+    std = case.jitter * PERIOD / (2.0 * np.pi * STRONG[1])
+    times = np.arange((case.cycles + 4 + _SPARE) * POINTS) / rate
+    pulses = PERIOD * (2.0 + np.arange(case.cycles + 1.0 + _SPARE))
+    wave = np.exp(2j * np.pi * np.outer(orders, (times - pulses[0]) / PERIOD))
+    for _ in range(trials):
+        turn = np.exp(2j * np.pi * rng.uniform(size=len(orders)))
+        samples = ((size * turn) @ wave).real + noise * rng.standard_normal(times.size)
+        late = std * (rng.standard_normal(pulses.size) if case.normal
+                      else rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter('ignore')
+            average, *_ = sa.average(
+                samples, rate, pulses + late, orders=orders, trigger_cycles=case.cycles,
+                correct_jitter=case.correct, keyphasor_rate=1.0 / (np.sqrt(12.0) * std),
+                interval_tolerance=0.45)
+        yield average, turn
 
 
 def _coverage(columns: list[NDArray[np.complex128]], truth: FloatArray | None,
@@ -133,19 +145,40 @@ def amplitude_table(trials: int) -> Iterator[str]:
     yield ('| N_t | order 16 above the noise, jitter | value | amplitude strong | weak | absent | '
            'phase strong | below `upper_95`: strong | weak | absent |')
     yield '|' + '---|' * 10
-    for cycles in (5, 10, 40, 160):
-        count = trials if cycles < 100 else trials // 3
-        for above, jitter in ((20.0, 0.1), (40.0, 0.3), (40.0, 0.8)):
-            pair = coverage(Case(cycles, above, jitter), count, seed=cycles + int(10 * jitter))
-            for name, item in zip(('raw', 'corrected'), pair):
-                if item.accepted < 0.1:
-                    continue
-                limits = (f'{100.0 * np.mean(item.upper[kind]):.1f}'
-                          for kind in ('strong', 'weak', 'absent'))
-                yield (f'| {cycles} | {above:g} dB, {jitter:g} rad | {name} | '
-                       + ' | '.join(shares(item.amplitude[kind])
-                                    for kind in ('strong', 'weak', 'absent'))
-                       + f' | {shares(item.phase["strong"])} | ' + ' | '.join(limits) + ' |')
+    cases = [Case(cycles, above, jitter) for cycles in (5, 10, 20, 40, 160)
+             for above, jitter in ((20.0, 0.1), (40.0, 0.3), (40.0, 0.8))]
+    cases += [Case(cycles, 40.0, 0.3, normal=True) for cycles in (5, 10, 20, 40)]
+    cases += [Case(cycles, 40.0, jitter, correct=False) for cycles in (5, 10, 20)
+              for jitter in (0.3, 0.8)]
+    for case in cases:
+        count = trials if case.cycles < 100 else trials // 3
+        pair = coverage(case, count, seed=case.cycles + int(10 * case.jitter))
+        for name, item in zip(('raw', 'corrected'), pair):
+            if item.accepted < 0.1 or (name == 'corrected' and not case.correct):
+                continue
+            limits = (f'{100.0 * np.mean(item.upper[kind]):.1f}'
+                      for kind in ('strong', 'weak', 'absent'))
+            how = ', normal' if case.normal else '' if case.correct else ', not corrected'
+            yield (f'| {case.cycles} | {case.above:g} dB, {case.jitter:g} rad{how} | {name} | '
+                   + ' | '.join(shares(item.amplitude[kind])
+                                for kind in ('strong', 'weak', 'absent'))
+                   + f' | {shares(item.phase["strong"])} | ' + ' | '.join(limits) + ' |')
+
+
+def limit_table(trials: int) -> Iterator[str]:
+    """Iterate over the lines of the table of `upper_95` of orders close to the noise."""
+    yield '| N_t | value | ' + ' | '.join(f'{level:g} dB' for level in LEVELS) + ' |'
+    yield '|' + '---|' * (2 + len(LEVELS))
+    for cycles in (5, 10, 40):
+        case = Case(cycles, 40.0, 0.3)
+        size = np.append(AMPLITUDES, 10.0 ** (0.05 * (np.array(LEVELS) - case.above)))
+        limits = np.array([
+            [item.amplitude_errors.upper_95[0] for item in (average, average.correction)]
+            for average, _ in averages(case, STRONG + CLOSE, size, trials, seed=2000 + cycles)
+            if average.correction is not None and average.correction.accepted])
+        for name, below in zip(('raw', 'corrected'), (limits >= size).mean(axis=0)):
+            yield (f'| {cycles} | {name} | '
+                   + ' | '.join(f'{100.0 * share:.1f}' for share in below[len(STRONG):]) + ' |')
 
 
 def strong_amplitudes(cycles: int, turn: float, uniform: bool, trials: int, seed: int
@@ -233,6 +266,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.trials:
         print('\n'.join(amplitude_table(options.trials)), '', sep='\n', flush=True)
+        print('\n'.join(limit_table(options.trials)), '', sep='\n', flush=True)
     if options.shapes:
         print('\n'.join(shape_table(options.shapes)), '', sep='\n', flush=True)
     if options.indicators:
