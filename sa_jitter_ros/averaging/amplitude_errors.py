@@ -144,8 +144,12 @@ def waveform_error(waveform: FloatArray, error: FloatArray, count: int, jitter: 
     common = np.where(apart < 1.0, 2.0 / 3.0 - apart**2 * (1.0 - 0.5 * apart),
                       (2.0 - apart) ** 3 / 6.0)
     shared = 2.0 / count * np.sum(common * (1.0 - lag / count))
-    slope = 0.5 * len(waveform) * (np.roll(waveform, -1, axis=0) - np.roll(waveform, 1, axis=0))
-    return np.hypot(widened(error, count - 1.0), math.sqrt(shared) * jitter * slope)
+    around = np.concatenate((waveform[-1:], waveform, waveform[:1]))
+    moved = around[2:] - around[:-2]
+    moved *= 0.5 * len(waveform) * math.sqrt(shared) * jitter
+    moved *= moved
+    moved += widened(error, count - 1.0) ** 2
+    return np.sqrt(moved, out=moved)
 
 
 def upper_limit(amplitude: FloatArray, error: FloatArray) -> FloatArray:
@@ -402,6 +406,7 @@ def _nodes(kurtosis: float) -> tuple[FloatArray, FloatArray]:
     return np.concatenate((-error, error)), np.concatenate((weight, weight))
 
 
+@lru_cache(maxsize=16)
 def _share_of_length(count: int, kurtosis: float) -> float:
     """
     Return which share of the variance along a mean of `count` cycles is that of its length.
