@@ -173,7 +173,7 @@ def _limit(drawn: Stretch | Evidence, name: str) -> Limit:
 @cache
 def bend_noise() -> float:
     """Return how much larger what the bends are wrong by is than what the errors are."""
-    return float(np.std(recovery_noise(np.random.default_rng(0), 10_000)[1]))
+    return float(np.std(recovery_noise(np.random.default_rng(0), 40_000)[1]))
 
 
 @dataclass(frozen=True)
