@@ -136,12 +136,6 @@ class Effect(Influence):
         """Return whether its errors are drawn at random, so that only their size is known."""
         return self.scatters or not isinstance(self.timing, Pattern)
 
-    @property
-    def moves_source(self) -> bool:
-        """Return whether it turns the vibration against all pulses alike, also those of others."""
-        return self.pulse_times_correct or (
-            isinstance(self.timing, Pattern) and not self.timing.show_in_times)
-
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting
                   ) -> tuple['Effect', Mapping[str, Any]]:

@@ -81,7 +81,7 @@ class Bench:
         """Return the bench for a source that moves as effects say."""
         if not self.observation.against_reference:
             return self
-        moving = tuple(item for item in self.with_declared(effects) if item.moves_source)
+        moving = tuple(item for item in self.with_declared(effects) if item.pulse_times_correct)
         return replace(self, moving=moving,
                        fewer=self.fewer and self.fewer.with_moving_source(effects))
 

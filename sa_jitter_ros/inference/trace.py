@@ -32,7 +32,7 @@ from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
-from sa_jitter_ros.effects.timing import SOURCE
+from sa_jitter_ros.effects.timing import Pattern, SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     best_of, Candidate, least_change, too_small, try_all)
@@ -373,7 +373,8 @@ def _beyond_doubt(chosen: Sequence[Finding], candidates: Sequence[Candidate], of
 def _absorbs(finding: Finding) -> bool:
     """Return whether an effect may absorb a part of what is none of it."""
     effect = finding.effect
-    return effect is not None and (effect.random or effect.moves_source)
+    return effect is not None and (effect.random or (
+        isinstance(effect.timing, Pattern) and not effect.timing.show_in_times))
 
 
 def _few(bench: Bench) -> list[int]:
