@@ -15,7 +15,7 @@ The loop on machines of another simulator: what it finds, and how wrong its numb
 that their declared model lacks (`independent_effects`), closes the loop on recording and
 parameter file as a user does, and judges the report. Beside it stands the oracle: the same
 recording with the true effects and parameters declared, scored on the same held-out acquisitions.
-It writes one line of JSON a run to the standard error and prints a table at the end.
+It writes one line of JSON a run to the standard error and prints tables at the end.
 """
 
 import argparse
@@ -45,6 +45,8 @@ from sa_jitter_ros.recordings import read, Recording
 PAIRS = (('keyphasor_quantisation', 'clock_skew'), ('excess_jitter', 'amplitude_modulation'),
          ('speed_fluctuation', 'additive_noise'), ('phase_wander', 'interfering_tone'))
 _OF_PULSES, _SAMPLED = ('excess_jitter', 'correlated_jitter'), 0.5  # sample periods, 12^-0.5 RMS
+_STATED = (0.0, 0.01), (0.01, 0.1), (0.1, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.1)
+_ON_LINES = {'interpolation_loss', 'additive_noise', 'amplitude_modulation', 'interfering_tone'}
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class Run:
     right. `sampling` are errors of the pulses, among those `found`, that the sampling of a tach
     waveform makes. Effects that are `present` change no average. `oracle` knows the true effects
     and parameters, NaN where no effect of the package describes them; `errors` are those of the
-    parameters in stated standard errors.
+    parameters in stated standard errors, `probabilities` those of all effects.
     """
 
     effects: tuple[str, ...]
@@ -90,6 +92,7 @@ class Run:
     after: Score = Score()
     oracle: Score = Score()
     errors: Mapping[str, float] = field(default_factory=dict)
+    probabilities: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def right(self) -> bool:
@@ -167,7 +170,8 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
         before=_score(trace.before), after=_score(trace.after), oracle=_score(oracle),
         errors={f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
                 for one in found for name, value in one['parameters'].items()
-                if name in truth.get(one['name'], {}) and value['standard_error'] is not None})
+                if name in truth.get(one['name'], {}) and value['standard_error'] is not None},
+        probabilities=report['probabilities'])
 
 
 def _oracle(trace: Trace, recording: Recording, truth: Mapping[str, Mapping[str, Any]]
@@ -242,6 +246,31 @@ def _by_effects(runs: Sequence[Run]) -> dict[str, list[Run]]:
     return found
 
 
+def reliability(runs: Sequence[Run]) -> str:
+    """
+    Return how often what has a stated probability is there, in Markdown; effects on lines apart.
+
+    The score is Brier's: the mean square of probability less truth, and that of a probability that
+    is always the share of those that are there. What no module describes is left out, and so is
+    noise where it is coloured.
+    """
+    lines = ['| effects | stated | cases | mean probability | there | Brier score, of the share |',
+             '|---|---|---|---|---|---|']
+    runs = [run for run in runs if not run.status and not set(run.effects) & set(UNKNOWN)]
+    for title, names in (('on the lines', _ON_LINES), ('on the timing', set(KNOWN) - _ON_LINES)):
+        pairs = np.array([(value, name in run.effects) for run in runs
+                          for name, value in run.probabilities.items() if name in names
+                          and not (run.noisy and name == 'additive_noise')], float).reshape(-1, 2)
+        share = pairs[:, 1].mean()
+        score = f'{np.mean(np.diff(pairs) ** 2):.4f}, {share * (1.0 - share):.4f}'
+        for low, high in _STATED:
+            some = pairs[(pairs[:, 0] >= low) & (pairs[:, 0] < high)]
+            if len(some):
+                lines.append(f'| {title} | {low:g} to {min(high, 1.0):g} | {len(some)} | '
+                             f'{some[:, 0].mean():.3f} | {some[:, 1].sum():.0f} | {score} |')
+    return '\n'.join(lines)
+
+
 def summary(runs: Sequence[Run]) -> str:
     """Return how many runs of each kind are right, and how many parameters."""
     kinds = {'as declared': [run for run in runs if not run.effects],
@@ -294,7 +323,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                             pictures=options.pictures, scale=scale, share=options.share)
             runs.append(run)
             print(json.dumps({**asdict(run), 'right': run.right}), file=sys.stderr, flush=True)
-    print(table(runs), scores(runs), summary(runs), sep='\n\n')
+    print(table(runs), scores(runs), summary(runs), reliability(runs), sep='\n\n')
     return 0
 
 

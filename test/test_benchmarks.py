@@ -205,6 +205,7 @@ def test_loop_is_judged_on_machines_of_another_simulator(benchmark, tmp_path, ef
     assert run.after.rms < 0.5 * run.before.rms or not effects  # six acquisitions to fit
     assert run.near
     assert row in confusion.table([run])
+    assert '| on the lines | 0 to 0.01 | 4 | ' in confusion.reliability([run])
     assert row.split('|')[1] in confusion.scores([run])
 
 

@@ -16,14 +16,12 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter)
+    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import noise_line_variance
-from scipy import special
 
-_SIGNIFICANT = 1e-4
 # What weak lines that nobody declared leave in the noise beside an order, in parts of it.
 _LINES = 0.01
 
@@ -79,14 +77,14 @@ class AdditiveNoise(DirectEffect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit the noise around the lines, beyond what was declared."""
         known, value, error = cls._power(evidence)
-        count = len(evidence.lines.noise_density)
+        if not (value > 0.0 and error > 0.0):
+            return absent(cls.name, 'the noise around the lines is not above the declared one')
+        error = math.hypot(error, 2.0 * _LINES * (known + value))
         # Lines of an average share its noise floor at worst: only acquisitions are independent.
-        p_value = float(special.stdtr(count - 1, -value / error)) if error > 0.0 else 1.0
-        if not p_value < _SIGNIFICANT:
-            return absent(cls.name, 'the noise around the lines is the declared one',
-                          p_value=p_value)
+        freedom = len(evidence.lines.noise_density) - 1
+        likelihood = 0.5 * freedom * math.log1p((value / error) ** 2 / freedom)  # Student
         std, std_error = root(value, error)
         text = (f'the lines scatter as white noise of {np.sqrt(value + known):.3g} per sample '
                 f'would make them, {np.sqrt(known):.3g} was declared')
-        return Finding(cls.name, cls(std), {'std': float(np.hypot(std_error, _LINES * std))},
-                       p_value, text)
+        return weighed(Finding(cls.name, cls(std), {'std': std_error}, 1.0, text),
+                       likelihood, 1, evidence)

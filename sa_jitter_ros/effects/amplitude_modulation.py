@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, memory, NARROWEST, SLOW_BAND, slow_band, slow_memory, WIDEST)
+from sa_jitter_ros.effects.common_gain import CommonGain, fit_common_gain
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter)
+    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, drawn_normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy import optimize, special
-
-_SIGNIFICANT = 1e-3
+from scipy import special
 
 
 @dataclass(frozen=True)
@@ -96,10 +95,12 @@ class AmplitudeModulation(DirectEffect):
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
         """Return the modulation that the amplitudes of the lines together allow."""
-        if evidence.lines.radial.shape[2] < 2:
+        radial = evidence.lines.radial
+        if radial.shape[2] < 2:
             return None
-        _, weight, product = _together(evidence)
+        weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
         pairs = weight.sum() ** 2 - np.sum(weight**2)
+        product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of different lines
         power = largest_power(float(product.mean()), product.size, 1.0 / weight.sum(),
                               1.0 / pairs, memory(SLOW_BAND))
         return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
@@ -108,66 +109,18 @@ class AmplitudeModulation(DirectEffect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit what is common to the amplitudes of all lines, cycle by cycle."""
         radial = evidence.lines.radial
-        known = sum(effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
         if radial.shape[2] < 2:
             return absent(cls.name, 'one line alone cannot distinguish modulation from noise')
-        common, weight, product = _together(evidence)
-        pairs = weight.sum() ** 2 - np.sum(weight**2)
-        rows = product.mean(axis=1)
-        variance, error = float(rows.mean()), float(rows.std(ddof=1) / np.sqrt(len(rows)))
-        # Without a modulation the lines are independent noise of a known size.
-        p_value = _chance(variance * pairs / weight.sum(), weight / weight.sum(), product.size)
-        if variance > 0.0:
-            noise = 1.0 / (weight.sum() * radial.shape[1])
-            # of averages about their own mean, which moves with them
-            slow = (common.mean(axis=1) / weight.sum()) ** 2 / (1.0 - 1.0 / len(rows)) - noise
-            bandwidth, bandwidth_error = _bandwidth_of(slow, rows, radial.shape[1])
-            within = _variance_of_mean(1, slow_band(bandwidth))
-            variance, error = variance / within - known, error / within
-        if variance <= 0.0 or p_value > _SIGNIFICANT:
-            return absent(cls.name, 'the amplitudes of the lines do not move together: '
-                          f'p = {p_value:.2g}', p_value=p_value)
-        std, std_error = root(variance, error)
-        text = (f'the amplitudes of all lines grow and shrink together by {std:.2%}, '
-                f'p = {p_value:.2g}')
-        return Finding(cls.name, cls(std, bandwidth), {
-            'std': std_error, 'bandwidth': bandwidth_error}, p_value, text)
-
-
-def _together(evidence: Evidence) -> tuple[Array, Array, Array]:
-    """Return the weighted sum over lines, the weights, and the mean product of different lines."""
-    radial = evidence.lines.radial
-    weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
-    common = radial @ weight
-    pairs = weight.sum() ** 2 - np.sum(weight**2)
-    return common, weight, np.asarray((common**2 - radial**2 @ weight**2) / pairs)
-
-
-def _chance(mean: float, weight: Array, count: int) -> float:
-    """
-    Return the chance that the mean of `count` quadratic forms z'Az reaches `mean`.
-
-    z are independent normal variables, A is a a' less its diagonal with a^2 = `weight` (line,),
-    which add to 1. By the saddlepoint of Lugannani and Rice: the form is skewed and has a longer
-    tail than a normal one.
-    """
-    a = np.sqrt(weight)
-    values = np.linalg.eigvalsh(np.outer(a, a) - np.diag(weight))
-
-    def slope(s: float) -> float:
-        return float(np.sum(values / (1.0 - 2.0 * s * values))) - mean
-
-    ends = 0.5 * (1.0 - 1e-9) / values[[0, -1]]
-    if slope(ends[0]) >= 0.0 or slope(ends[1]) <= 0.0:
-        return float(mean < 0.0)
-    s = optimize.brentq(slope, *ends, xtol=1e-12)
-    factors = 1.0 - 2.0 * s * values
-    exponent = np.sign(s) * np.sqrt(max(count * (2.0 * s * mean + np.sum(np.log(factors))), 0.0))
-    spread = s * np.sqrt(2.0 * count * np.sum((values / factors) ** 2))
-    if abs(exponent) < 1e-3:  # the formula is 0/0 there
-        return float(special.ndtr(-exponent))
-    return float(np.clip(special.ndtr(-exponent) + np.exp(-0.5 * exponent**2) / np.sqrt(
-        2.0 * np.pi) * (1.0 / spread - 1.0 / exponent), 0.0, 1.0))
+        found = fit_common_gain(radial, evidence.lines.radial_noise)
+        bandwidth, bandwidth_error = _bandwidth_of(found, radial.shape[1])
+        within = _variance_of_mean(1, slow_band(bandwidth))
+        std, std_error = root((found.slow + found.fast) / within,
+                              math.hypot(found.slow_error, found.fast_error) / within)
+        text = f'the amplitudes of all lines grow and shrink together by {std:.2%}'
+        return weighed(Finding(
+            cls.name, cls(min(std, 1.0), bandwidth),
+            {'std': std_error, 'bandwidth': bandwidth_error}, 1.0, text),
+            found.likelihood, found.bands, evidence)
 
 
 def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
@@ -177,18 +130,15 @@ def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
     return float(np.diff(integral)[0] / np.diff(x)[0])  # of sinc(x)^2
 
 
-def _bandwidth_of(slow: Array, fast: Array, cycles: int) -> tuple[float, float]:
-    """
-    Return the bandwidth that averages of some cycles show, and its error.
-
-    `slow` (acquisition,) are the squares of the averages, `fast` the variances of single cycles.
-    """
+def _bandwidth_of(found: CommonGain, cycles: int) -> tuple[float, float]:
+    """Return the bandwidth that averages of some cycles show beside single ones, and its error."""
     widths = np.geomspace(NARROWEST, WIDEST, 200)
     bands = [slow_band(width) for width in widths]
     shares = np.array([_variance_of_mean(cycles, band) / _variance_of_mean(1, band)
                        for band in bands])
-    share = float(slow.mean() / fast.mean())
-    error = float(np.std(slow - share * fast, ddof=1) / np.sqrt(slow.size) / fast.mean())
+    total = found.slow + found.fast
+    share = found.slow / total
+    error = math.hypot(found.fast * found.slow_error, found.slow * found.fast_error) / total**2
     low, bandwidth, high = np.exp(np.interp(
         [share + error, share, share - error], np.minimum.accumulate(shares)[::-1],
         np.log(widths)[::-1]))

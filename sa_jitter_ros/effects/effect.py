@@ -16,7 +16,7 @@ An effect is one frozen dataclass whose fields are its parameters. It overrides 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any, ClassVar
 
@@ -27,6 +27,7 @@ from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -34,6 +35,8 @@ Array = NDArray[Any]
 ONE_SIDED = 1.6449
 #: Standard errors of a power, where there is none, below which no limit is.
 SEEN = 0.25
+#: Logarithm of the odds against an effect before any data: one in 150.
+ODDS = 5.0
 _MOST_ERRORS = 4_000_000  # of pulses in all scenarios
 
 
@@ -182,11 +185,13 @@ class Finding:
 
     `effect` has the fitted parameters, None if nothing could be fitted; `standard_errors` are by
     parameter; `p_value` is the probability of evidence at least this strong if the effect is
-    absent; `evidence` describes it in words. `contradiction` says what in the data contradicts
-    the effect, '' if nothing does. `indistinguishable_from` names effects that this evidence
-    cannot distinguish from it, `deciding_measurement` a measurement that could. `largest_change`
-    is the largest change, over the lines, of the mean attenuation or of the standard deviation of
-    one average that the effect makes, NaN where it is not known.
+    absent; `gain` is what the effect adds to the logarithm of the evidence, without the odds
+    against it, NaN where all sets of effects decide together; `evidence` describes it in words.
+    `contradiction` says what in the data contradicts the effect, '' if nothing does.
+    `indistinguishable_from` names effects that this evidence cannot distinguish from it,
+    `deciding_measurement` a measurement that could. `largest_change` is the largest change, over
+    the lines, of the mean attenuation or of the standard deviation of one average that the effect
+    makes, NaN where it is not known.
     """
 
     name: str
@@ -198,11 +203,41 @@ class Finding:
     indistinguishable_from: Sequence[str] = ()
     deciding_measurement: str = ''
     largest_change: float = math.nan
+    gain: float = math.nan
+
+    @property
+    def probability(self) -> float:
+        """Return the probability of the effect by its gain."""
+        return float(special.expit(self.gain - ODDS))
 
 
-def absent(name: str, reason: str, *, p_value: float = 1.0) -> Finding:
+def absent(name: str, reason: str, *, p_value: float = 1.0, gain: float = 0.0) -> Finding:
     """Return the finding of an effect that the evidence does not show; `reason` says why."""
-    return Finding(name, None, {}, p_value, reason, contradiction=reason)
+    return Finding(name, None, {}, p_value, reason, contradiction=reason, gain=gain)
+
+
+def beyond_chance(likelihood: float, parameters: int, cycles: int, tried: float = 1.0) -> float:
+    """
+    Return what of a gain in log likelihood is none of free parameters (Schwarz).
+
+    The `parameters` were measured in so many trigger `cycles`, and are the best of those `tried`.
+    """
+    return likelihood - 0.5 * parameters * math.log(cycles) - math.log(tried)
+
+
+def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evidence, *,
+            tried: float = 1.0) -> Finding:
+    """
+    Return a finding with its gain and p value, absent unless its gain exceeds the odds against it.
+
+    `likelihood` is the gain in log likelihood by its `parameters`, the best of those `tried`.
+    """
+    gain = beyond_chance(likelihood, parameters, evidence.cycles, tried)
+    found = replace(finding, gain=gain, p_value=min(
+        1.0, tried * float(special.chdtrc(parameters, 2.0 * likelihood))))
+    return found if gain > ODDS else absent(
+        finding.name, 'the likelihood gains too little by it: probability '
+        f'{found.probability:.2g}', p_value=found.p_value, gain=gain)
 
 
 def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:

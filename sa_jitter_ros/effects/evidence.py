@@ -35,13 +35,37 @@ SAME_SPEED = 5e-3
 
 @dataclass(frozen=True)
 class Tone:
-    """`frequency` (Hz) and peak `amplitude` of the strongest tone, their errors, its p value."""
+    """
+    The strongest tone: its `frequency` (Hz), its peak `amplitude`, and their errors.
+
+    `likelihood` is the gain in log likelihood by the amplitudes on all `channels`, at the best of
+    so many frequencies `tried`.
+    """
 
     frequency: float
     amplitude: float
     frequency_error: float
     standard_error: float
-    p_value: float
+    likelihood: float
+    channels: int
+    tried: float
+
+
+@dataclass(frozen=True)
+class Beat:
+    """
+    A common beat of the lines that an interpolator causes.
+
+    `gain` is what it adds to the logarithm of the evidence, `p_value` the chance of as much
+    without one. `method` is the interpolator, '' unless the beat is certain, and `kept` (line,)
+    the share of the amplitude that it leaves; `frequency` is in cycles a trigger cycle.
+    """
+
+    gain: float = 0.0
+    p_value: float = 1.0
+    method: str = ''
+    kept: Array | float = 1.0
+    frequency: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -53,8 +77,8 @@ class LineEvidence:
     (acquisition, line) the standard deviation per sample of white noise that makes the line's
     noise, in the units of the recording; `radial` (acquisition, cycle, line) each cycle's
     amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
-    alone. `tone` is what stands out most between the synchronous lines. `beat_method` is the
-    interpolator whose beat the lines show, '' for none, and `beat_gain` (line,) its gain.
+    alone. `tone` is what stands out most between the synchronous lines, `beat` the beat of an
+    interpolator, which `radial` is without.
     """
 
     order: Array
@@ -64,9 +88,7 @@ class LineEvidence:
     radial: Array
     radial_noise: Array
     tone: Tone | None = None
-    beat_method: str = ''
-    beat_p_value: float = 1.0
-    beat_gain: Array | float = 1.0
+    beat: Beat = Beat()
 
 
 @dataclass(frozen=True)
@@ -105,6 +127,11 @@ class Evidence:
     def period(self) -> float:
         """Return the mean trigger period in s."""
         return float(np.mean(self.periods))
+
+    @property
+    def cycles(self) -> int:
+        """Return the number of trigger cycles that the lines were measured in."""
+        return int(np.prod(self.lines.radial.shape[:2]))
 
     @property
     def times(self) -> Array:

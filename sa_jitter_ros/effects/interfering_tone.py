@@ -15,11 +15,10 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below)
+    absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below, weighed)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-_SIGNIFICANT = 1e-4
 _MOST = 1e6
 
 
@@ -57,11 +56,11 @@ class InterferingTone(DirectEffect):
     def fit(cls, evidence: Evidence) -> Finding:
         """Take the strongest line of the spectrum that is not synchronous."""
         tone = evidence.lines.tone
-        if tone is None or not tone.p_value < _SIGNIFICANT:
-            return absent(cls.name, 'no line stands out between the synchronous ones',
-                          p_value=1.0 if tone is None else tone.p_value)
+        if tone is None:
+            return absent(cls.name, 'no line stands out between the synchronous ones')
         text = (f'a line of amplitude {tone.amplitude:.3g} at {tone.frequency:.6g} Hz '
                 'that is no order of the shaft')
-        return Finding(cls.name, cls(tone.amplitude, tone.frequency),
-                       {'frequency': tone.frequency_error, 'amplitude': tone.standard_error},
-                       tone.p_value, text)
+        found = Finding(cls.name, cls(tone.amplitude, tone.frequency),
+                        {'frequency': tone.frequency_error, 'amplitude': tone.standard_error},
+                        1.0, text)
+        return weighed(found, tone.likelihood, 2 * tone.channels, evidence, tried=tone.tried)

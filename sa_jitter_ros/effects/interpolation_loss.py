@@ -45,12 +45,11 @@ class InterpolationLoss(DirectEffect):
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Look for the beat that interpolation between samples of another clock makes."""
-        lines = evidence.lines
-        if not lines.beat_method:
+        beat = evidence.lines.beat
+        if not beat.method:
             return absent(cls.name, 'the lines show no common beat that deepens with frequency as '
-                          f'an interpolator makes it: p = {lines.beat_p_value:.2g}',
-                          p_value=lines.beat_p_value)
+                          'an interpolator makes it', p_value=beat.p_value, gain=beat.gain)
         text = (f'all lines beat at one frequency, the deeper the higher their order, as '
-                f'{lines.beat_method} interpolation makes them, p = {lines.beat_p_value:.2g}')
-        return Finding(cls.name, cls(lines.beat_method), {'method': None}, lines.beat_p_value,
-                       text)
+                f'{beat.method} interpolation makes them')
+        return Finding(cls.name, cls(beat.method), {'method': None}, beat.p_value, text,
+                       gain=beat.gain)

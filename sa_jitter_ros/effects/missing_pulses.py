@@ -19,6 +19,7 @@ whose Fourier transforms are spherical Bessel functions, however far the angle t
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -106,7 +107,7 @@ class MissingPulses(DirectEffect):
         error = float(np.sqrt(probability * (1.0 - probability) / (lost + seen)))
         return Finding(cls.name, cls(probability), {'probability': error}, 1e-12,
                        f'{np.count_nonzero(missing)} of {seen} pulse intervals are multiples of '
-                       f'the period: {lost} pulses are missing')
+                       f'the period: {lost} pulses are missing', gain=math.inf)
 
 
 def loss_moments(

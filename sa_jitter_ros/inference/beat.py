@@ -18,11 +18,12 @@ of the line. The mean loss follows from the depth of the beat; raw and corrected
 it, so that their ratio does not show it. Beats slower than half the trigger rate are found.
 """
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import ODDS
+from sa_jitter_ros.effects.evidence import Beat
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.ndimage import median_filter
 
@@ -30,85 +31,90 @@ Array = NDArray[Any]
 
 METHODS = ('linear', 'cubic', 'spline')
 _PLACES = 32
-_CERTAIN = 1e-6
-_OFF = 0.15  # depth beside that of samples at even places between the others
-_KNOWN = 0.05  # error of the shape
+_KNOWN = 0.03  # error of the shape
+_FINER, _HARMONICS = 33, 4  # frequencies between those that are tried; of the beat
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
-_POOR = 3.0  # mean square misfit of the depths, in their errors, that is no interpolator's
-_OTHERS = 1e-3  # p value of the other orders at the beat of the one that shows it best
 
 
-@dataclass(frozen=True)
-class Beat:
-    """
-    A common beat of the lines: interpolator, p value, and the `gain` (line,) that follows from it.
-
-    `depth` (line,) is the relative amplitude of the beat; `method` is '' without a beat.
-    """
-
-    method: str
-    p_value: float
-    gain: Array
-    depth: Array
-
-
-def find_beat(radial: Array, frequency: Array) -> Beat:
+def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
     """
     Find the beat in relative amplitudes `radial` (cycle, line) of consecutive trigger cycles.
 
-    `frequency` (line,) is in units of the sampling rate.
+    `order` (line,) and `frequency` (line,), in units of the sampling rate, are those of the lines.
+
+    At each frequency the known depths of an interpolator's beat compete with a modulation of all
+    lines, and with sidebands of each order by itself.
     """
-    count, lines = radial.shape
-    nothing = Beat('', 1.0, np.ones(lines), np.zeros(lines))
+    count = len(radial)
     if count < 32 or np.unique(frequency).size < 2:
-        return nothing
+        return Beat()
     window = np.hanning(count + 2)[1:-1]
-    spectrum = np.fft.rfft((radial - radial.mean(axis=0)) * window[:, None], 4 * count, axis=0)[8:]
+    spectrum = np.fft.rfft(
+        (radial - radial.mean(axis=0)) * window[:, None], 4 * count, axis=0)[8:-8]
     swings = 2.0 * spectrum / window.sum()
     power = np.abs(spectrum) ** 2
     floor = np.maximum(np.median(power, axis=0), median_filter(power, (_AROUND, 1)))
-    error = 2.0 * np.sqrt(floor / np.log(2.0)) / window.sum()
+    noise = floor / np.log(2.0) * (2.0 / window.sum()) ** 2
     turns = np.arange(8, 8 + len(spectrum)) / (4 * count)
-    depth_left = np.sinc(turns)  # of the mean over a trigger cycle
-    alike = _fits(swings, np.ones(lines), error)[1]  # a modulation of all lines is no beat
-    best, rarest, least = nothing, np.log(_CERTAIN), 1.0
-    for name in METHODS:
-        mean, swing = _interpolated(name, frequency)
-        log_p_value, misfit, size = _fits(swings, swing / mean, error)
-        chance = np.log(len(METHODS) * count) + log_p_value
-        fitting = (misfit < np.minimum(alike, _POOR * lines)) & (
-            np.abs(size / depth_left - 1.0) < _OFF)
-        least = min(least, float(np.exp(np.min(chance))))
-        peak = int(np.argmin(np.where(fitting, chance, np.inf)))
-        if not (fitting[peak] and chance[peak] < rarest):
-            continue
-        shown = np.abs(swings[peak] / error[peak]) * swing / mean
-        others = frequency != frequency[np.argmax(shown)]  # a sideband is one order's alone
-        here = np.ix_([peak], others)
-        if _fits(swings[here], (swing / mean)[others], error[here])[0][0] > np.log(_OTHERS):
-            continue
-        rarest = chance[peak]
-        depth = np.abs(swings[peak])
-        wanted = size[peak] * swing / mean
-        # The shape is known to so much, what a line shows by its own noise.
-        share = _KNOWN**2 / (_KNOWN**2 + (error[peak] / wanted) ** 2)
-        gain = 1.0 - (1.0 - mean) * (1.0 + share * np.clip(depth / wanted - 1.0, -0.5, 0.5))
-        best = Beat(name, float(np.exp(rarest)), gain, depth)
-    return best if best.method else replace(nothing, p_value=least)
+    depth_left = np.sinc(turns)[:, None]  # of the mean over a trigger cycle
+    shown = np.abs(swings) ** 2 / noise
+    tried = np.log(count)
+    alone = [_of_sidebands(swings[:, own], noise[:, own]) - tried
+             for own in order == np.unique(order)[:, None]]
+    rival = np.maximum(_of_sidebands(swings, noise) - tried,
+                       np.maximum(alone, 0.0).sum(axis=0))
+    best = -np.inf
+    for method in METHODS:
+        mean, swing = _interpolated(method, frequency)
+        wanted = depth_left * swing / mean
+        unsure = noise + (_KNOWN * wanted) ** 2
+        along = 2.0 * np.abs(np.sum(swings * wanted / unsure, axis=1))
+        likelihood = along - 0.5 * np.log1p(2.0 * np.pi * along) + np.sum(  # of any phase
+            shown - (np.abs(swings) ** 2 + wanted**2) / unsure - np.log(unsure / noise), axis=1)
+        peak = int(np.argmax(likelihood - rival))
+        if likelihood[peak] - rival[peak] > best:
+            best = likelihood[peak] - rival[peak]
+            # The shape is known to so much, what a line shows by its own noise.
+            share = (_KNOWN * wanted[peak]) ** 2 / unsure[peak]
+            off = np.clip(np.abs(swings[peak]) / wanted[peak] - 1.0, -0.5, 0.5)
+            name, at, kept = method, peak, 1.0 - (1.0 - mean) * (1.0 + share * off)
+    tried += np.log(len(METHODS))
+    gain, p_value = float(best - tried), float(np.exp(min(tried - best, 0.0)))
+    if gain <= ODDS:
+        return Beat(gain, p_value)
+    return Beat(gain, p_value, name, kept, float(turns[at]))
 
 
-def _fits(swings: Array, shape: Array, error: Array) -> tuple[Array, Array, Array]:
+def _of_sidebands(swings: Array, noise: Array) -> Array:
     """
-    Fit a shape (line,) of any size and phase to `swings` of some `error` (frequency, line).
+    Return the logarithm of the evidence (frequency,) for sidebands of lines in the last axis.
 
-    Returns, by frequency, the logarithm of the p value, the remaining sum of squares (large if the
-    lines swing out of phase, or each by itself) and the size.
+    Any depth up to that of the lines is as likely as any other by its logarithm; each line has
+    its own, or all have the same.
     """
-    alone = np.sum(swings * shape / error**2, axis=1)
-    weight = 1.0 / (error**2 + (_KNOWN * np.abs(swings)) ** 2)
-    size = np.sum(weight * swings * shape, axis=1) / np.sum(weight * shape**2, axis=1)
-    left = np.sum(weight * np.abs(swings - size[:, None] * shape) ** 2, axis=1)
-    return -np.abs(alone) ** 2 / np.sum((shape / error) ** 2, axis=1), left, np.abs(size)
+    known = np.sum(1.0 / noise, axis=1)
+    alike = np.abs(np.sum(swings / noise, axis=1)) ** 2 / known
+    each = _any_depth(np.abs(swings) ** 2 / noise, 1.0 / noise).sum(axis=1)
+    return np.asarray(np.maximum(each, _any_depth(alike, known)))
+
+
+def _any_depth(power: Array, known: Array) -> Array:
+    """Return the evidence for an amplitude of some power over that of the noise, 1 / known."""
+    return np.asarray(power - np.log(np.maximum(power, 1.0) * np.log(np.maximum(known, np.e))))
+
+
+def without_beat(radial: Array, beat: Beat) -> Array:
+    """Return relative amplitudes (cycle, line) less the beat that is in them."""
+    if not beat.method:
+        return radial
+    count, window = len(radial), np.hanning(len(radial))
+    finer = beat.frequency + np.linspace(-0.5, 0.5, _FINER) / (4 * count)
+    waves = np.exp(2j * np.pi * np.multiply.outer(finer, np.arange(count)))
+    swings = np.abs((window * waves) @ radial) ** 2
+    best = waves[np.argmax(np.sum(swings / radial.var(axis=0), axis=1))]
+    harmonics = np.stack([best**n for n in range(1, _HARMONICS + 1)], axis=1)
+    parts = np.concatenate([harmonics.real, harmonics.imag], axis=1)
+    return np.asarray(radial - parts @ np.linalg.lstsq(parts, radial, rcond=None)[0])
 
 
 def _interpolated(method: str, frequency: Array) -> tuple[Array, Array]:

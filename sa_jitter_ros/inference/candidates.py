@@ -9,10 +9,11 @@
 # the License.
 
 """
-Candidates: what may scatter the amplitudes, fitted, scored and accepted or rejected.
+Candidates: what the lines and the pulse times alone show, and why it is named or not.
 
-An effect on the lines is accepted if its own evidence is significant and it changes an average:
-where the evidence is beyond doubt, or the held-out acquisitions are predicted better with it.
+The noise around the lines, their common gain, a tone and the beat of an interpolator are seen in
+different parts of the data, so that the evidence for a set of them is the sum of their gains: each
+belongs to the best set whose gain exceeds the odds against it.
 """
 
 from collections.abc import Sequence
@@ -20,21 +21,15 @@ from dataclasses import dataclass, replace
 
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
-from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.inference.residual import ACCURACY, Residual
+from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.scoring import Bench
 
-#: A residual with a smaller p value is no chance.
-SIGNIFICANT = 0.02
-_EVIDENCE = 1e-3
-# A p value of evidence that needs no help from held-out averages, which are few.
-_DECISIVE = 1e-6
 _KNOWN_CHANGE = 1e-3  # of an average by what is no chance, from which on its cause is named
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One effect in one round: finding, score on held-out acquisitions, reason of rejection."""
+    """One effect: finding, score on held-out acquisitions, reason of rejection."""
 
     name: str
     stage: int
@@ -43,64 +38,31 @@ class Candidate:
     rejected_because: str
 
 
-def try_all(bench: Bench, evidence: Evidence, chosen: Sequence[Finding], current: Residual,
-            own: float, stage: int) -> list[Candidate]:
-    """
-    Fit every effect on the lines that is not in the model yet; score it on held-out acquisitions.
-
-    `current` is the residual so far, `own` the unsteadiness.
-    """
-    taken = {finding.name for finding in chosen} | {item.name for item in bench.declared}
-    found = []
+def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candidate]:
+    """Fit every effect on the lines, and score it beside the `chosen` ones on the timing."""
+    effects = [item.effect for item in chosen if item.effect is not None]
+    evidence, found = bench.gather(effects, bench.fit), []
     for name, kind in EFFECTS.items():
-        if name in taken or not issubclass(kind, DirectEffect):
+        if name in {item.name for item in bench.declared} or not issubclass(kind, DirectEffect):
             continue
         untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
         finding = absent(name, untold) if untold else kind.fit(evidence)
-        if finding.effect is None:
-            found.append(Candidate(name, stage, finding, None, finding.contradiction))
-        else:
-            found.append(_tried(bench, chosen, finding, current, own, stage))
+        found.append(Candidate(name, 1, finding, None, finding.contradiction)
+                     if finding.effect is None else _scored(bench, effects, finding))
     return found
 
 
-def _tried(bench: Bench, chosen: Sequence[Finding], finding: Finding, current: Residual,
-           own: float, stage: int) -> Candidate:
-    """Score an effect and accept or reject it."""
-    effects = [item.effect for item in chosen if item.effect is not None]
+def _scored(bench: Bench, others: Sequence[Effect], finding: Finding) -> Candidate:
+    """Score an effect on held-out acquisitions, and reject it if it hardly changes an average."""
     effect = finding.effect
     assert effect is not None
-    finding = replace(finding, largest_change=bench.change(effects, effect))
-    left = bench.unsteadiness([*effects, effect]) if effect.scatters else own
-    score = bench.score([*effects, effect], [*chosen, finding], unsteadiness=left)
-    new = score.amplitude_score if effect.scatters else score.score
-    rejected = finding.contradiction
-    if not rejected and not effect.visible_in_pulse_times:
-        rejected = _rejection(finding, current, score)
-    return Candidate(finding.name, stage, finding, new, rejected)
-
-
-def _rejection(finding: Finding, current: Residual, score: Residual) -> str:
-    """Return why an effect is not needed or does not help, '' if it does."""
-    effect = finding.effect
-    assert effect is not None
-    if finding.p_value > _EVIDENCE:
-        return f'its evidence may be chance: {finding.evidence}'
-    if finding.largest_change < least_change(effect):
-        return too_small(finding)
-    if effect.scatters:
-        of, new, old = 'amplitude', score.amplitude_score, current.amplitude_score
-        p_value = current.p_amplitude
-    else:
-        of, new, old, p_value = 'attenuation', score.score, current.score, current.p_attenuation
-    if finding.p_value < _DECISIVE:  # held-out averages are few
-        return ''
-    if not p_value < SIGNIFICANT:
-        return f'not needed: the residual of the {of} is not significant (p = {p_value:.2g})'
-    if not new > old:
-        return (f'the {of} of held-out acquisitions is predicted no better: log score '
-                f'{new:.3f} after {old:.3f}')
-    return ''
+    finding = replace(finding, largest_change=bench.change(others, effect))
+    every = [*others, effect]
+    score = bench.score(every, unsteadiness=bench.unsteadiness(every))
+    matters = effect.visible_in_pulse_times or finding.largest_change >= least_change(effect)
+    return Candidate(finding.name, 1, finding,
+                     score.amplitude_score if effect.scatters else score.score,
+                     '' if matters else too_small(finding))
 
 
 def least_change(effect: Effect) -> float:
@@ -112,15 +74,3 @@ def too_small(finding: Finding) -> str:
     """Say that an effect changes no line by much."""
     return (f'it is too small to matter: no line changes by more than '
             f'{finding.largest_change:.2g}')
-
-
-def best_of(candidates: Sequence[Candidate]) -> Candidate | None:
-    """Return the accepted candidate whose evidence is the most certain, None without any."""
-    left = [item for item in candidates if not item.rejected_because]
-    return min(left, key=_rank) if left else None
-
-
-def _rank(item: Candidate) -> tuple[bool, bool, float]:
-    """Rank: pulses first, then the mean of the amplitude, then its scatter, by their score."""
-    kind = EFFECTS[item.name]
-    return (not kind.visible_in_pulse_times, kind.scatters, -(item.held_out_score or 0.0))

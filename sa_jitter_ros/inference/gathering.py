@@ -22,7 +22,7 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
-from sa_jitter_ros.inference.beat import find_beat
+from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.record_recovery import doubtful_lines
@@ -179,16 +179,36 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     noise = np.sqrt(np.mean(noises**2, axis=0))
     floor = lines.of(observation.stacked('noise_floor'))
     density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
-    evidence = LineEvidence(
-        order=observation.orders[lines.order], channel=lines.channel, level=level,
-        noise_density=density, radial=along, radial_noise=noise * np.sqrt(shortest) / level)
+    order = observation.orders[lines.order]
     # What changes from acquisition to acquisition is the machine's own.
-    steady = along - along.mean(axis=1, keepdims=True)
-    beat = find_beat(steady.reshape(-1, along.shape[2]), evidence.order
-                     * model.fundamental_frequency / observation.sample_rate)
-    evidence = replace(evidence, beat_method=beat.method, beat_p_value=beat.p_value,
-                       beat_gain=beat.gain)
-    return replace(evidence, tone=_tone(observation, lines))
+    beating = cycles + lines.of(_sidebands(observation, shortest))
+    steady = np.abs(beating) / level  # what turns a line is no beat
+    steady -= steady.mean(axis=1, keepdims=True)
+    beat = find_beat(steady.reshape(-1, order.size), order,
+                     order * model.fundamental_frequency / observation.sample_rate)
+    own = along.mean(axis=1, keepdims=True)
+    return LineEvidence(
+        order=order, channel=lines.channel, level=level, noise_density=density,
+        radial=own + without_beat(
+            (along - own).reshape(-1, order.size), beat).reshape(along.shape),
+        radial_noise=noise * np.sqrt(shortest) / level, tone=_tone(observation, lines), beat=beat)
+
+
+def _sidebands(observation: Observation, count: int) -> Array:
+    """
+    Return what undeclared sources make of the orders (acquisition, cycle, channel, order).
+
+    It was taken out of the amplitudes with the leakage, but the beat of an interpolator makes such
+    sources, too: those beside an order by less than half the trigger rate.
+    """
+    declared = observation.orders.size
+    turns = observation.model.cycle_length * (
+        observation.sources[declared:, None] - observation.orders)
+    share = np.exp(1j * np.pi * turns) * np.sinc(turns) * (np.abs(turns) < 0.5)
+    mean = np.array([item.cycles[..., declared:].mean(axis=0)
+                     for item in observation.acquisitions])
+    waves = np.exp(2j * np.pi * turns * np.arange(count)[:, None, None]) * share
+    return np.asarray(np.einsum('acs,kso->akco', mean, waves))
 
 
 def _tone(observation: Observation, lines: Lines) -> Tone | None:
@@ -216,9 +236,8 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     duration = model.trigger_period * (fit.errors.size - 1)
     # of a line that begins and ends: sqrt(12) errors of its phase over its duration
     of_frequency = math.sqrt(12.0) * error / amplitude / (2.0 * np.pi * duration)
-    tried = 0.5 * observation.sample_rate * duration
-    return Tone(float(frequency[best]), amplitude, of_frequency, error, min(
-        1.0, tried * float(special.chdtrc(2 * len(amplitudes), power))))
+    return Tone(float(frequency[best]), amplitude, of_frequency, error, 0.5 * power,
+                len(amplitudes), 0.5 * observation.sample_rate * duration)
 
 
 def _cycles(observation: Observation) -> Array:

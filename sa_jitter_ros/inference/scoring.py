@@ -126,7 +126,7 @@ class Bench:
         def of(name: str) -> Array:
             return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
 
-        kept = self.scatter.beat_gain  # raw and corrected amplitude have both lost the rest
+        kept = self.scatter.beat.kept  # raw and corrected amplitude have both lost the rest
         if self.moving:
             kept = kept * self._without_jitter(self.moving, chosen).attenuation
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,

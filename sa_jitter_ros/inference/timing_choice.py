@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.lattice import ticks_leave_room, ticks_log_likelihood
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
@@ -41,7 +42,6 @@ RIPPLE = 'ripple'
 #: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.
 SIDEBANDS = 'sidebands'
 NO_EFFECTS = RIPPLE, SIDEBANDS
-_ODDS = 5.0  # against an effect, as a logarithm: one in 150
 #: Logarithm of the odds of two explanations, 20 to 1, from which on one of them is the answer.
 DECIDED = math.log(20.0)
 _MOST = 4  # effects at once
@@ -201,7 +201,7 @@ class Chooser:
         if not math.isfinite(fit.value):
             return -_RARE
         shape = max(self.of_shape(fit, power) for power in self._powers(fit))
-        return fit.value + shape - prior - self._gained_by_chance(fit) - _ODDS * len(names)
+        return fit.value + shape - prior - self._gained_by_chance(fit) - ODDS * len(names)
 
     def _gained_by_chance(self, fit: TimingFit) -> float:
         """

@@ -15,8 +15,8 @@
 The trace: which effects the declared model lacks, and what remains with them.
 
 Effects on pulse times and source are chosen by the likelihood of the timing, those on the lines
-one at a time while the amplitudes scatter more than predicted. They are fitted to some of the
-acquisitions and scored on the others. The result may be that no effect explains the residual.
+by that of what the lines show. They are fitted to some of the acquisitions and scored on the
+others. The result may be that no effect explains the residual.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,7 +35,7 @@ from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.effects.timing import Pattern, SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
-    best_of, Candidate, least_change, too_small, try_all)
+    Candidate, candidates_of_lines, least_change, too_small)
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
@@ -56,12 +56,10 @@ Progress = Callable[[str], None]
 #: The largest change that an effect beside others makes.
 Change = Callable[[Sequence[Effect], Effect], float]
 
-_MOST_EFFECTS = 4
 _SPEED = 'speed_fluctuation'
 # A tone turns a line by itself, and errors that grow turn it by more than its phase tells.
 _TURNING = {'interfering_tone', 'clock_skew'}
 _UNDECIDED = 1e-2  # change of an average by what may be there
-_AGAINST, _PRIOR = 148.4, 0.0067  # odds against an effect (e^5), and its probability before
 _REMAINS = 0.005  # p value of what is unexplained
 _UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
 _SCATTER = 'the scatter of the amplitudes'
@@ -206,7 +204,8 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
         (), (), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing,
         nothing, None, 'traced' if found else 'none', float('nan'), None, None, rows, undecided,
-        {row.name: _PRIOR for row in rows} | {item.name: 1.0 - item.p_value for item in found},
+        {row.name: absent(row.name, _UNSEEN).probability for row in rows} | {
+            item.name: item.probability for item in found},
         reason)
 
 
@@ -235,11 +234,15 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     candidates = [Candidate(finding.name, 0, finding, None, '') for finding in chosen]
     candidates += [Candidate(finding.name, 0, finding, None, too_small(finding))
                    for finding in present]
-    more, tried, evidence = _of_lines(bench, chosen, say)
-    chosen, candidates = [*chosen, *more], [*candidates, *tried]
-    last = max((item.stage for item in tried), default=0)
-    present += [item.finding for item in tried if item.stage == last and item.rejected_because
-                and item.rejected_because == too_small(item.finding)]
+    tried = candidates_of_lines(bench, chosen)
+    for item in tried:
+        if not item.rejected_because:
+            say(f'found {item.name}: {item.finding.evidence}')
+    candidates += tried
+    chosen += [item.finding for item in tried if not item.rejected_because]
+    present += [item.finding for item in tried
+                if item.rejected_because and item.finding.effect is not None]
+    evidence = bench.gather((), everything)
     effects = _effects(chosen)
     own = bench.unsteadiness(effects)
     before = bench.score((), unsteadiness=own) if chosen else first
@@ -304,29 +307,6 @@ def _sorted(timing: Timing | None, change: Change) -> tuple[list[Finding], list[
         (chosen if matters else present).append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
     return chosen, [item for item in present if item.name != _SPEED]
-
-
-def _of_lines(bench: Bench, chosen: Sequence[Finding], say: Progress
-              ) -> tuple[list[Finding], list[Candidate], Evidence]:
-    """Return the effects that scatter the amplitudes, all that were tried, and the evidence."""
-    more: list[Finding] = []
-    tried: list[Candidate] = []
-    evidence = bench.gather((), range(len(bench.observation.acquisitions)))
-    while len(more) < _MOST_EFFECTS:
-        found = [*chosen, *more]
-        effects = _effects(found)
-        own = bench.unsteadiness(effects)
-        now = bench.score(effects, found, unsteadiness=own)
-        round_ = try_all(bench, bench.gather(effects, bench.fit), found, now, own, len(more) + 1)
-        winner = best_of(round_)
-        tried += [item if item is winner or item.rejected_because else replace(
-            item, rejected_because=f'{winner.name if winner else ""} has the more certain '
-            'evidence') for item in round_]
-        if winner is None:
-            break
-        more.append(winner.finding)
-        say(f'found {winner.name}: {winner.finding.evidence}')
-    return more, tried, evidence
 
 
 def _refitted(bench: Bench, timing: Timing | None) -> Timing | None:
@@ -401,21 +381,9 @@ def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
 
 
 def _probabilities(timing: Timing | None, candidates: Sequence[Candidate]) -> Mapping[str, float]:
-    """
-    Return the probability of every effect that was tried.
-
-    Of those on the lines it follows from their p value p, with at most -e p log(p) for the odds
-    against them (Sellke, Bayarri and Berger 2001).
-    """
+    """Return the probability of every effect that was tried."""
     found = dict(timing.probabilities) if timing is not None else {}
-    for item in candidates:
-        p_value = item.finding.p_value
-        if item.name not in found:
-            against = -math.e * p_value * math.log(p_value) if 0.0 < p_value < 1.0 / math.e else (
-                float(p_value > 0.0))
-            likely = 1.0 / (1.0 + _AGAINST * against) if against < 1.0 else _PRIOR
-            found[item.name] = likely if not item.rejected_because else min(likely, 0.5)
-    return found
+    return {item.name: item.finding.probability for item in candidates} | found
 
 
 def _effects(findings: Sequence[Finding]) -> list[Effect]:

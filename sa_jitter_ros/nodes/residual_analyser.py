@@ -28,7 +28,6 @@ from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.declaration import declaration_of, predictor_parameters, SHAFTS
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.errors import MessageError, SaJitterError
-from sa_jitter_ros.inference.candidates import SIGNIFICANT
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
 from sa_jitter_ros.inference.online_trace import trace_averages
@@ -51,6 +50,7 @@ PARAMETERS = (
               'missing effect', minimum=2, maximum=10000),
     Parameter('close_loop', False, "add each missing effect to the predictor's parameters"),
 )
+_SIGNIFICANT = 0.02  # p value of a residual that is no chance
 _FEWEST = 4  # averages that a search for the cause takes
 _PERIOD = 0.1  # s between the steps of the loop
 _FIND_TIMEOUT = 3.0  # s to find the predictor
@@ -186,7 +186,7 @@ class ResidualAnalyser(MonitoringNode):
             'averager, or use a better keyphasor'))
         self._batch.averages.clear()
         self._batches += 1
-        self._significant = found.p_value < SIGNIFICANT
+        self._significant = found.p_value < _SIGNIFICANT
         self._residual.publish(encode_residual(ResidualMessage(
             table, len(averages), found.chi2_per_dof, found.p_value, found.rms)))
         self._ask(averages, self._prediction)
