@@ -26,7 +26,7 @@ RATE, SPEED, CYCLES, ACQUISITIONS = 5000.0, 25.0, 20, 8
 TONE = 560.0  # Hz
 
 
-def sources(rng, ratio, orders, *, drift, tone=0.0, declared=(8.0,)):
+def sources(rng, ratio, orders, *, drift, tone=0.0, declared=(8.0,), lost=()):
     """Return the sources found beside `declared` orders, amplitudes of `orders` by order."""
     time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
     turns = SPEED * (time + 0.5 * drift * time**2 / time[-1])
@@ -36,6 +36,7 @@ def sources(rng, ratio, orders, *, drift, tone=0.0, declared=(8.0,)):
     vibration += 0.02 * rng.standard_normal(time.size)
     pulses = np.interp(np.arange(0.5, turns[-1]), turns, time)
     pulses = pulses + rng.uniform(-0.5, 0.5, pulses.size) / 10000.0
+    pulses = np.delete(pulses, lost)
     model = DeclaredModel(keyphasor_rate=10000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
                           ratio=ratio, orders=declared, sample_rate=RATE)
     return observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model
@@ -54,6 +55,32 @@ def test_orders_of_other_shafts_are_found_and_tones_are_not(rng):
 def test_a_steady_machine_tells_only_orders_that_its_shafts_have(rng, other, count):
     found = sources(rng, 3.0, {8.0: 1.0, other: 0.2}, drift=0.0)
     assert found.size == count
+
+
+def test_what_a_lost_pulse_reads_as_a_declared_order_comes_first(rng):
+    """A cycle of two revolutions reads order 4 as order 8, order 20 as order 40."""
+    orders = {8.0: 1.0, 40.0: 1.0, 4.0: 0.05, **{10.0 + k: 0.2 for k in range(22)}}
+    whole = sources(rng, 1.0, orders, drift=0.01, declared=(8.0, 40.0))
+    assert 4.0 not in whole
+    assert whole.size == 20
+    found = sources(rng, 1.0, orders, drift=0.01, declared=(8.0, 40.0), lost=[50])
+    assert found[:2].tolist() == [20.0, 4.0]
+
+
+def test_a_source_that_moves_does_not_hide_the_undeclared_orders(rng):
+    """Pulses that are right are smoothest uncorrected; the vibration still shows its motion."""
+    count = 200
+    time = np.arange(int((count + 4) / SPEED * RATE)) / RATE
+    moved = time + 3e-4 * np.cos(2.0 * np.pi * 0.13 * SPEED * time + 1.0)
+    vibration = sum(np.cos(2.0 * np.pi * order * SPEED * moved + order**2)
+                    for order in (8.0, 9.0, 10.0, 11.0))
+    vibration += 0.1 * rng.standard_normal(time.size)
+    pulses = np.arange(2.0, count) / SPEED + rng.uniform(-0.5, 0.5, count - 2) / 20000.0
+    model = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                          orders=(8.0,), sample_rate=RATE)
+    found = recover_record(vibration[:, None], 0.0, RATE, RecordPulses.unbroken(pulses), model)
+    assert found.resolved
+    assert found.undeclared[0].size >= 3
 
 
 def test_sidebands_of_a_shaft_are_no_tones_on_a_steady_machine(rng):

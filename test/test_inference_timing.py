@@ -12,7 +12,7 @@
 
 from dataclasses import replace
 
-from limit_coverage import limit_of, lines, machine, MODEL, UNIT
+from limit_coverage import limit_of, lines, machine, MODEL, recovered_source, UNIT
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import EFFECTS
@@ -37,7 +37,7 @@ def names_of(timing):
 
 def value_of(timing, name, parameter):
     finding = next(item for item in timing.findings if item.name == name)
-    return finding.effect.values[parameter], finding.standard_errors[parameter]
+    return finding.effect.values[parameter], finding.standard_errors.get(parameter)
 
 
 CASES = {
@@ -326,3 +326,22 @@ def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
         assert error < 0.01 * skew
         off.append((value - skew) / error)
     assert np.max(np.abs(off)) < 3.0
+
+
+@pytest.mark.parametrize('beside', [0.0, 3.0])
+def test_speed_fluctuation_is_told_from_sidebands_by_its_frequency(beside):
+    """The shaft bends the angle slowly; sidebands of half an order bend it to and fro."""
+    part = machine(7)
+    index = part.setting.index
+    motion = 10.0 * UNIT * np.cos(2.0 * np.pi * 0.11 * index)
+    seen = motion * [[1.0], [0.0]] + recovered_source(motion)
+    seen += recovered_source(beside * UNIT * (-1.0) ** index)
+    setting = replace(part.setting, times=part.setting.times + motion)
+    timing = read_timing([replace(
+        part, setting=setting, errors=part.errors + seen[0], bends=part.bends + seen[1, :-1],
+        sidebands=np.array([0.5]))])
+    value, error = value_of(timing, 'speed_fluctuation', 'acceleration_std')
+    size = np.std(recovered_source(motion)[1])
+    bandwidth, _ = value_of(timing, 'speed_fluctuation', 'bandwidth')
+    truth = EFFECTS['speed_fluctuation'].of_ripple(size, MODEL, bandwidth).acceleration_std
+    assert abs(value - truth) < 3.0 * error + 0.05 * truth

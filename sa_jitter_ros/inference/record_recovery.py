@@ -165,7 +165,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
             return recovery
         none = np.zeros(0), np.zeros(0)
         bare = _joined(pulses, stretches, fits(none, wider))
-        if _roughness(bare) < roughness:
+        # pulses that are hardly corrected stay as smooth as a source that moves leaves them
+        if (bare.resolved or not recovery.resolved) and _roughness(bare) < roughness:
             return replace(bare, fits=recovery.fits)
     return recovery
 
@@ -288,10 +289,15 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
     share = np.max(np.abs(fit.amplitudes) / level, axis=0)
     kept_out = modulating_lines(fit, model) | doubtful_lines(fit, model)
+    # a trigger cycle that missing pulses make longer reads these as the declared ones
+    longer = 1 + np.unique(recovery.missing[recovery.missing > 0])
+    read = np.divide.outer(np.array(model.orders), longer)
+    near = np.abs(fit.orders[:, None] - read.ravel()).min(axis=1, initial=np.inf) < _ON_LINE / (
+        model.trigger_cycles * model.cycle_length)
     found: list[float] = []
-    for i in (declared + np.argsort(-share[declared:])).tolist():
-        if share[i] < _STRONG or len(found) == _MOST:
-            break
+    for i in np.lexsort((-share, ~near)).tolist():
+        if i < declared or share[i] < _STRONG or len(found) == _MOST:
+            continue
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact
         wanted = order == round(order) or not kept_out[i]

@@ -39,6 +39,7 @@ from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
 from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
+from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
@@ -214,9 +215,14 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
     choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
                      setting=chooser.setting)
     findings = tuple(_findings(chooser, choice, declared))
-    if [item.name for item in findings] != [item.name for item in timing.findings]:
+    if _chosen(findings) != _chosen(timing.findings):
         return timing
     return Timing(findings, timing.probabilities, chooser, choice)
+
+
+def _chosen(findings: Sequence[Finding]) -> Sequence[str]:
+    """Return the names of effects; the bends of a speed are found whatever the others are."""
+    return [item.name for item in findings if item.name != _SPEED]
 
 
 def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, float]:
@@ -345,21 +351,25 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     data = fit.data
     if data.series < 3:  # nothing is known of what happens inside the cycles
         return None
-    made = {name: float(np.average(fit.contribution(name)[:, 2, 2].real, weights=data.size))
+    made = {name: fit.contribution(name)[:, 2, 2].real
             for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
-    share = made[SHAFT] / sum(made.values())  # the rest are bends of a source that moves
+    # of each frequency by itself: the rest are bends of a source that moves
+    share = made[SHAFT] / sum(made.values())
+    gain, density = np.sqrt(share), data.size * data.noise[:, 2, 2].real
+    passed = float(share @ density / density.sum())
     parts, next_, count = [], [], 0
     for item in data.stretches:
         if not np.isfinite(item.bend_std):
             continue
-        for part in np.array_split(item.bends, max(1, item.bends.size // _PART)):
-            parts.append(share * (np.mean(part**2) - item.bend_std**2))
-            next_.append(share * np.mean(part[1:] * part[:-1]))
+        bends = through(item.bends, gain, data) + gain[0] * item.bends.mean()
+        for part in np.array_split(bends, max(1, bends.size // _PART)):
+            parts.append(np.mean(part**2) - passed * item.bend_std**2)
+            next_.append(np.mean(part[1:] * part[:-1]))
             count += part.size
     if len(parts) < _FEWEST_PARTS:
         return None
     power, error = _mean(parts)
-    noise = share * float(np.mean([item.bend_std**2 for item in data.stretches]))
+    noise = passed * float(np.mean([item.bend_std**2 for item in data.stretches]))
     chance = float(special.ndtr(-power / (noise * math.sqrt(2.0 / count) + 1e-300)))
     if power <= 0.0 or chance > _CHANCE:
         return None
