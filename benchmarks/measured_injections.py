@@ -14,8 +14,8 @@ Put effects into measured machines, and tell whether the loop finds them or give
 `python benchmarks/measured_injections.py --data FOLDER` moves the pulses, resamples the vibration
 or adds to it, for every effect and for two that no module describes, so that the worst line
 changes by 0.01, 0.03 and 0.1 (mean, or standard deviation of an average). What the loop finds in
-the recording itself is declared before. It writes a line of JSON a run to the standard error and
-prints a table at the end.
+the recordings themselves is declared before. It writes a line of JSON a run to the standard error
+and prints a table at the end, whose letters docs/measured_cases.md explains.
 """
 
 import argparse
@@ -29,22 +29,25 @@ import time
 from typing import Any
 import warnings
 
-from measured_cases import GEAR0
+from measured_cases import Case, GEAR0, other_cases, stored
 import numpy as np
 import sa_jitter_ros as sa
+from sa_jitter_ros.effects.band import ACCELERATION_BAND, slow_band
 from sa_jitter_ros.errors import SaJitterError
-from sa_jitter_ros.recordings import read, Recording
+from sa_jitter_ros.recordings import Recording
 from sa_jitter_ros.recordings.recording import ArraySource
-from scipy import ndimage
+from scipy import interpolate, ndimage
 import yaml
 
 Array = np.ndarray[Any, Any]
 Generator = np.random.Generator
 SIZES = 0.01, 0.03, 0.1
 _STEPS, _STEP = 400, 1.1
-_CORRELATION, _BEAT, _OFF = 0.8, 0.2, 1.5
+_CORRELATION, _BEAT, _OFF, _WANDER = 0.8, 0.2, 1.5, 0.2
 _HUM = 59.8  # Hz
-_CHANGED = {'noise': 'additive_noise'}
+_HIT, _KEPT = 0.04, 0.75  # share of pulses at which a sensor drops out, and what stays of it
+_UNSURE = {'amplitude', 'bandwidth'}  # parameters whose errors are not looked at
+_WAVES, _POINTS = 300, 20  # of a slow process, and its points in a trigger cycle
 
 
 @dataclass(frozen=True)
@@ -75,12 +78,22 @@ class Bench:
         """Return the times of the samples."""
         return self.start + np.arange(self.samples.shape[1]) / self.rate
 
-    def slow(self, rng: Generator, low: float, high: float) -> Callable[[Array], Array]:
-        """Return a process of unit variance of some frequencies, in cycles a trigger cycle."""
-        rates = rng.uniform(low, high, 24) / self.period
-        phases = rng.uniform(0.0, 2.0 * np.pi, 24)
-        return lambda times: sum(np.cos(2.0 * np.pi * rate * times + phase)
-                                 for rate, phase in zip(rates, phases)) / np.sqrt(12.0)
+    def slow(self, rng: Generator, band: tuple[float, float], power: int = 0
+             ) -> Callable[[Array], Array]:
+        """
+        Return a motion whose derivative of some `power` is flat in a band and of unit variance.
+
+        The band is in cycles a trigger cycle; the variance that of this recording.
+        """
+        edges = np.linspace(*band, _WAVES + 1) / self.period
+        rates = 2.0 * np.pi * rng.uniform(edges[:-1], edges[1:])
+        phases = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+        grid = np.arange(self.start - self.period, self.clock[-1] + self.period,
+                         self.period / _POINTS)
+        waves = np.cos(np.multiply.outer(grid, rates) + phases)
+        scale = float(np.std(waves.sum(axis=1)))
+        spline = interpolate.CubicSpline(grid, waves @ rates**-power / scale)
+        return lambda times: np.asarray(spline(times))
 
     def moved(self, lead: Array) -> Array:
         """Return the samples (channel, sample) that the machine makes `lead` (sample,) s later."""
@@ -132,17 +145,14 @@ def missing_pulses(bench: Bench, rng: Generator, size: float) -> Bench:
 def phase_wander(bench: Bench, rng: Generator, size: float) -> Bench:
     """Let the gears move against the tach shaft."""
     turn = 2.0 * np.pi * bench.model['trigger_speed'] * bench.model.get('ratio', 1.0)
-    lead = size / turn * bench.slow(rng, 0.0, 0.2)(bench.clock)
+    lead = size / turn * bench.slow(rng, slow_band(_WANDER))(bench.clock)
     return replace(bench, samples=bench.moved(lead))
 
 
 def speed_fluctuation(bench: Bench, rng: Generator, size: float) -> Bench:
     """Let the whole machine turn unevenly."""
-    low, high = 0.05, 0.3
-    motion = bench.slow(rng, low, high)
-    grid = np.linspace(bench.times[0], bench.times[-1], 20 * bench.times.size)
-    bent = np.gradient(np.gradient(motion(grid), grid), grid)[5:-5]
-    scale = size / (2.0 * np.pi * bench.model['trigger_speed'] * bent.std())
+    motion = bench.slow(rng, ACCELERATION_BAND, 2)
+    scale = size / (2.0 * np.pi * bench.model['trigger_speed'])
     times = bench.times
     for _ in range(20):  # t + motion(t) is when it happened before
         times = bench.times - scale * motion(times)
@@ -171,10 +181,15 @@ def additive_noise(bench: Bench, rng: Generator, size: float) -> Bench:
         bench.samples.shape))
 
 
+def _load(bench: Bench) -> float:
+    """Return the bandwidth of a load that is nearly constant in an average."""
+    return 0.5 / float(bench.model['trigger_cycles'])
+
+
 def amplitude_modulation(bench: Bench, rng: Generator, size: float) -> Bench:
     """Let the load vary slowly."""
     return replace(bench, samples=bench.samples * (
-        1.0 + size * bench.slow(rng, 0.0, 0.5 / bench.model['trigger_cycles'])(bench.clock)))
+        1.0 + size * bench.slow(rng, slow_band(_load(bench)))(bench.clock)))
 
 
 def _tone(bench: Bench) -> float:
@@ -201,26 +216,39 @@ def late_recovery(bench: Bench, rng: Generator, size: float) -> Bench:
     """Let the sensor drop out now and then and come late until it has recovered; unknown, too."""
     late = np.zeros(bench.times.size)
     for k in range(1, late.size):
-        hit = rng.uniform(0.5, 1.5) if rng.random() < 0.04 else 0.0
-        late[k] = 0.75 * late[k - 1] + hit
-    return replace(bench, times=bench.times + size * late)
+        hit = rng.uniform(0.5, 1.5) if rng.random() < _HIT else 0.0
+        late[k] = _KEPT * late[k - 1] + hit
+    return replace(bench, times=bench.times + size / late.std() * late)
 
 
-_MOTOR = {'pulses_per_revolution': 8, 'orders': [12.0, 16.0, 18.0, 36.0, 54.0, 72.0]}
-#: File, declared model, and the width (s) of the uniform pulse errors that are added.
-MACHINES: Mapping[str, tuple[str, Mapping[str, Any], float]] = {
-    'gearbox': ('gear0_gearbox.npz', {
-        **GEAR0, 'keyphasor_rate': 2e4, 'trigger_cycles': 10}, 5e-5),
-    'motor, 30 V': ('motor_30V_100kHz.npz', {
-        **_MOTOR, 'keyphasor_rate': 1e5, 'trigger_speed': 94.4, 'trigger_cycles': 5}, 1e-5),
-    'motor, run-up': ('motor_runup_20V_40kHz.npz', {
-        **_MOTOR, 'keyphasor_rate': 4e4, 'trigger_speed': 44.0, 'trigger_cycles': 8}, 0.0),
-    'bearing rig': ('uia_bearing_rig_1.npz', {
-        'keyphasor_rate': 1024.0, 'orders': [1.0, 2.0, 3.0], 'trigger_speed': 4.19,
-        'trigger_cycles': 10}, 0.0),
-    'turbine': ('turbine_20130316.npz', {
-        'keyphasor_rate': 3.125e6, 'pulses_per_revolution': 2, 'orders': [20.0, 40.0, 60.0],
-        'trigger_speed': 30.0, 'trigger_cycles': 10}, 0.0)}
+def jitter_scale(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Let the declared errors be larger than declared."""
+    return replace(bench, times=bench.times + size * (bench.times - bench.true_times))
+
+
+def _angles(bench: Bench, size: float) -> Array:
+    """Return by which angle each mark is late."""
+    marks = int(bench.model.get('pulses_per_revolution', 1))
+    angles = np.random.default_rng(marks).standard_normal(marks)
+    return np.asarray(size * (angles - angles.mean()))
+
+
+def target_geometry(bench: Bench, rng: Generator, size: float) -> Bench:
+    """Put the marks off their even places."""
+    angles = _angles(bench, size)
+    late = angles[np.arange(bench.times.size) % angles.size]
+    return replace(bench, times=bench.times + late / (2.0 * np.pi * bench.model['trigger_speed']))
+
+
+#: Trigger cycles and what else is declared so that short recordings have enough acquisitions.
+_SHORTER: Mapping[str, Mapping[str, Any]] = {
+    'motor, 10 V': {'pulses_per_trigger': 4}, 'motor, 30 V': {'trigger_cycles': 5}}
+#: Width (s) of the uniform pulse errors that are added, as declared.
+_JITTER: Mapping[str, float] = {'gearbox': 5e-5, 'motor, 30 V': 1e-5}
+MACHINES: Mapping[str, Case] = {case.title: replace(
+    case, model={**case.model, **_SHORTER.get(case.title, {})}) for case in (
+        Case('gearbox', [stored('gear0_gearbox.npz')], {
+            **GEAR0, 'keyphasor_rate': 2e4, 'trigger_cycles': 10}), *other_cases())}
 #: Effects, how to put them in, and their parameters at a size, for the prediction.
 KNOWN: Mapping[str, tuple[Make, Callable[[Bench, float], Mapping[str, Any]]]] = {
     'excess_jitter': (excess_jitter, lambda bench, size: {'std': size}),
@@ -228,19 +256,24 @@ KNOWN: Mapping[str, tuple[Make, Callable[[Bench, float], Mapping[str, Any]]]] = 
         'std': size, 'correlation': _CORRELATION}),
     'clock_skew': (clock_skew, lambda bench, size: {'skew': size}),
     'path_delay': (path_delay, lambda bench, size: {'delay': size}),
+    'jitter_scale': (jitter_scale, lambda bench, size: {'scale': 1.0 + size}),
+    'target_geometry': (target_geometry, lambda bench, size: {
+        'pulse_angles': _angles(bench, size).tolist()}),
     'missing_pulses': (missing_pulses, lambda bench, size: {'probability': size}),
-    'phase_wander': (phase_wander, lambda bench, size: {'std': size, 'bandwidth': 0.2}),
+    'phase_wander': (phase_wander, lambda bench, size: {'std': size, 'bandwidth': _WANDER}),
     'speed_fluctuation': (speed_fluctuation, lambda bench, size: {'acceleration_std': size}),
     'keyphasor_quantisation': (keyphasor_quantisation, lambda bench, size: {
         'clock_rate': 1.0 / size}),
     'interpolation_loss': (interpolation_loss, lambda bench, size: {'method': 'linear'}),
     'additive_noise': (additive_noise, lambda bench, size: {'std': size}),
-    'amplitude_modulation': (amplitude_modulation, lambda bench, size: {'std': size}),
+    'amplitude_modulation': (amplitude_modulation, lambda bench, size: {
+        'std': size, 'bandwidth': _load(bench)}),
     'interfering_tone': (interfering_tone, lambda bench, size: {
         'frequency': _tone(bench), 'amplitude': size})}
-# with as large a standard deviation as correlated jitter, which has the same second moments
+# with as large a standard deviation as correlated jitter
 UNKNOWN: Mapping[str, Make] = {'hum': hum, 'late_recovery': late_recovery}
-_FIRST = {'excess_jitter': 1e-8, 'correlated_jitter': 1e-8, 'clock_skew': 1e-8, 'path_delay': 1e-5,
+_FIRST = {'excess_jitter': 1e-8, 'correlated_jitter': 1e-8, 'clock_skew': 1e-8,
+          'path_delay': 1e-5, 'jitter_scale': 1e-2, 'target_geometry': 1e-6,
           'missing_pulses': 1e-4, 'phase_wander': 1e-5, 'speed_fluctuation': 1e-3,
           'keyphasor_quantisation': 1e-7, 'additive_noise': 1e-5, 'amplitude_modulation': 1e-4,
           'interfering_tone': 1e-5}
@@ -268,14 +301,18 @@ def size_of(name: str, bench: Bench, change: float) -> float | None:
     return None
 
 
-def opened(title: str, data: Path) -> Bench:
-    """Return a measured machine, with uniform pulse errors of a clock's period added to it."""
-    name, model, jitter = MACHINES[title]
-    recording = read(data / name)
+def opened(title: str, data: Path) -> list[Bench]:
+    """Return the recordings of a machine, with uniform errors of the pulses where wanted."""
+    case, jitter = MACHINES[title], _JITTER.get(title, 0.0)
+    rng = np.random.default_rng(7)
+    return [_bench(make(data), case.model, jitter, rng) for make in case.recordings]
+
+
+def _bench(recording: Recording, model: Mapping[str, Any], jitter: float, rng: Generator
+           ) -> Bench:
     times = recording.reference_pulse_times
     if times is None:
         times = recording.keyphasor_pulses()
-    rng = np.random.default_rng(7)
     samples = np.concatenate(list(recording.blocks(1 << 20)), axis=1)
     bench = Bench(samples, recording.sample_rate, recording.start_time,
                   times + jitter * rng.uniform(-0.5, 0.5, times.size), times, model, recording,
@@ -290,91 +327,96 @@ def opened(title: str, data: Path) -> Bench:
     return replace(bench, level=level)
 
 
-def close(bench: Bench, declared: str) -> Mapping[str, Any]:
-    """Return the report on a recording with its model, or that of a parameter file (text)."""
+def close(parts: Sequence[Bench], declared: str) -> Mapping[str, Any]:
+    """Return the report on recordings with their model, or that of a parameter file (text)."""
     sections = yaml.safe_load(declared) if declared else {}
     known = {key: value for section in sections.values()
              for key, value in section['ros__parameters'].items()}
-    values = {**bench.model, **known, 'keyphasor_rate': bench.model['keyphasor_rate']}
+    model = parts[0].model
+    values = {**model, **known, 'keyphasor_rate': model['keyphasor_rate']}
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as name:
         warnings.simplefilter('ignore')
         path = Path(name, 'model.yaml')
         path.write_text(yaml.safe_dump({'jitter_predictor': {'ros__parameters': values}}),
                         encoding='utf-8')
-        return sa.close_loop(bench.made(), path).report
+        return sa.close_loop([part.made() for part in parts], path).report
 
 
 def outcome(report: Mapping[str, Any], name: str, parameters: Mapping[str, Any]) -> str:
-    """Return what became of an effect: found, present, within its limit or missed."""
+    """Return what became of an effect, as a letter and a number."""
     found = {item['name']: item for item in report['missing_effects']}
-    extra = sorted(found.keys() - {name})
     text = ''
     if name in found:
         rest = [abs(item['value'] - parameters[key]) / item['standard_error']
                 for key, item in found[name]['parameters'].items()
-                if key in parameters and key != 'amplitude' and item['standard_error']]
-        text = 'found' + (f' ({max(rest):.1f} s.e.)' if rest else '')
-    elif any(name in item['indistinguishable_from'] for item in found.values()):
-        text = 'rival'
+                if isinstance(parameters.get(key), float) and key not in _UNSURE
+                and item['standard_error']]
+        text = 'F' + (f'{max(rest):.1f}' if rest else '')
+    elif rivals := {key for key, item in found.items()
+                    if name in item['indistinguishable_from']}:
+        text, found = 'R', {key: item for key, item in found.items() if key not in rivals}
     elif name in {item['name'] for item in report['present']}:
-        text = 'present'
+        text = 'P'
     elif report['verdict'] == 'unexplained':
-        text = 'unexplained'
-    elif any(name == _CHANGED.get(item['name'], item['name'])
-             for item in report['declared_changes']):
-        text = 'declared wrongly'
+        return 'U' + '+' * bool(found)
     else:
         limits = {item['name']: item for item in report['limits']}
-        text = _limit(limits.get(name), parameters)
-    return text + (f' + {", ".join(extra)}' if extra else '') + (
-        ' *unexplained*' if report['verdict'] == 'unexplained' and text != 'unexplained' else '')
+        text = _limit(limits.get(name), parameters, name in report['undecided'])
+    unexplained = bool(report['verdict'] == 'unexplained')
+    return text + '+' * bool(found.keys() - {name}) + '?' * unexplained
 
 
-def _limit(limit: Mapping[str, Any] | None, parameters: Mapping[str, Any]) -> str:
+def _limit(limit: Mapping[str, Any] | None, parameters: Mapping[str, Any], undecided: bool) -> str:
     if limit is None:
-        return 'missed'
-    if limit['upper_95'] is None and limit['lower_95'] is None:
-        return 'no limit'
+        return 'M'
     size = parameters.get(limit['parameter'])
-    if size is None or limit['upper_95'] is None:
-        return 'limit'
-    return 'within its limit' if limit['upper_95'] >= abs(size) else 'excluded'
+    if limit['upper_95'] is None or size is None:
+        return 'O' if undecided or limit['lower_95'] is None else 'L'
+    size = float(np.sqrt(np.mean(np.square(size))))
+    ratio: float = limit['upper_95'] / size
+    return f'{"L" if ratio >= 1.0 else "X"}{ratio:.1f}'
 
 
-def run(title: str, bench: Bench, name: str, change: float, declared: str
+def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: str
         ) -> Mapping[str, Any]:
     """Put an effect in, close the loop and return what came out."""
+    bench = parts[0]
     like = 'correlated_jitter' if name in UNKNOWN else name
     size = size_of(like, bench, change)
     row = {'machine': title, 'effect': name, 'change': change, 'size': size}
-    if size is None:
-        return {**row, 'outcome': 'changes nothing'}
+    if size is None or (name == 'jitter_scale' and title not in _JITTER):
+        return {**row, 'outcome': '-'}
     rng = np.random.default_rng([round(1e3 * change), *name.encode()])
     make = UNKNOWN[name] if name in UNKNOWN else KNOWN[name][0]
     start = time.process_time()
     try:
-        report = close(make(bench, rng, size), declared)
+        report = close([make(part, rng, size) for part in parts], declared)
     except SaJitterError as error:
         return {**row, 'outcome': 'refused', 'error': str(error)}
     parameters = {} if name in UNKNOWN else dict(KNOWN[name][1](bench, size))
     if name == 'additive_noise':  # reported in the unit of the vibration
         parameters['std'] *= bench.level
     return {**row, 'outcome': outcome(report, name, parameters), 'verdict': report['verdict'],
-            'found': [item['name'] for item in report['missing_effects']],
+            'found': {item['name']: {key: (value['value'], value['standard_error'])
+                                     for key, value in item['parameters'].items()}
+                      for item in report['missing_effects']},
+            'remains': report['remains'], 'remarks': report['remarks'],
+            'limit': [(item['upper_95'], item['lower_95']) for item in report['limits']
+                      if item['name'] == name],
             'before': report['error_before']['rms'], 'after': report['error_after']['rms'],
-            'cpu': time.process_time() - start}
+            'p_value': report['error_after']['p_value'], 'cpu': time.process_time() - start}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the outcomes in Markdown, a row for each machine and effect."""
-    sizes = list(dict.fromkeys(row['change'] for row in rows))
-    lines = ['| machine | put in | ' + ' | '.join(f'{size:g}' for size in sizes) + ' |',
-             '|---|---|' + '---|' * len(sizes)]
-    for machine, effect in dict.fromkeys((row['machine'], row['effect']) for row in rows):
-        some = {row['change']: row['outcome'] for row in rows
-                if (row['machine'], row['effect']) == (machine, effect)}
-        lines.append(f'| {machine} | {effect} | '
-                     + ' | '.join(some.get(size, '-') for size in sizes) + ' |')
+    """Return the outcomes in Markdown: effects down, machines across, sizes in a cell."""
+    machines = list(dict.fromkeys(row['machine'] for row in rows))
+    lines = ['| put in | ' + ' | '.join(machines) + ' |', '|---|' + '---|' * len(machines)]
+    for effect in dict.fromkeys(row['effect'] for row in rows):
+        cells = [[row['outcome'] for row in rows
+                  if (row['machine'], row['effect']) == (machine, effect)]
+                 for machine in machines]
+        lines.append(f'| {effect} | ' + ' | '.join(
+            '-' if set(cell) <= {'-'} else ' '.join(cell) for cell in cells) + ' |')
     return '\n'.join(lines)
 
 
@@ -390,15 +432,16 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for title in options.machines:
-        bench = opened(title, options.data)
-        first = close(bench, '')
+        parts = opened(title, options.data)
+        first = close(parts, '')
         declared = first.get('parameter_file') or ''
         print(json.dumps({'machine': title, 'verdict': first['verdict'],
                           'declared': [item['name'] for item in first['missing_effects']],
+                          'remarks': first['remarks'], 'undecided': first['undecided'],
                           'rms': first['error_after']['rms']}), file=sys.stderr, flush=True)
         for name in options.effects:
             for change in options.sizes:
-                rows.append(run(title, bench, name, change, declared))
+                rows.append(run(title, parts, name, change, declared))
                 print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     print(table(rows))
 
