@@ -9,7 +9,7 @@
 # the License.
 
 """
-One recording under several lists of orders and counts of trigger cycles: the same answer?
+Whether one recording gives the same answer under several lists of orders and trigger cycles.
 
 `python benchmarks/order_lists.py` draws machines with an effect each (`independent_effects`). Each
 is recorded once and declared several times, with some of its orders, in any sequence, and with

@@ -32,8 +32,8 @@ from math import pi
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
-from scipy import fft
 from sa_jitter_ros.averaging.noise import row_medians
+from scipy import fft
 from scipy.special import chndtrix, erf
 
 FloatArray = NDArray[np.float64]

@@ -425,7 +425,6 @@ class _Moments(NamedTuple):
             difference_6=self.difference_6 * difference**3,
             difference_8=self.difference_8 * difference**4)
 
-
     def with_extents(self, parts: WaveformParts, settings: GearSettings) -> '_Moments':
         """
         Return the moments of an average and of it without one part each, with other extents.

@@ -34,6 +34,7 @@ from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Pattern, Spectrum
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import special
@@ -110,12 +111,18 @@ def largest(timing: Timing, name: str) -> Effect | None:
         if name not in chooser.patterns:
             return None
         sizes, covariance = chooser.fit(choice.best | {name}, choice.fit.starts).pattern(name)
-        return kind.of_timing(_farthest(sizes, covariance), covariance, choice.setting)[0]
-    if not isinstance(kind.timing, Spectrum):
+        found, errors = _farthest(sizes, covariance), covariance
+    elif isinstance(kind.timing, Spectrum):
+        power = _bound(timing, name, kind.timing.upper[0], ONE_SIDED)
+        if power is None:
+            return None
+        found, errors = power, np.zeros(len(kind.timing.upper))
+    else:
         return None
-    found = _bound(timing, name, kind.timing.upper[0], ONE_SIDED)
-    return None if found is None else kind.of_timing(
-        found, np.zeros(len(kind.timing.upper)), choice.setting)[0]
+    try:
+        return kind.of_timing(found, errors, choice.setting)[0]
+    except ParameterError:  # the data allow more than such an effect may be
+        return None
 
 
 def _bound(timing: Timing, name: str, top: float, far: float) -> Array | None:
