@@ -221,6 +221,9 @@ def test_noise_that_hides_any_jitter_leaves_no_limit():
     assert 5.0 < noisy / quiet < 50.0  # jitter below the noise shows by its power
     timing = read_timing([machine(1, noise=3e4)], names=frozenset())
     assert largest(timing, 'excess_jitter') is None
+    assert largest(timing, 'clock_skew') is not None
+    timing = read_timing([machine(1, noise=3e6)], names=frozenset())
+    assert largest(timing, 'clock_skew') is None  # more than any clock has
 
 
 def test_no_motion_of_the_source_shows_against_a_reference_keyphasor():
