@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.commands.close_loop import main
 from sa_jitter_ros.declaration import read_declaration
-from sa_jitter_ros.effects import EFFECTS, make_effect
+from sa_jitter_ros.effects import declared_effects, EFFECTS, make_effect
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.beat import find_beat
 from sa_jitter_ros.inference.observation import observe
@@ -248,6 +248,25 @@ def test_declared_effect_is_not_missing():
     found = trace([observe(recording, MODEL)], [recording],
                   declared=[make_effect('clock_skew', skew=4e-4)])
     assert found.verdict == 'none'
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize(('name', 'true', 'parameter', 'wrong'), [
+    ('additive_noise', {'std': 1.0}, 'std', 0.5),
+    ('amplitude_modulation', {'std': 0.3}, 'std', 0.1),
+    ('interfering_tone', {'frequency': 400.9, 'amplitude': 0.12}, 'amplitude', 0.06),
+])
+def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, parameter, wrong):
+    recording = simulated(*make_effects({name: true}))
+    observation = observe(recording, MODEL)
+    right = trace([observation], [recording], declared=declared_effects({name: true}))
+    assert right.verdict == 'none'
+    content = report(trace([observation], [recording], declared=declared_effects(
+        {name: {**true, parameter: wrong}})))
+    assert content['verdict'] == 'traced'
+    changed, = [item for item in content['declared_changes'] if item['parameter'] == parameter]
+    assert (changed['name'], changed['declared']) == (name, wrong)
+    assert abs(changed['value'] - true[parameter]) < 4.0 * changed['standard_error']
 
 
 @pytest.mark.machines

@@ -85,6 +85,6 @@ class AdditiveNoise(DirectEffect):
         likelihood = 0.5 * freedom * math.log1p((value / error) ** 2 / freedom)  # Student
         std, std_error = root(value, error)
         text = (f'the lines scatter as white noise of {np.sqrt(value + known):.3g} per sample '
-                f'would make them, {np.sqrt(known):.3g} was declared')
+                f'would make them, noise_std is {np.sqrt(known):.3g}')
         return weighed(Finding(cls.name, cls(std), {'std': std_error}, 1.0, text),
                        likelihood, 1, evidence)

@@ -240,6 +240,13 @@ def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evid
         f'{found.probability:.2g}', p_value=found.p_value, gain=gain)
 
 
+def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles: int) -> bool:
+    """Return whether the numbers of a fitted effect, with their errors, are not the declared."""
+    away = [((effect.values[name] - declared.values[name]) / error) ** 2
+            for name, error in errors.items() if 0.0 < error < math.inf]
+    return beyond_chance(0.5 * sum(away), len(away), cycles) > ODDS
+
+
 def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:
     """Return the ranges of an effect's parameters by name, in their order."""
     return {item.name: item.metadata['range'] for item in fields(kind)

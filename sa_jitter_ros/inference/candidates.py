@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
+from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.scoring import Bench
 
@@ -39,16 +39,26 @@ class Candidate:
 
 
 def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candidate]:
-    """Fit every effect on the lines, and score it beside the `chosen` ones on the timing."""
+    """
+    Fit every effect on the lines, and score it beside the `chosen` ones on the timing.
+
+    A declared one is a candidate where its numbers are others than the declared.
+    """
     effects = [item.effect for item in chosen if item.effect is not None]
-    evidence, found = bench.gather(effects, bench.fit), []
+    declared = {item.name: item for item in bench.declared}
+    shared, found = bench.gather(effects, bench.fit), []
     for name, kind in EFFECTS.items():
-        if name in {item.name for item in bench.declared} or not issubclass(kind, DirectEffect):
+        if not issubclass(kind, DirectEffect):
             continue
+        evidence = bench.without(name).gather(effects, bench.fit) if name in declared else shared
         untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
         finding = absent(name, untold) if untold else kind.fit(evidence)
+        effect = finding.effect
+        if name in declared and (effect is None or not departs(
+                effect, finding.standard_errors, declared[name], evidence.cycles)):
+            continue
         found.append(Candidate(name, 1, finding, None, finding.contradiction)
-                     if finding.effect is None else _scored(bench, effects, finding))
+                     if effect is None else _scored(bench, effects, finding))
     return found
 
 

@@ -90,6 +90,11 @@ class Bench:
         return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
                       self.with_declared(effects), self.scatter)
 
+    def without(self, name: str) -> 'Bench':
+        """Return the bench of a model that does not declare an effect."""
+        return replace(self, declared=tuple(
+            item for item in self.declared if item.name != name))
+
     def with_declared(self, effects: Sequence[Effect]) -> list[Effect]:
         """Return the declared effects and others, which take the place of those of their name."""
         names = {item.name for item in effects}

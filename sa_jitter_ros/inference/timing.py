@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
-from sa_jitter_ros.effects.effect import Finding, parameter_ranges
+from sa_jitter_ros.effects.effect import departs, Finding, parameter_ranges
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
@@ -381,12 +381,9 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     errors = {'acceleration_std': effect.acceleration_std * size_error / size}
     if low < high:  # not the widest band
         errors['bandwidth'] = 0.5 * (high - low)
-    for known in declared:
-        if known.name == _SPEED and 0.5 * sum(
-                ((effect.values[name] - known.values[name]) / value) ** 2
-                for name, value in errors.items()) < DECIDED + 0.5 * len(errors) * math.log(
-                    data.cycles):
-            return None
+    if any(known.name == _SPEED and not departs(effect, errors, known, data.cycles)
+           for known in declared):
+        return None
     return Finding(
         _SPEED, effect, errors, chance,
         'the speed changes within a trigger cycle: the angle between the pulses errs by '

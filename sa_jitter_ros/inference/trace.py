@@ -66,6 +66,7 @@ _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
 _UNSEEN = 'nothing of it shows in this recording'
+_AS_DECLARED = 'it is declared, and shows no other numbers than these'
 _FEWEST = 4
 _HELD_OUT = 6
 _SAME_CLOCK = 0.01
@@ -271,6 +272,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         if timing is not None and name in timing.probabilities:
             reason = ('the likelihood of the timing gains nothing by it: probability '
                       f'{timing.probabilities[name]:.2g}')
+        elif name in {item.name for item in declared}:
+            reason = _AS_DECLARED
         else:
             reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
@@ -323,8 +326,9 @@ def _on_all(bench: Bench, timing: Timing | None, findings: Sequence[Finding]) ->
     found: list[Finding] = []
     for finding in findings:
         kind = EFFECTS[finding.name]
-        again = kind.fit(bench.gather(_effects(found), everything)) if issubclass(
-            kind, DirectEffect) else of_timing.get(finding.name)
+        again = kind.fit(bench.without(finding.name).gather(
+            _effects(found), everything)) if issubclass(kind, DirectEffect) else of_timing.get(
+                finding.name)
         found.append(finding if again is None or again.effect is None else replace(
             finding, effect=again.effect, standard_errors=again.standard_errors,
             evidence=again.evidence))

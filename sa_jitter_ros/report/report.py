@@ -153,14 +153,14 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
         if isinstance(effect, JitterScale):
             found.append(('jitter', 'jitter_std', jitter, jitter * effect.scale,
                           jitter * error['scale'], 's'))
-        elif isinstance(effect, AdditiveNoise):
-            total = math.hypot(model.noise_std, effect.std)
-            found.append(('noise', 'noise_std', model.noise_std, total,
-                          effect.std / total * error['std'], '1'))
         elif item.name in declared:
             for name, limits in parameter_ranges(type(effect)).items():
                 found.append((item.name, name, declared[item.name].values[name],
                               effect.values[name], error.get(name), limits.unit))
+        elif isinstance(effect, AdditiveNoise):
+            total = math.hypot(model.noise_std, effect.std)
+            found.append(('noise', 'noise_std', model.noise_std, total,
+                          effect.std / total * error['std'], '1'))
     keys = 'name', 'parameter', 'declared', 'value', 'standard_error', 'unit'
     return [dict(zip(keys, row)) for row in found]
 
