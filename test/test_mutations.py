@@ -17,7 +17,7 @@ import pytest
 def test_numbers_of_constants_are_found():
     names = [number.name for number in numbers()]
     assert len(set(names)) == len(names) > 100
-    assert 'inference.timing_choice._ODDS' in names
+    assert 'effects.effect.ODDS' in names
 
 
 @pytest.mark.machines
