@@ -156,10 +156,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     Observe the acquisitions of a recording.
 
     `sources` are the declared orders, then others that leak into them; without it these are
-    searched for. A reference keyphasor is not used if the vibration wanders against it, or the
-    speed ripples between its pulses, so much that the average with it loses amplitude. Raises
-    RecordingError if there is no whole acquisition or the reference keyphasor is worse than the
-    keyphasor, ModelError if the declared model does not fit the recording.
+    searched for. A reference keyphasor is not used if it is worse than the keyphasor, the vibration
+    wanders against it, or the speed ripples between its pulses, so much that the average with it
+    loses amplitude. Raises RecordingError if there is no whole acquisition, ModelError if the
+    declared model does not fit the recording.
     """
     if recording.samples * recording.channels > _MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
@@ -186,9 +186,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             + ''.join(f' ({remark})' for remark in pulses.remarks))
     recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses, model)
     orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
-    if pulses.reference is not None and not _reference_serves(
-            reader, pulses, recovery, model, starts, np.array(once)):
-        pulses = replace(pulses, reference=None)
+    if pulses.reference is not None and (reason := _fails_as_reference(
+            reader, pulses, recovery, model, starts, np.array(once))):
+        pulses = replace(pulses, reference=None, remarks=(
+            *pulses.remarks, f'reference_pulse_times are not used: {reason}'))
     found = []
     for count, first in enumerate(starts):
         found.append(_acquire(reader, pulses, recovery, model, first, orders))
@@ -279,9 +280,9 @@ def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLa
     return found
 
 
-def _reference_serves(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,
-                      model: DeclaredModel, starts: Sequence[int], orders: FloatArray) -> bool:
-    """Whether, in a few acquisitions, the reference keyphasor keeps the amplitudes."""
+def _fails_as_reference(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,
+                        model: DeclaredModel, starts: Sequence[int], orders: FloatArray) -> str:
+    """Return why amplitudes with the reference keyphasor are too small, '' where they are not."""
     bare = replace(pulses, reference=None)
     kept, gained = [], []
     for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
@@ -296,11 +297,13 @@ def _reference_serves(reader: CycleReader, pulses: RecordPulses, recovery: Recor
                                      np.nan))
     gain = np.median(gained, axis=0)
     if np.any(gain > 1.0 + _LOSS):
-        raise RecordingError(
-            f'reference_pulse_times give less amplitude than pulse_times (raw over reference '
-            f'amplitude {np.nanmax(gain):.3f}, at most {1.0 + _LOSS:g}): the reference keyphasor '
-            'is worse; give a better one or none')
-    return not kept or not bool(np.any(np.median(kept, axis=0) < 1.0 - _LOSS))
+        return ('they give less amplitude than pulse_times (raw over reference amplitude '
+                f'{np.nanmax(gain):.3f}, at most {1.0 + _LOSS:g}); give better ones or none')
+    if kept and np.any((left := np.median(kept, axis=0)) < 1.0 - _LOSS):
+        return ('the vibration moves against them: they give '
+                f'{np.nanmin(left):.3f} of the amplitude that corrected pulses give, at least '
+                f'{1.0 - _LOSS:g} is asked')
+    return ''
 
 
 def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,

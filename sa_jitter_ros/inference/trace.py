@@ -432,7 +432,7 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
     level = lines.of(corrected[list(fit)].mean(axis=0))
     return with_fewer_cycles(Bench(
         observation, lines, level, [row for _, rows in known for row in rows], clock, group,
-        line_evidence(observation, lines), fit, held_out, tuple(declared)))
+        line_evidence(observation, lines), fit, held_out, tuple(declared))).with_moving_source(())
 
 
 def parted(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
