@@ -156,6 +156,9 @@ def test_effect_on_the_mean_is_traced(name, values, parameter):
     content = report(found)
     assert content['verdict'] == 'traced'
     assert [item['name'] for item in content['missing_effects']] == [name]
+    assert content['probabilities'].keys() == EFFECTS.keys()
+    assert content['probabilities'][name] > 0.9
+    assert all(0.0 <= item <= 1.0 for item in content['probabilities'].values())
     fitted = content['missing_effects'][0]['parameters'][parameter]
     assert abs(fitted['value'] - values[parameter]) < 4.0 * fitted['standard_error']
     before, after = content['error_before']['rms'], content['error_after']['rms']

@@ -156,10 +156,10 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     Observe the acquisitions of a recording.
 
     `sources` are the declared orders, then others that leak into them; without it these are
-    searched for. A reference keyphasor is not used if it is worse than the keyphasor, the vibration
-    wanders against it, or the speed ripples between its pulses, so much that the average with it
-    loses amplitude. Raises RecordingError if there is no whole acquisition, ModelError if the
-    declared model does not fit the recording.
+    searched for. A reference keyphasor is not used if it is worse than the keyphasor, or if the
+    vibration wanders against it, or the speed ripples between its pulses, so much that the average
+    with it loses amplitude. Raises RecordingError if there is no whole acquisition, ModelError if
+    the declared model does not fit the recording.
     """
     if recording.samples * recording.channels > _MOST_SAMPLES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '

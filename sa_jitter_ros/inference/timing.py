@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
-from sa_jitter_ros.effects.effect import departs, Finding, parameter_ranges
+from sa_jitter_ros.effects.effect import (
+    beyond_chance, departs, Finding, parameter_ranges)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
@@ -370,7 +371,8 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
         return None
     power, error = _mean(parts)
     noise = passed * float(np.mean([item.bend_std**2 for item in data.stretches]))
-    chance = float(special.ndtr(-power / (noise * math.sqrt(2.0 / count) + 1e-300)))
+    certainty = power / (noise * math.sqrt(2.0 / count) + 1e-300)
+    chance = float(special.ndtr(-certainty))
     if power <= 0.0 or chance > _CHANCE:
         return None
     size, size_error = root(power, error)
@@ -387,7 +389,8 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     return Finding(
         _SPEED, effect, errors, chance,
         'the speed changes within a trigger cycle: the angle between the pulses errs by '
-        f'u (1 - u) times {size:.3g} s')
+        f'u (1 - u) times {size:.3g} s',
+        gain=beyond_chance(0.5 * certainty**2, len(errors), data.cycles))
 
 
 def _mean(values: Sequence[float] | Array) -> tuple[float, float]:
