@@ -346,7 +346,13 @@ def outcome(report: Mapping[str, Any], name: str, parameters: Mapping[str, Any])
     """Return what became of an effect, as a letter and a number."""
     found = {item['name']: item for item in report['missing_effects']}
     text = ''
-    if name in found:
+    changes = {item['parameter']: item for item in report['declared_changes']
+               if item['name'] == name and name not in found}
+    if changes:  # of what the machine has and was declared, to which the effect adds its power
+        std = changes['std']
+        off = abs(std['value'] - np.hypot(std['declared'], parameters['std']))
+        text = f'F{off / std["standard_error"]:.1f}'
+    elif name in found:
         rest = [abs(item['value'] - parameters[key]) / item['standard_error']
                 for key, item in found[name]['parameters'].items()
                 if isinstance(parameters.get(key), float) and key not in _UNSURE

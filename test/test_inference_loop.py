@@ -32,7 +32,7 @@ from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.report.html_report import report_files
 from sa_jitter_ros.report.report import report, summary
-from sa_jitter_ros.report.words import next_steps
+from sa_jitter_ros.report.words import findings, next_steps, verdict_sentence
 from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
@@ -271,6 +271,9 @@ def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, param
     assert content['verdict'] == 'traced'
     changed, = [item for item in content['declared_changes'] if item['parameter'] == parameter]
     assert (changed['name'], changed['declared']) == (name, wrong)
+    assert f'lacks the right numbers of {name}' in verdict_sentence(content)
+    assert f'{name}: {parameter} = ' in summary(content)
+    assert any(text.startswith(f'{parameter} = ') for _, text in findings(content))
     assert abs(changed['value'] - true[parameter]) < 4.0 * changed['standard_error']
 
 

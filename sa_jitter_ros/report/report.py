@@ -110,6 +110,8 @@ def summary(content: Mapping[str, Json]) -> str:
         if effect['indistinguishable_from']:
             text.append(f'  these data do not distinguish it from: '
                         f'{", ".join(effect["indistinguishable_from"])}')
+    for item in other_numbers(content):
+        text.append(f'{item["name"]}: {change_text(item, content["unit"])}')
     if content['lines']:
         text.append(f'held-out error (RMS of observed minus predicted attenuation): '
                     f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
@@ -121,6 +123,19 @@ def summary(content: Mapping[str, Json]) -> str:
         text.append('unexplained scatter of the amplitudes (unsteadiness): '
                     f'{content["unsteadiness"]:.2%}; chi2 and p value take it into account')
     return '\n'.join(text)
+
+
+def other_numbers(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
+    """Return the changes of declared effects, which are no missing ones."""
+    declared = content['declared']['effects']
+    return [item for item in content['declared_changes'] if item['name'] in declared]
+
+
+def change_text(item: Mapping[str, Json], unit: str) -> str:
+    """Return a number of a declared effect as it is and as it was declared."""
+    unit = parameter_unit(item['name'], item['parameter'], item['unit'], unit)
+    return (f'{item["parameter"]} = {measured_text(item["value"], item["standard_error"], unit)}, '
+            f'declared as {measured_text(item["declared"], None, unit)}')
 
 
 def _not_compared(trace: Trace) -> Sequence[str]:

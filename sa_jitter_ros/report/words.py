@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.number_text import order_text, p_text, percent_text
-from sa_jitter_ros.report.report import parameters_text
+from sa_jitter_ros.report.report import change_text, other_numbers, parameters_text
 
 Json = Any
 
@@ -53,7 +53,9 @@ def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
 
 def verdict_sentence(content: Mapping[str, Json]) -> str:
     """Return the verdict of a report in one sentence."""
-    names = _listed([item['name'] for item in content['missing_effects']], 'and')
+    others = dict.fromkeys(item['name'] for item in other_numbers(content))
+    names = _listed([*(item['name'] for item in content['missing_effects']),
+                     *(f'the right numbers of {name}' for name in others)], 'and')
     if not content['lines']:
         found = f'The pulse times alone show {names}; nothing else' if names else (
             'Nothing was found, and nothing')
@@ -103,6 +105,9 @@ def findings(content: Mapping[str, Json]) -> Iterator[tuple[str, str]]:
             others = _listed(item['indistinguishable_from'], 'or')
             text += f' It may also be {others}: these data do not tell them apart.'
         yield _sentence((kind.meaning or kind.summary) if kind else item['name']), text
+    for item in other_numbers(content):
+        yield (f'{item["name"]} is not as it was declared.',
+               f'{change_text(item, content["unit"])}.')
 
 
 def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
