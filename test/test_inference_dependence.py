@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sa_jitter_ros.inference.dependence import dependences, moving, still_moving
+from sa_jitter_ros.inference.dependence import dependences, moving
 from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.fewer_cycles import fewer_cycles
 from sa_jitter_ros.inference.observation import observe
@@ -164,15 +164,6 @@ def test_jitter_that_changes_its_size_says_so(pickup):
     reasons = {item.name: item.rejected_because for item in pickup.candidates}
     assert 'times larger in some parts of the recording' in reasons['excess_jitter']
     assert 'times larger in some parts of the recording' in report(pickup)['remains']
-
-
-def test_still_moving_is_what_an_effect_leaves_nearly_all_of(pickup):
-    before = [replace(item, change=0.05, p_value=1e-5) for item in pickup.dependences_before]
-    assert still_moving(before, [replace(item, change=0.03) for item in before]) is None
-    remaining = still_moving(before, [replace(item, change=-0.045) for item in before])
-    assert remaining is not None
-    assert remaining.change == -0.045
-    assert still_moving(before, [replace(item, p_value=0.01) for item in before]) is None
 
 
 def test_report_says_what_the_residual_changes_with(pickup):

@@ -33,7 +33,6 @@ Array = NDArray[Any]
 
 #: A change of the residual with a smaller p value is significant; up to four are tested.
 CERTAIN = 1e-3
-_NEARLY_ALL = 0.8
 _FREEDOM = 3
 # Error of the difference of predictions for the same lines at the same speed.
 _ALIKE = 1e-3
@@ -68,12 +67,6 @@ def moving(found: Sequence[Dependence]) -> Dependence | None:
     """Return the most significant change, None if none is significant."""
     certain = [item for item in found if item.p_value < CERTAIN]
     return min(certain, key=lambda item: item.p_value) if certain else None
-
-
-def still_moving(before: Sequence[Dependence], after: Sequence[Dependence]) -> Dependence | None:
-    """Return the most significant change of which nearly all remains, None if there is none."""
-    old = {item.on: abs(item.change) for item in before}
-    return moving([item for item in after if abs(item.change) > _NEARLY_ALL * old[item.on]])
 
 
 def dependences(bench: Bench, effects: Sequence[Effect], findings: Sequence[Finding]

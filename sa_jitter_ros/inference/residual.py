@@ -78,11 +78,6 @@ class Residual:
     z: Array
 
     @property
-    def p_attenuation(self) -> float:
-        """Return the p value of mean and scatter of the attenuation together."""
-        return _one_of_three(self.p_mean, self.p_scatter)
-
-    @property
     def p_amplitude(self) -> float:
         """Return the p value of the scatter of the amplitude, as one of three tests."""
         return _one_of_three(self.p_amplitude_scatter)
