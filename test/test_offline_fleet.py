@@ -168,6 +168,17 @@ def test_cluster_that_does_not_answer_is_one_line(monkeypatch):
             with pytest.raises(ParameterError, match='no answer of a Dask scheduler') as error:
                 list(run_jobs(work, ['a'], scheduler=address))
             assert '\n' not in str(error.value)
+    assert 'IO loop' not in {thread.name for thread in threading.enumerate()}  # of a client
+
+
+def test_cluster_without_a_worker_is_one_line(monkeypatch):
+    distributed = pytest.importorskip(
+        'distributed', reason="Dask is not installed: pip install '.[fleet]'")
+    monkeypatch.setattr('sa_jitter_ros.offline.cluster.ANSWER', 1.0)
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None, host='127.0.0.1') as empty:
+        address = empty.scheduler_address
+        with pytest.raises(ParameterError, match=f'no worker: start some, dask worker {address}'):
+            list(run_jobs(work, ['a'], scheduler=address))
 
 
 def test_loops_of_a_folder_have_a_report_and_a_row_each(tmp_path, capfd):

@@ -10,6 +10,7 @@
 
 """A function of many jobs on the workers of an existing Dask cluster."""
 
+import asyncio
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 import logging
@@ -65,18 +66,35 @@ def run_on_cluster(function: Callable[[Job], Result], jobs: Sequence[Job], addre
 
 
 def _connected(connect: Callable[..., Any], address: str) -> Any:
-    """Return a client of the cluster; raises ParameterError unless it answers and has a worker."""
+    """
+    Return a client of the cluster; raises ParameterError unless it answers and has a worker.
+
+    A client that cannot connect closes itself when it is collected as garbage. If that happens
+    while another client starts, both wait for one lock, for ever: a client of an event loop, which
+    is closed in any case, tries the address first.
+    """
     try:
-        client = connect(address, timeout=ANSWER)
+        asyncio.run(_try(connect, address))
+        return connect(address, timeout=ANSWER)
+    except ParameterError:
+        raise
     except Exception as error:  # of a wrong address, or of what answers there, of any type
         reason = ' '.join(str(error).split())
         raise ParameterError(f'--scheduler {address}: no answer of a Dask scheduler within '
                              f'{ANSWER:g} s: check host and port, and that dask scheduler runs '
                              f'({reason:.200})') from None
+
+
+async def _try(connect: Callable[..., Any], address: str) -> None:
+    """Connect and wait for a worker; raises ParameterError without one."""
+    client = connect(address, timeout=ANSWER, asynchronous=True, set_as_default=False)
     try:
-        client.wait_for_workers(1, timeout=ANSWER)
+        await client
+        await client.wait_for_workers(1, timeout=ANSWER)
     except TimeoutError:
-        client.close(timeout=ANSWER)
+        if client.status != 'running':
+            raise
         raise ParameterError(f'--scheduler {address}: the cluster has no worker: start some, '
                              f'dask worker {address}') from None
-    return client
+    finally:
+        await client.close(timeout=ANSWER)
