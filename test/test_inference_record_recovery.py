@@ -51,6 +51,13 @@ def test_orders_of_other_shafts_are_found_and_tones_are_not(rng):
                                atol=3.0 * 0.04 / np.sqrt(5.0) / (CYCLES * 2.4))
 
 
+def test_what_an_average_does_not_resolve_from_a_line_is_no_source(rng):
+    """An average resolves 0.02 orders; taken for a source, the line would grow beyond bounds."""
+    orders = {8.0: 1.0, 7.988: 0.05, 8.012: 0.05, 8.37: 0.2}
+    found = sources(rng, 2.4, orders, drift=0.02)
+    np.testing.assert_allclose(found, [8.37], atol=1e-3)
+
+
 @pytest.mark.parametrize(('other', 'count'), [(9.0, 1), (9.0 + 1.0 / 3.0, 1), (9.04, 0)])
 def test_a_steady_machine_tells_only_orders_that_its_shafts_have(rng, other, count):
     found = sources(rng, 3.0, {8.0: 1.0, other: 0.2}, drift=0.0)

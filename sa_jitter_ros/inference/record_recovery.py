@@ -280,7 +280,8 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     Return the undeclared orders that leak into the declared ones, strongest first.
 
     These are orders that a shaft must have, and those that certainly turn with the shaft.
-    Sidebands that change all lines in phase are a modulation of the amplitudes, no lines.
+    Sidebands that change all lines in phase are a modulation of the amplitudes, no lines; nor are
+    those that an average does not resolve from a line: they change it from average to average.
     """
     if not recovery.fits:
         return []
@@ -292,8 +293,9 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     # a trigger cycle that missing pulses make longer reads these as the declared ones
     longer = 1 + np.unique(recovery.missing[recovery.missing > 0])
     read = np.divide.outer(np.array(model.orders), longer)
-    near = np.abs(fit.orders[:, None] - read.ravel()).min(axis=1, initial=np.inf) < _ON_LINE / (
-        model.trigger_cycles * model.cycle_length)
+    resolved = 1.0 / (model.trigger_cycles * model.cycle_length)
+    near = np.abs(fit.orders[:, None] - read.ravel()).min(axis=1, initial=np.inf) < (
+        _ON_LINE * resolved)
     found: list[float] = []
     for i in np.lexsort((-share, ~near)).tolist():
         if i < declared or share[i] < _STRONG or len(found) == _MOST:
@@ -301,7 +303,7 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact
         wanted = order == round(order) or not kept_out[i]
-        if wanted and order not in (*model.orders, *found):
+        if wanted and np.abs(np.subtract((*model.orders, *found), order)).min() > resolved:
             found.append(order)
     return found
 
