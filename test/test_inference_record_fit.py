@@ -113,3 +113,22 @@ def test_sidebands_turn_with_those_of_their_spacing(rng):
     states.orders = np.array([8.0, 16.0, 24.0, 8.37, 15.63, 0.3701, 24.6, 11.2])
     turning = np.array([True] * 4 + [False] * 4)
     assert states._families(turning).tolist() == [True] * 6 + [False] * 2
+
+
+def test_sidebands_that_do_not_change_are_no_bend_of_all_cycles(rng):
+    """A bend that all cycles share would take the place of sidebands that are not looked for."""
+    speed, rate, count = 9.0, 2300.0, 150
+    lines = {25: 0.27, 26: 0.8, 27: 0.22, 28: 0.08, 50: 0.1, 51: 0.35, 52: 4.3, 53: 1.2, 54: 0.33,
+             77: 0.07, 78: 0.33, 79: 0.1}
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(lines))
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    turns = speed * time + 0.05 * np.sin(2.0 * np.pi * 0.3 * time)
+    vibration = sum(size * np.cos(2.0 * np.pi * order * turns + phase)
+                    for (order, size), phase in zip(lines.items(), phases))
+    times = np.interp(np.arange(count) + 0.5, turns, time) + rng.normal(0.0, 5e-5, count)
+    declared = [25, 27, 52, 53, 78]
+    found = fit_record((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+                       times, measured=np.ones(count, bool), cycle_length=1.0, orders=declared,
+                       jitter_std=5e-5, known=(np.zeros(0), np.zeros(0)))
+    wrong = np.abs(found.amplitudes[0, :5]) - [lines[order] for order in declared]
+    assert np.all(np.abs(wrong) < 4.0 * found.amplitude_errors[0, :5])

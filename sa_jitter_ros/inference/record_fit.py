@@ -374,11 +374,21 @@ class _States:
             most = _STEP / (self.orders[:self.declared].max() * self.frequency)
             part = min(1.0, most / max(size, 1e-300))
             self.states = self.states + part * change
+            self._take_out_mean_bend()
             self.amplitudes = self.amplitudes + part * amplitudes
             if weak == 1.0:
                 self._estimate_sizes()
             self._read()
         return size
+
+    def _take_out_mean_bend(self) -> None:
+        """
+        Leave no bend that all cycles share.
+
+        It would make sidebands that do not change: no vibration tells it from lines beside lines.
+        """
+        bends = self.states[:-1, 1:-1]
+        bends -= bends[self.whole].mean(axis=0)
 
     def _solve(self, residual: Array, derivative: tuple[Array, Array], weak: float
                ) -> tuple[Array, ComplexArray]:
