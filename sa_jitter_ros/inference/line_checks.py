@@ -39,7 +39,7 @@ _STEADY = 1e-4  # relative spread of the speed
 
 def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     """Return the checks of the amplitudes of all acquisitions of a recording that has lines."""
-    if not lines.count or len(observation.acquisitions) < 3 or not observation.recoveries:
+    if not lines.count or len(observation.acquisitions) < 4 or not observation.recoveries:
         return ()
     orders = observation.orders.size
     amplitude = lines.of(observation.stacked('corrected')[..., :orders])
@@ -58,12 +58,23 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
         turned = turned * np.exp(-1j * np.outer(late, order))
     mean = turned.mean(axis=0)
     ratio, noise = turned / mean, noise / np.abs(mean)
+    # the angle of a speed that rises bends, which makes orders leak into those beside them
+    rises = _accelerations(observation)
+    ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
+        float(rises @ rises), np.finfo(np.float64).tiny)
     return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise))
 
 
 def _periods(observation: Observation) -> Array:
     """Return the mean trigger period (acquisition,) in s."""
     return np.array([mean_period(item.times, item.missing) for item in observation.acquisitions])
+
+
+def _accelerations(observation: Observation) -> Array:
+    """Return how each acquisition's trigger period grows (acquisition,), less their mean."""
+    grows = np.array([np.polyfit(np.arange(item.bridged.size), item.bridged, 2)[0]
+                      for item in observation.acquisitions])
+    return np.asarray(grows - grows.mean())
 
 
 def _late(observation: Observation) -> Array:
@@ -79,10 +90,10 @@ def _late(observation: Observation) -> Array:
 
 def _turns(ratio: Array, noise: Array, order: Array) -> Check:
     """Test whether a line turns by itself."""
-    count = len(ratio)
-    power = np.mean(ratio.imag**2, axis=0)
+    freedom = len(ratio) - 2  # of mean and acceleration
+    power = np.sum(ratio.imag**2, axis=0) / freedom
     own = np.sqrt(np.maximum(power - noise**2, 0.0))
-    chance = special.chdtrc(count - 1, count * power / (noise**2 + _TURN**2))
+    chance = special.chdtrc(freedom, freedom * power / (noise**2 + _TURN**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
@@ -104,7 +115,7 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
     worst = int(np.argmax(explained / noise**2))
     if not explained[worst] > _TURN**2:
         return ()
-    freedom = count - 3
+    freedom = count - 4  # of the parabola and the acceleration
     ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
     return (Check(float(special.fdtrc(2, freedom, ratio)) * size.shape[1], LINES,
                   math.sqrt(float(explained[worst])),

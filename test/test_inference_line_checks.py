@@ -1,0 +1,45 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Whether all lines move together: what a changing speed does to them, and what a path does."""
+
+import numpy as np
+import pytest
+from sa_jitter_ros.inference.gathering import choose_lines
+from sa_jitter_ros.inference.line_checks import check_lines
+from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.prediction.model import DeclaredModel
+from sa_jitter_ros.recordings.recording import ArraySource, Recording
+
+RATE, SPEED, CYCLES, ACQUISITIONS = 5000.0, 16.0, 8, 80
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.15])
+def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn):
+    """A speed that changes by 2 % bends the angle, so that order 58 leaks into order 59."""
+    time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
+    load = np.sin(2.0 * np.pi * 0.27 * time)
+    slow = -np.cos(2.0 * np.pi * 0.27 * time) / (2.0 * np.pi * 0.27)
+    turns = SPEED * (time + 0.02 * slow)
+    vibration = sum(size * np.cos(2.0 * np.pi * order * turns + phase) for order, size, phase in (
+        (28, 0.5, 1.0), (58, 7.0, 2.0)))
+    vibration += 0.4 * np.cos(2.0 * np.pi * 59.0 * turns + turn * load)
+    vibration += rng.standard_normal(time.size)
+    pulses = np.interp(np.arange(0.5, turns[-1]), turns, time)
+    pulses += rng.uniform(-0.5, 0.5, pulses.size) / 20000.0
+    model = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                          orders=(28.0, 58.0, 59.0), sample_rate=RATE)
+    observation = observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model)
+    turned = check_lines(observation, choose_lines(observation))[0]
+    if turn:
+        assert turned.p_value < 1e-6
+        assert turned.size == pytest.approx(turn / np.sqrt(2.0), rel=0.3)
+    else:
+        assert turned.p_value > 0.01
