@@ -56,7 +56,7 @@ def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noi
     seen = errors + rng.normal(0.0, NOISE, errors.shape)
     radial = np.zeros((count, pulses - 1, 4)) if radial is None else radial
     lines = LineEvidence(
-        order=np.full(4, 8.0), channel=np.arange(4), level=np.ones(4),
+        order=8.0 + np.arange(4), channel=np.zeros(4, int), level=np.ones(4),
         noise_density=np.zeros((count, 4)) if noise_density is None else noise_density,
         radial=radial, radial_noise=np.full(4, 0.01))
     return Evidence(
@@ -219,11 +219,12 @@ def test_a_found_modulation_predicts_the_scatter_of_the_averages(rng, band):
         assert 0.0 < error < 0.1
 
 
-@pytest.mark.parametrize(('noise', 'acquisitions', 'cycles'), [
-    (np.full(12, 0.02), 12, 20), (np.array([0.01, 0.05, 0.05, 0.05]), 2, 20),
-    (np.array([0.01, 0.02]), 3, 6)])
-@pytest.mark.parametrize('unsteady', [0.0, 0.1])
-def test_lines_that_change_each_by_itself_have_no_common_gain(
+@pytest.mark.parametrize(('noise', 'acquisitions', 'cycles', 'unsteady'), [
+    *((*case, unsteady) for unsteady in (0.0, 0.1) for case in (
+        (np.full(12, 0.02), 12, 20), (np.array([0.01, 0.05, 0.05, 0.05]), 2, 20),
+        (np.array([0.01, 0.02]), 3, 6))),
+    (np.array([0.02]), 12, 20, 0.0)])
+def test_orders_that_change_each_by_itself_have_no_common_gain(
         rng, noise, acquisitions, cycles, unsteady):
     """What chance gains in likelihood is about what the penalty takes it for, or less."""
     draws = 300
@@ -234,6 +235,25 @@ def test_lines_that_change_each_by_itself_have_no_common_gain(
     gains = [beyond_chance(item.likelihood, item.bands, acquisitions * cycles) for item in found]
     assert np.mean(gains) < 0.0
     assert np.mean(np.array(gains) > ODDS) < 0.01
+
+
+@pytest.mark.parametrize('std', [0.0, 0.05])
+def test_noise_that_reaches_all_channels_is_no_modulation(rng, std):
+    """Four channels of one order tell as much as one; an order alone, what is slow."""
+    found = []
+    for _ in range(100):
+        gain = std * stationary(rng, flat_band_correlation(LAGS, (0.0, 0.1)) + 1e-9 * (
+            LAGS == 0), 12)[:, :-1, None]
+        noise = rng.normal(0.0, 0.03, (12, PULSES - 1, 1)) + rng.normal(
+            0.0, 0.01, (12, PULSES - 1, 4))
+        evidence = evidence_of(rng, declared(rng)[:12], radial=gain + noise)
+        found.append(EFFECTS['amplitude_modulation'].fit(replace(evidence, lines=replace(
+            evidence.lines, order=np.full(4, 8.0), channel=np.arange(4)))))
+    if std:
+        off = [(item.effect.std - std) / item.standard_errors['std'] for item in found]
+        assert abs(np.median(off)) < 1.0
+    else:
+        assert sum(item.effect is not None for item in found) == 0
 
 
 def test_few_acquisitions_tell_no_noise_that_is_declared(rng):

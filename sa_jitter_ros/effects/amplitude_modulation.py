@@ -94,24 +94,30 @@ class AmplitudeModulation(DirectEffect):
 
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
-        """Return the modulation that the amplitudes of the lines together allow."""
-        radial = evidence.lines.radial
-        if radial.shape[2] < 2:
+        """Return the modulation that the amplitudes of the orders together allow."""
+        radial, noise = evidence.lines.of_orders
+        if not noise.size:
             return None
-        weight = 1.0 / np.maximum(evidence.lines.radial_noise, 1e-9) ** 2
+        if noise.size == 1:  # all that it scatters may be a modulation
+            power = largest_power(float(np.mean(radial**2)), radial.size, 0.0, 0.0,
+                                  memory(SLOW_BAND))
+            return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
+        weight = 1.0 / noise**2
         pairs = weight.sum() ** 2 - np.sum(weight**2)
-        product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of different lines
+        product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of different orders
         power = largest_power(float(product.mean()), product.size, 1.0 / weight.sum(),
                               1.0 / pairs, memory(SLOW_BAND))
         return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
-        """Fit what is common to the amplitudes of all lines, cycle by cycle."""
-        radial = evidence.lines.radial
-        if radial.shape[2] < 2:
-            return absent(cls.name, 'one line alone cannot distinguish modulation from noise')
-        found = fit_common_gain(radial, evidence.lines.radial_noise)
+        """Fit what is common to the amplitudes of all orders, cycle by cycle."""
+        radial, noise = evidence.lines.of_orders
+        if not noise.size:
+            return absent(cls.name, 'no line is compared')
+        found = fit_common_gain(radial, noise)
+        if found.slow + found.fast == 0.0:
+            return absent(cls.name, 'the one order that is compared scatters as noise does')
         bandwidth, bandwidth_error = _bandwidth_of(found, radial.shape[1])
         within = _variance_of_mean(1, slow_band(bandwidth))
         std, std_error = root((found.slow + found.fast) / within,

@@ -9,10 +9,11 @@
 # the License.
 
 """
-The likelihood of a gain that all lines share, from the amplitudes of single trigger cycles.
+The likelihood of a gain that all orders share, from the amplitudes of single trigger cycles.
 
-The spectra of the lines are normal (Whittle). In each octave of frequency, and in the averages,
-each line changes by itself as much as it likes, and the common gain has a power of its own.
+The spectra of the orders are normal (Whittle). In each octave of frequency, and in the averages,
+each order changes by itself as much as it likes, and the common gain has a power of its own. One
+order alone changes by itself as noise does, by the power of the highest octave in all of them.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ _RANGE = 25.0  # of logarithms of a power
 @dataclass(frozen=True)
 class CommonGain:
     """
-    A gain that all lines share.
+    A gain that all orders share.
 
     `likelihood` is the gain in log likelihood by its power in so many `bands`; `slow` is the
     variance of its means over the cycles of an acquisition, `fast` that within acquisitions, and
@@ -48,12 +49,11 @@ class CommonGain:
 
 def fit_common_gain(radial: Array, noise: Array) -> CommonGain:
     """
-    Fit `radial` (acquisition, cycle, line), relative amplitudes less 1 of two lines or more.
+    Fit `radial` (acquisition, cycle, order), relative amplitudes less 1.
 
-    `noise` (line,) is about their standard deviation by noise.
+    `noise` (order,) is about their standard deviation by noise.
     """
     acquisitions, cycles, _ = radial.shape
-    noise = np.maximum(noise, 1e-9)
     waves = np.fft.rfft(radial / noise, axis=1) / np.sqrt(cycles)
     waves[:, 0] -= waves[:, 0].mean(axis=0)  # the levels are free
     power = np.einsum('afl,afm->flm', waves, waves.conj()).real
@@ -65,20 +65,38 @@ def fit_common_gain(radial: Array, noise: Array) -> CommonGain:
         power[-1] *= 0.5
     edges = [0, *(2**k for k in range(len(power).bit_length()) if 2**k < len(power))]
     counts, powers = (np.add.reduceat(item, edges, axis=0) for item in (count, power))
-    likelihood, size, error = np.array([
-        _shared(own / number, number, 1.0 / noise) for own, number in zip(powers, counts)]).T
+    if noise.size == 1:
+        likelihood, size, error = _above_noise(powers[:, 0, 0] * noise**2, counts)
+    else:
+        likelihood, size, error = np.array([
+            _shared(own / number, number, 1.0 / noise) for own, number in zip(powers, counts)]).T
     share = 2.0 * counts[1:] / (acquisitions * cycles)
     return CommonGain(
         float(likelihood.sum()), size.size, float(size[0] / cycles), float(error[0] / cycles),
         float(share @ size[1:]), float(np.sqrt(share**2 @ error[1:] ** 2)))
 
 
+def _above_noise(powers: Array, counts: Array) -> tuple[Array, Array, Array]:
+    """
+    Return the log likelihood that a gain of one order adds, its powers and their standard errors.
+
+    `powers` (octave,) are sums of `counts` ordinates; the highest octave shows the noise alone.
+    """
+    own = powers / counts
+    more = own > own[-1]
+    noise = np.sum(powers, where=~more) / np.sum(counts, where=~more)
+    size = np.where(more, own - noise, 0.0)
+    likelihood = counts * (np.log(powers.sum() / counts.sum()) - np.log(np.where(more, own, noise)))
+    error = np.hypot(own / np.sqrt(counts), noise / np.sqrt(np.sum(counts, where=~more)))
+    return likelihood, size, error
+
+
 def _shared(power: Array, count: float, gain: Array) -> tuple[float, float, float]:
     """
     Return the log likelihood that a common gain adds, its power and its standard error.
 
-    `power` (line, line) is the mean of `count` ordinates, `gain` (line,) what a unit of the common
-    gain makes of each line.
+    `power` (order, order) is the mean of `count` ordinates, `gain` (order,) what a unit of the
+    common gain makes of each order.
     """
     each = np.diag(power)
     alone = np.maximum(each, _LEAST)

@@ -90,6 +90,20 @@ class LineEvidence:
     tone: Tone | None = None
     beat: Beat = Beat()
 
+    @property
+    def of_orders(self) -> tuple[Array, Array]:
+        """
+        Return `radial` (acquisition, cycle, order) and its noise (order,), the channels together.
+
+        What is beside an order, be it a noise or the line of a bearing, reaches all channels: that
+        it changes them together tells no more than one of them does.
+        """
+        found, place = np.unique(self.order, return_inverse=True)
+        weight = (place[:, None] == np.arange(found.size)) / np.maximum(
+            self.radial_noise, 1e-9)[:, None] ** 2
+        information = weight.sum(axis=0)
+        return self.radial @ (weight / information), 1.0 / np.sqrt(information)
+
 
 @dataclass(frozen=True)
 class Evidence:
