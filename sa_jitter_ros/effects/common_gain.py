@@ -86,7 +86,7 @@ def _above_noise(powers: Array, counts: Array) -> tuple[Array, Array, Array]:
     more = own > own[-1]
     noise = np.sum(powers, where=~more) / np.sum(counts, where=~more)
     size = np.where(more, own - noise, 0.0)
-    likelihood = counts * (np.log(powers.sum() / counts.sum()) - np.log(np.where(more, own, noise)))
+    likelihood = counts * np.log(powers.sum() / counts.sum() / np.where(more, own, noise))
     error = np.hypot(own / np.sqrt(counts), noise / np.sqrt(np.sum(counts, where=~more)))
     return likelihood, size, error
 
