@@ -89,14 +89,14 @@ def machine(seed: int | Sequence[int], *, count: int = _COUNT, scale: float = 1.
     shape = np.hanning(17) / np.sqrt(np.sum(np.hanning(17) ** 2))
     source = wander * UNIT * recovered_source(flat(rng, count, band) if band else np.convolve(
         rng.standard_normal(count + 16), shape, 'valid'))
-    late = errors + source[0] + skew * (motion - motion[0])
-    late = late + delay * (PERIOD / np.gradient(motion) - 1.0)
+    late = errors + source[0] + skew * (motion - motion[0]) + delay
     wrong, bends = recovery_noise(rng, count)
     late = late + noise * UNIT * wrong
-    late -= late.mean()
+    # the vibration shows all but a turn, which takes longer where the speed is low
+    late -= late.mean() * np.gradient(motion) * (count - 1) / (motion[-1] - motion[0])
     bends = noise * UNIT * bends
     shaken = shake * UNIT * flat(rng, count, ACCELERATION_BAND) if shake else 0.0
-    setting = Setting(MODEL, UNIT, index, times, times - late)
+    setting = Setting(MODEL, UNIT, index, times, times - late, times[0], times)
     return Stretch(setting, np.ones(count, np.bool_), late, noise * UNIT, np.inf,
                    (bends + shaken + source[1] + np.gradient(np.gradient(motion)) / 2.0)[:-1],
                    noise * UNIT * bend_noise(), np.inf)
@@ -150,7 +150,8 @@ def lines(seed: int | Sequence[int], *, std: float = 0.0, gain: float = 0.0, los
     modulation = gain * fine.reshape(_ACQUISITIONS, _CYCLES, 1, 4).mean(axis=-1)
     none = np.zeros(0)
     evidence = LineEvidence(
-        none, none, none, density, modulation + rng.standard_normal(shape), np.ones(_LINES))
+        np.arange(float(_LINES)), none, none, density,
+        modulation + rng.standard_normal(shape), np.ones(_LINES))
     return Evidence(
         replace(MODEL, noise_std=1.0, sample_rate=20e3), (Pulses(none),), none, none, none,
         np.nan, False, none,

@@ -263,6 +263,21 @@ def test_skew_is_a_delay_that_grows(rng):
     assert gain == pytest.approx(np.abs(np.sinc(frequency * 2e-4 * 0.8)), abs=1e-6)
 
 
+def test_delay_that_a_skew_has_made_turns_an_average_as_the_speed_changes():
+    """The true times are those at which the angle is whole; the measured ones are skewed."""
+    skew, first, count = 2e-4, 1000, MODEL.trigger_cycles + 1
+    index = np.arange(first + count)
+    times = index / 25.0 - 2e-4 * np.maximum(index - first, 0.0) ** 2 / 25.0  # the speed rises
+    late = skew * times[first:]
+    speed = 25.0 / (1.0 - 4e-4 * (index[first:] - first))
+    angle = late * speed / speed.mean()  # in s at the mean speed
+    found = make_effect('clock_skew', skew=skew).pattern(
+        MODEL, Pulses(times[first:] + late, first=first))
+    assert np.std(late * (speed / speed.mean() - 1.0)) > 0.3 * np.std(late)
+    np.testing.assert_allclose(found - found.mean(), angle - angle.mean(),
+                               atol=0.02 * np.std(angle))
+
+
 def test_marks_are_counted_from_the_one_that_a_recording_begins_with(rng):
     model = replace(MODEL, pulses_per_revolution=3, pulses_per_trigger=2)
     target = make_effect('target_geometry', pulse_angles=(0.01, -0.002, -0.008))

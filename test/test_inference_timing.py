@@ -331,6 +331,26 @@ def test_skew_beside_the_ticks_of_a_clock_is_found_with_its_error():
     assert np.max(np.abs(off)) < 3.0
 
 
+def test_skew_of_a_machine_whose_speed_changes_is_no_wander():
+    """
+    The delay that has grown turns the vibration as the speed changes.
+
+    What turn all pulses have in common is that of the whole recording, not of its parts.
+    """
+    for seed in range(3):
+        whole = machine(820 + seed, count=1500, skew=2e-4, swing=0.02)
+        parts = [replace(whole, measured=whole.measured[here], errors=whole.errors[here],
+                         bends=whole.bends[here][:-1], setting=replace(
+                             whole.setting, index=whole.setting.index[here],
+                             times=whole.setting.times[here],
+                             true_times=whole.setting.true_times[here]))
+                 for here in (slice(0, 500), slice(1000, 1500))]
+        timing = read_timing(parts)
+        assert names_of(timing) == {'clock_skew'}
+        value, error = value_of(timing, 'clock_skew', 'skew')
+        assert abs(value - 2e-4) < 3.0 * error
+
+
 @pytest.mark.parametrize('beside', [0.0, 3.0])
 def test_speed_fluctuation_is_told_from_sidebands_by_its_frequency(beside):
     """The shaft bends the angle slowly; sidebands of half an order bend it to and fro."""

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.timing import Pattern, relative_speed, Setting
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.effects.timing import Pattern, Setting
+from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -28,12 +28,11 @@ def _growing(setting: Setting) -> Array:
     """
     Return the delay in trigger periods of pulses whose clock began with that of the vibration.
 
-    The delay in the middle of the stretch is one of all pulses: it shows as the speed changes.
+    The turn that is common to all pulses takes longer where the speed is low.
     """
-    period = setting.model.trigger_period
-    elapsed = setting.times - setting.times[0] + period * float(setting.index[0])
-    middle = float(elapsed.mean())
-    return np.asarray(elapsed - middle + middle * (relative_speed(setting) - 1.0))[None] / period
+    common = np.mean(setting.fitted - setting.begin) / np.mean(np.diff(setting.fitted))
+    delay = setting.times - setting.begin - common * trigger_periods(setting.times)
+    return np.asarray(delay)[None] / setting.model.trigger_period
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,15 @@ class ClockSkew(Effect):
                 * np.arange(model.trigger_cycles + 1.0))[None, :]
 
     def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
-        """Return the delay that grows through the average at hand."""
-        return np.asarray(self.skew * (pulses.times - pulses.times[0]))
+        """
+        Return the delay that grows through the average at hand, beyond the turn of all pulses.
+
+        What has grown before counts, too, as far as the speed changes (see `PathDelay.pattern`).
+        """
+        begin = int(np.argmax(np.isfinite(pulses.times)))
+        before = model.trigger_period * pulses.index[begin]
+        delay = self.skew * (before + pulses.times - pulses.times[begin])
+        return np.asarray(delay * pulses.relative_speed - delay[begin])
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting

@@ -23,8 +23,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
-from sa_jitter_ros.effects.timing import Pattern, relative_speed, Setting
-from sa_jitter_ros.prediction.influence import mean_period, Pulses
+from sa_jitter_ros.effects.timing import Pattern, Setting
+from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -33,9 +33,10 @@ _STEADY = 1e-4  # relative spread of the speed: below it a delay is a phase
 
 
 def _of_speed(setting: Setting) -> Array:
-    """Return what a delay adds at the speed of each pulse to the turn of all; none if steady."""
-    speed = relative_speed(setting)
-    return np.asarray(speed - 1.0)[None] if np.std(speed) > _STEADY else np.zeros((0, speed.size))
+    """Return a delay less the turn of all, which takes longer when slow; none if steady."""
+    period = trigger_periods(setting.true_times)
+    longer = period / period.mean() - 1.0
+    return np.asarray(-longer)[None] if np.std(longer) > _STEADY else np.zeros((0, period.size))
 
 
 @dataclass(frozen=True)
@@ -82,11 +83,6 @@ class PathDelay(Effect):
         Angle errors count in s at the mean speed f of the average: a pulse at the speed f_k is
         late by delay f_k of a revolution, delay (f_k / f - 1) beyond the turn of all.
         """
-        measured = np.isfinite(pulses.times)
-        if self.delay == 0.0 or np.count_nonzero(measured) < 3:
+        if self.delay == 0.0 or not np.any(np.isfinite(pulses.times)):
             return None
-        times, index = pulses.times[measured], pulses.index[measured]
-        ends = slice(int(np.argmax(measured)), len(measured) - int(np.argmax(measured[::-1])))
-        lost = None if pulses.missing is None else pulses.missing[ends.start:ends.stop - 1]
-        speed = np.gradient(index, times) * mean_period(pulses.times[ends], lost)
-        return np.asarray(self.delay * (np.interp(pulses.index, index, speed) - 1.0))
+        return np.asarray(self.delay * (pulses.relative_speed - 1.0))

@@ -24,12 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.prediction.model import DeclaredModel
-from scipy.ndimage import gaussian_filter1d
 
 Array = NDArray[Any]
 
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
-_SMOOTH = 6.0  # trigger cycles over which a speed is taken
 
 
 @dataclass(frozen=True)
@@ -37,8 +35,10 @@ class Setting:
     """
     The pulses of one unbroken stretch that patterns refer to.
 
-    `index` (pulse,) counts trigger pulses from the first of the recording; `times` (pulse,) in s
-    are the measured ones and `true_times` those less their recovered errors; `clock_errors`
+    `index` (pulse,) counts trigger pulses from the first of the recording, which came at `begin`
+    (s); `times` (pulse,) in s are the measured ones and `true_times` those less their recovered
+    errors, of which the vibration shows all but a turn that is common to `fitted`, the times of
+    pulses of which these may be a part; `clock_errors`
     (pulse,) in s are what the grid of a clock makes of a smooth motion, None without a clock of
     `clock_rate` Hz.
     """
@@ -48,6 +48,8 @@ class Setting:
     index: Array
     times: Array
     true_times: Array
+    begin: float
+    fitted: Array
     clock_errors: Array | None = None
     clock_rate: float = 0.0
 
@@ -88,12 +90,6 @@ class Pattern:
     replaces_jitter: bool = False
     show_in_times: bool = True
     usual: Callable[[Setting], float] | None = None
-
-
-def relative_speed(setting: Setting) -> Array:
-    """Return the speed at each pulse over its mean, smoothed over some trigger cycles."""
-    speed = gaussian_filter1d(1.0 / np.gradient(setting.true_times), _SMOOTH, mode='nearest')
-    return np.asarray(speed / speed.mean())
 
 
 def white(parameters: Array, frequency: Array) -> Array:

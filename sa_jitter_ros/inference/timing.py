@@ -91,7 +91,7 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
                 continue
-            found.append(replace(_stretch(observation, number, here, clock, unit),
+            found.append(replace(_stretch(observation, number, part, here, clock, unit),
                                  sidebands=_sidebands(fit, model),
                                  held=fit.held or observation.against_reference))
     return found
@@ -111,8 +111,10 @@ def _of_average(observation: Observation, item: Acquisition, unit: float, grid: 
                 rate: float) -> Stretch:
     """Return the pulses of one average, without what happens inside its cycles."""
     count = item.times.size
-    setting = Setting(observation.model, unit, item.first + np.arange(count), item.times,
+    model = observation.model
+    setting = Setting(model, unit, item.first + np.arange(count), item.times,
                       item.times - item.errors,
+                      item.times[0] - item.first * model.trigger_period, item.times,
                       None if grid is None else grid[item.first:item.first + count], rate)
     return Stretch(setting, np.ones(count, np.bool_), item.errors,
                    float(np.sqrt(np.mean(item.standard_errors**2))), math.inf,
@@ -140,9 +142,9 @@ def _runs(observation: Observation, chosen: Sequence[int]) -> list[tuple[int, in
     return runs
 
 
-def _stretch(observation: Observation, number: int, here: slice, clock: Clock, unit: float
-             ) -> Stretch:
-    """Return one unbroken stretch of the pulses of a recording, missing ones too."""
+def _stretch(observation: Observation, number: int, part: slice, here: slice, clock: Clock,
+             unit: float) -> Stretch:
+    """Return the pulses `here` of a `part` of a recording that is unbroken, missing ones too."""
     recovery, model = observation.recoveries[number], observation.model
     bridged, errors = recovery.bridged[here], recovery.bridged_errors[here]
     measured = np.zeros(recovery.bridged.size, np.bool_)
@@ -169,7 +171,7 @@ def _stretch(observation: Observation, number: int, here: slice, clock: Clock, u
         grid[recovery.number] = smooth
         grid = grid[here]
     setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
-                      grid, clock.rate)
+                      float(recovery.bridged[0]), recovery.bridged[part], grid, clock.rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
                    recovery.ripple_standard_error, bend_prior, referenced)
 

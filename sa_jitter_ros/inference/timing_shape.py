@@ -101,4 +101,5 @@ class Shapes:
 
 
 def _normal(errors: Array, variance: float) -> Array:
-    return np.asarray(np.exp(-0.5 * errors**2 / variance) / math.sqrt(2.0 * math.pi * variance))
+    density = np.exp(-0.5 * errors**2 / variance) / math.sqrt(2.0 * math.pi * variance)
+    return np.maximum(density, np.finfo(np.float64).tiny)  # far from all that is expected

@@ -29,8 +29,11 @@ from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentP
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
+from scipy.signal import savgol_filter
 
 Array = NDArray[Any]
+
+_SMOOTH = 25  # pulses over which a speed is taken
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,17 @@ class Pulses:
         """Return how many pulses went before each (N_t + 1,), missing ones too."""
         lost = 0 if self.missing is None else np.concatenate(([0], np.cumsum(self.missing)))
         return np.asarray(self.first + np.arange(len(self.times)) + lost)
+
+    @property
+    def relative_speed(self) -> Array:
+        """Return the speed at each pulse over that of the average (N_t + 1,); 1 if unknown."""
+        measured = np.isfinite(self.times)
+        if np.count_nonzero(measured) < 3:
+            return np.ones(len(self.times))
+        index = self.index[measured]
+        all_of_them = np.arange(index[0], index[-1] + 1)
+        period = trigger_periods(np.interp(all_of_them, index, self.times[measured]))
+        return np.asarray(np.interp(self.index, all_of_them, period.mean() / period))
 
     def without(self, before: int, after: int) -> 'Pulses':
         """Return all but some pulses at either end."""
@@ -183,6 +197,12 @@ def known_errors(model: DeclaredModel, influences: Sequence[Influence], pulses: 
     found = [errors for errors in (item.pattern(model, pulses) for item in influences)
              if errors is not None]
     return np.asarray(np.sum(found, axis=0)) if found else None
+
+
+def trigger_periods(times: Array) -> Array:
+    """Return the trigger period at each pulse (s): the slope of a cubic through some pulses."""
+    window = min(_SMOOTH, (times.size - 1) // 2 * 2 + 1)
+    return np.asarray(savgol_filter(times, window, min(3, window - 1), deriv=1))
 
 
 def mean_period(times: Array, missing: Array | None) -> float:
