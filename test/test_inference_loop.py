@@ -297,13 +297,31 @@ def test_recording_without_lines_to_compare_says_what_it_cannot_exclude(shared_d
         trigger_cycles=5 if motor else 10, pulses_per_revolution=8 if motor else 1,
         orders=(12.0, 16.0, 18.0) if motor else (1.0, 2.0, 3.0))
     content = report(trace([observe(recording, model)], [recording]))
-    assert content['verdict'] == 'none'
     assert content['error_before']['rms'] is None
     upper = {item['name']: item['upper_95'] for item in content['limits']}
     assert upper['clock_skew'] > 0.0  # the timing is known, if badly
-    assert upper['additive_noise'] is None  # there is no line
-    assert {'additive_noise', 'amplitude_modulation'} <= set(content['undecided'])
+    if motor:
+        assert content['verdict'] == 'none'
+        assert upper['additive_noise'] is None  # there is no line
+        assert {'additive_noise', 'amplitude_modulation'} <= set(content['undecided'])
+    else:  # the lines are there, and show their noise, of which nothing is declared
+        assert [item['name'] for item in content['missing_effects']] == ['additive_noise']
+        assert 0.0 < upper['amplitude_modulation'] < 1.0
     assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
+
+
+@pytest.mark.machines
+def test_noise_that_hides_the_pulse_errors_is_found():
+    """No attenuation can be compared where single errors do not show; the noise is seen."""
+    recording = simulated(AdditiveNoise(1.5), jitter=False)
+    model = replace(MODEL, keyphasor_rate=1e6, noise_std=0.5, sample_rate=RATE)
+    content = report(trace([observe(recording, model)], [recording]))
+    assert content['error_before']['rms'] is None
+    assert 'no line is compared' in ' '.join(content['remarks'])
+    effect, = content['missing_effects']
+    assert effect['name'] == 'additive_noise'
+    std = effect['parameters']['std']
+    assert std['value'] == pytest.approx(np.sqrt(1.5**2 - 0.5**2), abs=3.5 * std['standard_error'])
 
 
 def test_pulse_times_alone_show_lost_pulses(rng, tmp_path):

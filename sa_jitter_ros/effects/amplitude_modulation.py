@@ -95,7 +95,7 @@ class AmplitudeModulation(DirectEffect):
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
         """Return the modulation that the amplitudes of the orders together allow."""
-        radial, noise = evidence.lines.of_orders
+        radial, noise = evidence.of_orders
         if not noise.size:
             return None
         if noise.size == 1:  # all that it scatters may be a modulation
@@ -112,7 +112,7 @@ class AmplitudeModulation(DirectEffect):
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit what is common to the amplitudes of all orders, cycle by cycle."""
-        radial, noise = evidence.lines.of_orders
+        radial, noise = evidence.of_orders
         if not noise.size:
             return absent(cls.name, 'no line is compared')
         found = fit_common_gain(radial, noise)

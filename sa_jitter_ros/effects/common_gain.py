@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.effect import ONE_SIDED
 from scipy.optimize import minimize
 
 Array = NDArray[Any]
@@ -80,15 +81,21 @@ def _above_noise(powers: Array, counts: Array) -> tuple[Array, Array, Array]:
     """
     Return the log likelihood that a gain of one order adds, its powers and their standard errors.
 
-    `powers` (octave,) are sums of `counts` ordinates; the highest octave shows the noise alone.
+    `powers` (octave,) are sums of `counts` ordinates. A slow gain has no more power in an octave
+    than in those below, but by chance, and none in the highest, which shows the noise alone; what
+    is more is a line beside the order.
     """
     own = powers / counts
-    more = own > own[-1]
-    noise = np.sum(powers, where=~more) / np.sum(counts, where=~more)
-    size = np.where(more, own - noise, 0.0)
-    likelihood = counts * np.log(powers.sum() / counts.sum() / np.where(more, own, noise))
-    error = np.hypot(own / np.sqrt(counts), noise / np.sqrt(np.sum(counts, where=~more)))
-    return likelihood, size, error
+    least = own.copy()
+    for octave, number in enumerate(np.cumsum(counts)[:-1], 1):
+        below = np.average(least[:octave], weights=counts[:octave])
+        least[octave] = min(own[octave], below * (1.0 + ONE_SIDED / np.sqrt(number)))
+    more = least > least[-1]
+    noise = np.average(least, weights=counts * ~more)
+    told = counts * (own == least)
+    likelihood = told * np.log(np.average(least, weights=told) / np.where(more, least, noise))
+    error = np.hypot(least / np.sqrt(counts), noise / np.sqrt(np.sum(counts, where=~more)))
+    return likelihood, np.where(more, least - noise, 0.0), error
 
 
 def _shared(power: Array, count: float, gain: Array) -> tuple[float, float, float]:

@@ -31,6 +31,7 @@ Array = NDArray[Any]
 
 #: Relative spread of speeds below which they count as one speed.
 SAME_SPEED = 5e-3
+_RESOLVED = 1e-6  # of a trigger cycle, by which orders may be nearer than one
 
 
 @dataclass(frozen=True)
@@ -90,20 +91,6 @@ class LineEvidence:
     tone: Tone | None = None
     beat: Beat = Beat()
 
-    @property
-    def of_orders(self) -> tuple[Array, Array]:
-        """
-        Return `radial` (acquisition, cycle, order) and its noise (order,), the channels together.
-
-        What is beside an order, be it a noise or the line of a bearing, reaches all channels: that
-        it changes them together tells no more than one of them does.
-        """
-        found, place = np.unique(self.order, return_inverse=True)
-        weight = (place[:, None] == np.arange(found.size)) / np.maximum(
-            self.radial_noise, 1e-9)[:, None] ** 2
-        information = weight.sum(axis=0)
-        return self.radial @ (weight / information), 1.0 / np.sqrt(information)
-
 
 @dataclass(frozen=True)
 class Evidence:
@@ -146,6 +133,24 @@ class Evidence:
     def cycles(self) -> int:
         """Return the number of trigger cycles that the lines were measured in."""
         return int(np.prod(self.lines.radial.shape[:2]))
+
+    @property
+    def of_orders(self) -> tuple[Array, Array]:
+        """
+        Return `radial` (acquisition, cycle, group) and its noise (group,) of lines that differ.
+
+        What is beside an order, be it a noise or the line of a bearing, reaches all channels, and
+        the orders that a trigger cycle does not resolve from it: that it changes them together
+        tells no more than one of them does.
+        """
+        lines = self.lines
+        found, place = np.unique(lines.order, return_inverse=True)
+        apart = np.diff(found) * self.model.cycle_length > 1.0 - _RESOLVED
+        group = np.concatenate(([0], np.cumsum(apart)))[place]
+        weight = (group[:, None] == np.unique(group)) / np.maximum(
+            lines.radial_noise, 1e-9)[:, None] ** 2
+        information = weight.sum(axis=0)
+        return lines.radial @ (weight / information), 1.0 / np.sqrt(information)
 
     @property
     def times(self) -> Array:

@@ -318,7 +318,9 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     late = late - late[measured].mean()
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
     ripple = recovery.ripple[span.start + measured[:-1]]
-    reason = _unresolved(bridged - late, standard_errors, recovery, model)
+    ripple_is_clear = np.mean(ripple**2) > _RIPPLE * (
+        recovery.ripple_standard_error**2)  # false with a missing pulse
+    reason = _unresolved(bridged - late, standard_errors, recovery, model, bool(ripple_is_clear))
     corrected_pulses: FloatArray = bridged if reason else bridged - late
     law = angle_law(model.angle_law)
     used = slice(first - law.before, first + count + 1 + law.after)
@@ -328,9 +330,8 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         corrected_pulses = pulses.reference[span.start - law.before:span.stop + law.after]
         errors = times - pulses.reference[span][measured]
     errors = errors - errors.mean()
-    ripple_is_clear = not reason and np.mean(ripple**2) > _RIPPLE * (
-        recovery.ripple_standard_error**2)  # false with a missing pulse
-    corrected_ripple = ripple if pulses.reference is None and ripple_is_clear else None
+    corrected_ripple = ripple if pulses.reference is None and ripple_is_clear and not reason else (
+        None)
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
     clean_cycles = without_leakage(
@@ -347,13 +348,17 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
 
 
 def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: RecordRecovery,
-                model: DeclaredModel) -> str:
-    """Return why the errors of an acquisition tell nothing of its amplitudes, '' if they do."""
+                model: DeclaredModel, bends: bool) -> str:
+    """
+    Return why the errors of an acquisition tell nothing of its amplitudes, '' if they do.
+
+    The `bends` of the angle inside the cycles tell of them where the errors of pulses do not.
+    """
     size = max(float(np.sqrt(model.distribution.variance)), recovery.size)
     typical = float(np.sqrt(np.mean(standard_errors**2)))
     if not np.isfinite(typical):
         return 'the vibration holds no declared order'
-    if typical >= RESOLVED * size:
+    if typical >= RESOLVED * size and not bends:
         return (f'the standard error of a recovered pulse, {typical:.3g} s, is not below '
                 f'{RESOLVED:g} of the size of the pulse errors, {size:.3g} s')
     if np.any(np.diff(corrected) <= 0.0):

@@ -123,7 +123,8 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
 
     `declared` are the effects of the declared model.
 
-    Where no line can be compared, nothing is found, and the trace says why.
+    Where no line can be compared, only what needs no pulse errors is found, and the trace says
+    why.
     """
     whole = together(observations)
     try:
@@ -131,7 +132,10 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     except ModelError as error:
         return _nothing_compared(whole, declared, f'no line is compared: {error}')
     if len(whole.compared) < _FEWEST:
-        return _nothing_compared(whole, declared, _unresolved(whole))
+        known = np.isfinite(whole.stacked('errors')).all(axis=1)
+        shows = np.count_nonzero(known) >= _FEWEST and choose_lines(whole).count
+        bench = make_bench(whole, observations, recordings, declared) if shows else None
+        return _nothing_compared(whole, declared, _unresolved(whole), bench)
     used = [(replace(item, acquisitions=tuple(item.acquisitions[a] for a in item.compared)), source
              ) for item, source in zip(observations, recordings) if item.compared]
     observations, recordings = [item for item, _ in used], [source for _, source in used]
@@ -171,12 +175,14 @@ def _unresolved(observation: Observation) -> str:
             'give reference_pulse_times')
 
 
-def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str) -> Trace:
+def _nothing_compared(observation: Observation, declared: Sequence[Effect], reason: str,
+                      bench: Bench | None = None) -> Trace:
     """
     Return the trace of a recording whose lines cannot be compared.
 
-    What pulse times show by themselves is found. What of the timing the vibration excludes still
-    has a limit; whatever that leaves, and all that only lines show, is undecided.
+    What pulse times show by themselves is found, and with a `bench` what lines show whose pulse
+    errors are too small to be seen: noise, modulation, tones. What of the timing the vibration
+    excludes still has a limit; whatever that leaves is undecided.
     """
     count = len(observation.acquisitions)
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
@@ -190,23 +196,33 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         return float(max(np.abs(getattr(with_it, name) - getattr(without, name)).max()
                          for name in ('mean_attenuation', 'standard_deviation')))
 
-    evidence, known = pulse_evidence(observation), [item.name for item in declared]
-    findings = [kind.fit(evidence) for kind in EFFECTS.values()
-                if issubclass(kind, DirectEffect) and kind.visible_in_pulse_times
-                and kind.name not in known and not kind.unmodelled(observation.model)]
-    found = [replace(item, largest_change=change(declared, item.effect)) for item in findings
-             if item.effect is not None]
-    rows = limits(timing, evidence, [*known, *(item.name for item in found)])
+    known = [item.name for item in declared]
+    if bench is None:
+        evidence, by_how_much, tried = pulse_evidence(observation), change, []
+        findings = [kind.fit(evidence) for kind in EFFECTS.values()
+                    if issubclass(kind, DirectEffect) and kind.visible_in_pulse_times
+                    and kind.name not in known and not kind.unmodelled(observation.model)]
+        found = [replace(item, largest_change=change(declared, item.effect)) for item in findings
+                 if item.effect is not None]
+    else:
+        evidence = bench.gather((), range(count))
+        by_how_much = partial(bench.change, chosen=_few(bench))
+        tried = candidates_of_lines(bench, ())
+        found = [item.finding for item in tried if not item.rejected_because]
+    present = [item.finding for item in tried
+               if item.rejected_because and item.finding.effect is not None]
+    rows = limits(timing, evidence, [*known, *(item.name for item in (*found, *present))])
 
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
     undecided = tuple(row.name for row in rows if row.name in {
-        *open_, *_undecided(change, declared, rows)})
+        *open_, *_undecided(by_how_much, declared, rows)})
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
-        (), (), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)), np.zeros((count, 0)), nothing,
-        nothing, None, 'traced' if found else 'none', float('nan'), None, None, rows, undecided,
-        {row.name: absent(row.name, _UNSEEN).probability for row in rows} | {
-            item.name: item.probability for item in found},
+        tuple(present), tuple(tried), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)),
+        np.zeros((count, 0)), nothing, nothing, None, 'traced' if found else 'none', float('nan'),
+        None, None, rows, undecided,
+        {**{row.name: absent(row.name, _UNSEEN).probability for row in rows},
+         **_probabilities(None, tried), **{item.name: item.probability for item in found}},
         reason)
 
 

@@ -29,7 +29,6 @@ from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentP
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments
-from scipy.signal import savgol_filter
 
 Array = NDArray[Any]
 
@@ -201,6 +200,7 @@ def known_errors(model: DeclaredModel, influences: Sequence[Influence], pulses: 
 
 def trigger_periods(times: Array) -> Array:
     """Return the trigger period at each pulse (s): the slope of a cubic through some pulses."""
+    from scipy.signal import savgol_filter  # which loads long, for programs that predict nothing
     window = min(_SMOOTH, (times.size - 1) // 2 * 2 + 1)
     return np.asarray(savgol_filter(times, window, min(3, window - 1), deriv=1))
 
