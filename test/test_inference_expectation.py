@@ -147,6 +147,26 @@ def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, o
             assert distance < bias + 1.95 / np.sqrt(256 if wander else draws)
 
 
+def test_orders_beside_leak_as_late_as_the_corrected_pulses_are(rng):
+    """These have the mean of the measured ones, wherever the known errors of an average begin."""
+    sources, amplitudes, cycles = (19.0, 18.3), np.array([1.0, 0.6j]), 16
+    model = replace(MODEL, ratio=0.4, orders=(19.0,), noise_std=0.0, trigger_cycles=cycles)
+    item = observed(model).acquisitions[0]
+    heard = np.tile(amplitudes, (2, 1, 1))
+    observation = replace(observed(model), orders=np.array([19.0]), sources=np.array(sources),
+                          acquisitions=(replace(item, raw_cycles=heard, cycles=heard),))
+    errors = 2e-4 * np.arange(cycles + 1.0) + rng.uniform(-1e-4, 1e-4, cycles + 1)
+    clock = make_effect('keyphasor_quantisation', clock_rate=model.keyphasor_rate)
+    signal = AveragedSignal(cycles, model.cycle_length, 19.0, sources, tuple(amplitudes))
+    seen = np.abs(signal.whole_trigger_cycles(
+        (errors - errors.mean())[None] * model.fundamental_frequency))
+    for delay in (0.0, 0.02):
+        pulses = [[Pulses(np.full(cycles + 1, np.nan), errors=errors + delay)]]
+        found = expect(observation, Lines(np.zeros(1, int), np.zeros(1, int)), np.ones(1),
+                       [clock], pulses, np.zeros(1, int), [0])
+        assert found.attenuation[0, 0] == pytest.approx(seen[0], abs=2e-3)  # mirror image
+
+
 @pytest.mark.parametrize('correlated', [False, True])
 def test_orders_beside_scatter_by_jitter_too(correlated, rng):
     """A short trigger cycle does not keep them apart; their phases are their own."""

@@ -36,7 +36,7 @@ from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import (
-    Influence, known_errors, mean_period, Pulses, random_processes)
+    Influence, known_errors, mean_period, Pulses, random_processes, without_gaps)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
@@ -275,7 +275,7 @@ class _Setting:
 
     def shown(self, pulses: Sequence[Pulses]) -> list[_Source]:
         """Return the predicted amplitudes and leakage of unit components, for all `pulses`."""
-        known = [known_errors(self.observation.model, self.effects, item) for item in pulses]
+        known = [self._of_corrected(item) for item in pulses]
         found: dict[int, _Source] = {}
         alike: dict[tuple[float, ...], list[int]] = {}
         for i, (item, errors) in enumerate(zip(pulses, known)):
@@ -288,6 +288,20 @@ class _Setting:
             rows = self._of_known_pulses(np.array([known[i] for i in some]), pulses[some[0]])
             found.update(zip(some, rows))
         return [found[i] for i in range(len(pulses))]
+
+    def _of_corrected(self, item: Pulses) -> Array | None:
+        """
+        Return the known errors of an acquisition, as if its corrected pulses were right.
+
+        These are as late as the measured ones in the mean, apart from gaps: a delay turns an order
+        against those that leak into it.
+        """
+        model = self.observation.model
+        errors = known_errors(model, self.effects, item)
+        if errors is None:
+            return None
+        own = slice(model.weights.before, len(errors) - model.weights.after)
+        return np.asarray(errors - without_gaps(errors, item.missing, item.times)[own].mean())
 
     def _of_known_pulses(self, errors: Array, like: Pulses) -> list[_Source]:
         """Return what is predicted with known `errors` (acquisition, pulse), unsure alike."""

@@ -26,7 +26,7 @@ from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.record_recovery import doubtful_lines
-from sa_jitter_ros.prediction.influence import known_errors, mean_period, Pulses
+from sa_jitter_ros.prediction.influence import known_errors, Pulses, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
@@ -135,7 +135,7 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
             read = read.without(model.weights.before, model.weights.after)
         own.append(read)
         known = known_errors(model, effects, read)
-        left = item.errors if known is None else item.errors - _without_gaps(
+        left = item.errors if known is None else item.errors - without_gaps(
             known, item.missing, item.times)
         errors.append(left - left.mean())
     items = [observation.acquisitions[a] for a in usable]
@@ -330,11 +330,3 @@ def _slope(items: Sequence[Acquisition], errors: Array) -> float:
     centred = [(time - time.mean(), error) for time, error in rows if time.size]
     return float(sum(time @ error for time, error in centred)
                  / sum(time @ time for time, _ in centred))
-
-
-def _without_gaps(known: Array, missing: Array, times: Array) -> Array:
-    """Return known errors less those of missing pulses, which the recovery repairs itself."""
-    if not missing.any():
-        return known
-    period = mean_period(times, missing)
-    return np.asarray(known - period * np.concatenate(([0.0], np.cumsum(missing))))

@@ -327,8 +327,9 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     corrected_law = LINEAR_LAW  # the recovery is a model of the linear law
     if pulses.reference is not None:
         corrected_law = law
-        corrected_pulses = pulses.reference[span.start - law.before:span.stop + law.after]
         errors = times - pulses.reference[span][measured]
+        corrected_pulses = errors.mean() + pulses.reference[
+            span.start - law.before:span.stop + law.after]
     errors = errors - errors.mean()
     corrected_ripple = ripple if pulses.reference is None and ripple_is_clear and not reason else (
         None)

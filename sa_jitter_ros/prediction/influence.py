@@ -209,3 +209,11 @@ def mean_period(times: Array, missing: Array | None) -> float:
     """Return the mean trigger period in s of pulses of which `missing` (interval,) lack."""
     lost = 0 if missing is None else missing.sum()
     return float((times[-1] - times[0]) / (len(times) - 1 + lost))
+
+
+def without_gaps(errors: Array, missing: Array | None, times: Array) -> Array:
+    """Return known errors less the periods of `missing` pulses, which corrected ones lack too."""
+    if missing is None or not missing.any():
+        return errors
+    period = mean_period(times, missing)
+    return np.asarray(errors - period * np.concatenate(([0.0], np.cumsum(missing))))
