@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sa_jitter_ros.inference.gathering import _slope, _uncertainty, _unskewed
+from sa_jitter_ros.inference.gathering import _of_centred, _slope, _uncertainty, _unskewed
 
 PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
 
@@ -48,3 +48,17 @@ def test_skew_of_neighbours_is_that_of_their_whole_run(rng):
     rows[20, 3] = np.nan
     error = TICK / np.ptp(times) / np.sqrt(count)  # of the whole, without the gap
     assert _slope(items, rows) == pytest.approx(SKEW, abs=4.0 * 2.0 * error)
+
+
+@pytest.mark.parametrize('correlation', [0.0, 0.5, 0.95])
+def test_size_of_errors_counts_what_their_means_took(rng, correlation):
+    runs, count, size = 4000, 30, 2.0
+    errors = size * rng.standard_normal((runs, count))
+    for k in range(1, count):
+        errors[:, k] *= np.sqrt(1.0 - correlation**2)
+        errors[:, k] += correlation * errors[:, k - 1]
+    errors -= errors.mean(axis=1, keepdims=True)
+    variance = np.mean(errors**2)
+    together = np.mean(errors[:, 1:] * errors[:, :-1]) / variance
+    assert _of_centred(variance, together, count) == pytest.approx(
+        (size, correlation), rel=0.03, abs=0.01)

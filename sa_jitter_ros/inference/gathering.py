@@ -282,11 +282,31 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
         return 0.0, 0.0
     missed = errors - _of_acquisitions(smooth, usable)
     missed -= missed.mean(axis=1, keepdims=True)
-    variance = float(np.mean(missed.var(axis=1, ddof=1))) - error**2
+    variance = float(np.mean(missed**2)) - error**2
     if variance <= 0.0:
         return 0.0, 0.0
     together = float(np.mean(missed[:, 1:] * missed[:, :-1])) / variance
-    return float(np.sqrt(variance)), float(np.clip(together, 0.0, 0.95))
+    return _of_centred(variance, together, missed.shape[1])
+
+
+def _of_centred(variance: float, together: float, count: int) -> tuple[float, float]:
+    """
+    Return size and correlation of neighbours of errors, of which runs of `count` lost their means.
+
+    A mean takes much of errors that hardly change in a run: `variance` is that of what is left,
+    and `together` its covariance of neighbours over it. No memory is longer than a run.
+    """
+    k = np.arange(count)
+    tried = np.exp(-1.0 / np.geomspace(0.1, count, 100))
+    kept, shared = np.zeros((2, tried.size))
+    for i, correlation in enumerate(tried):
+        rows = correlation ** np.abs(k - k[:, None])
+        rows -= rows.mean(axis=0)
+        rows -= rows.mean(axis=1, keepdims=True)
+        kept[i] = np.trace(rows) / count
+        shared[i] = np.trace(rows, 1) / (count - 1) / kept[i]
+    correlation = float(np.interp(together, shared, tried))
+    return float(np.sqrt(variance / np.interp(correlation, tried, kept))), correlation
 
 
 def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
