@@ -10,7 +10,7 @@
 
 """The grid of a clock in pulse times: how it is found, and the error it implies for each pulse."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -153,6 +153,20 @@ def ticks_log_likelihood(errors: Sequence[Array], variance: float, clock_rate: f
         placed = clock_rate * np.abs(placed_on_grid(row, clock_rate)[0])
         total += float(np.sum(special.log_ndtr((0.5 - placed) / std)))
     return total
+
+
+def sizes_within_ticks(left: Callable[[float], Sequence[Array]], tried: Array, variance: float,
+                       clock_rate: float) -> tuple[Array, Array]:
+    """
+    Return those of the sizes `tried` beside which a clock alone can make the errors `left` by one.
+
+    With them comes the probability of each, if all are as likely before. `left` gives errors
+    (pulse,) of some stretches in s, and `variance` is that of what they are wrong by.
+    """
+    possible = tried[[ticks_leave_room(left(size), variance, clock_rate) for size in tried]]
+    likely = np.array([ticks_log_likelihood(left(size), variance, clock_rate)
+                       for size in possible])
+    return possible, special.softmax(likely) if likely.size else likely
 
 
 def on_grid(errors: Array, clock_rate: float) -> Array:

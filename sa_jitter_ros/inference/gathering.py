@@ -11,7 +11,7 @@
 """Gathering: the evidence that effects are fitted to, from the acquisitions that a fit may use."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 import math
 from typing import Any
 
@@ -21,7 +21,7 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, on_grid, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
@@ -39,6 +39,14 @@ _GROUPS = 3
 _LEAKS = 0.5  # lines of the average between which everything leaks
 # A clock this much faster than the declared one has no visible effect.
 _FINE = 50.0
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Ticks of a clock of `rate` Hz; `smooth` (pulse,) are the errors by the smoothest motion."""
+
+    rate: float
+    smooth: Array
 
 
 def choose_lines(observation: Observation) -> Lines:
@@ -89,31 +97,31 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     found = find_clock(pulses.times)
     clock = found.rate
     usable = 0.0 < clock < _FINE * model.keyphasor_rate
-    smooth = smooth_on_grid(pulses.times, clock) if usable else None
+    grid = _Grid(clock, smooth_on_grid(pulses.times, clock)) if usable else None
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
     if usable and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
                  for i in range(int(group.max()) + 1)]
-    again = [None if motion is None or smooth is None else _unskewed(
-        observation.acquisitions, motion, smooth) for motion in again]
+    again = [None if motion is None or grid is None else _unskewed(
+        observation.acquisitions, motion, grid) for motion in again]
     spread = [motion for motion in again if motion is not None]
-    error_std = [0.0 if motion is None or smooth is None else _uncertainty(
-        observation, motion, spread, smooth) for motion in again]
-    missed = (0.0, 0.0) if smooth is None else _missed(observation, smooth, clock)
+    error_std = [0.0 if motion is None or grid is None else _uncertainty(
+        observation, motion, spread, grid) for motion in again]
+    missed = (0.0, 0.0) if grid is None else _missed(observation, grid)
     known = []
     for a, item in enumerate(observation.acquisitions):
         start = item.first - model.weights.before
         read = slice(start, item.first + item.times.size + model.weights.after)
         own = slice(model.weights.before, model.weights.before + item.times.size)
-        grid = None if smooth is None else smooth[read]
+        smooth = None if grid is None else grid.smooth[read]
         first = int(pulses.number[start])
         rows = []
         for motion, uncertain in zip(again, error_std):
-            errors, std, unknown = grid, 0.0, missed
+            errors, std, unknown = smooth, 0.0, missed
             precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
-            if grid is not None and motion is not None and precise and np.all(
+            if smooth is not None and motion is not None and precise and np.all(
                     np.isfinite(motion[a])):
-                errors, std, unknown = grid.copy(), uncertain, (0.0, 0.0)
+                errors, std, unknown = smooth.copy(), uncertain, (0.0, 0.0)
                 errors[own] = on_grid(motion[a], clock)
             rows.append(Pulses(pulses.times[read], first, errors,
                                pulses.missing[read.start:read.stop - 1], std, *unknown))
@@ -247,18 +255,18 @@ def _cycles(observation: Observation) -> Array:
                      for item in observation.acquisitions])
 
 
-def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array], smooth: Array
+def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array], grid: _Grid
                  ) -> float:
     """
     Return the standard error of recovered errors (acquisition, pulse) without skew, in s.
 
     With a reference keyphasor it is their difference from it, whose errors are included, also
-    without the skew beside the `smooth` motion on the grid. Otherwise it is that of the
+    without the skew beside the `grid`. Otherwise it is that of the
     delete-a-group jackknife over recoveries that leave out one group of channels each.
     """
     if observation.against_reference:
         apart = motion - _unskewed(
-            observation.acquisitions, observation.stacked('errors'), smooth)
+            observation.acquisitions, observation.stacked('errors'), grid)
         variance = np.var(apart, axis=1, ddof=1)
     else:
         variance = (len(others) - 1) * np.var(others, axis=0, ddof=min(1, len(others) - 1))
@@ -266,7 +274,7 @@ def _uncertainty(observation: Observation, motion: Array, others: Sequence[Array
     return float(np.sqrt(variance.mean())) if variance.size else 0.0
 
 
-def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[float, float]:
+def _missed(observation: Observation, grid: _Grid) -> tuple[float, float]:
     """
     Return the error of the smoothest motion on a grid: size in s and correlation of neighbours.
 
@@ -275,12 +283,12 @@ def _missed(observation: Observation, smooth: Array, clock: float) -> tuple[floa
     usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
     if not usable:
         return 0.0, 0.0
-    errors = _unskewed(usable, np.array([item.errors for item in usable]), smooth)
+    errors = _unskewed(usable, np.array([item.errors for item in usable]), grid)
     error = 0.0 if observation.against_reference else float(np.sqrt(np.nanmean(
         [item.standard_errors**2 for item in usable])))
-    if not ticks_leave_room(list(errors), float(np.nanmean(np.square(error))), clock):
+    if not ticks_leave_room(list(errors), float(np.nanmean(np.square(error))), grid.rate):
         return 0.0, 0.0
-    missed = errors - _of_acquisitions(smooth, usable)
+    missed = errors - _of_acquisitions(grid.smooth, usable)
     missed -= missed.mean(axis=1, keepdims=True)
     variance = float(np.mean(missed**2)) - error**2
     if variance <= 0.0:
@@ -314,11 +322,15 @@ def _of_acquisitions(values: Array, items: Sequence[Acquisition]) -> Array:
     return np.array([values[item.first:item.first + item.times.size] for item in items])
 
 
-def _unskewed(items: Sequence[Acquisition], motion: Array, smooth: Array) -> Array:
-    """Return recovered errors (acquisition, pulse) less a slope over time that no grid causes."""
-    grid = _of_acquisitions(smooth, items)
+def _unskewed(items: Sequence[Acquisition], motion: Array, grid: _Grid) -> Array:
+    """
+    Return recovered errors (acquisition, pulse) less a slope over time that no grid causes.
+
+    The smoothest motion shows that there is one, but may drift itself by a part of a tick. The
+    slopes that leave all errors within the ticks tell more.
+    """
     times = np.array([item.times - item.times.mean() for item in items])
-    left = motion - grid
+    left = motion - _of_acquisitions(grid.smooth, items)
     slopes = np.sum(times * (left - left.mean(axis=1, keepdims=True)), axis=1) / np.sum(
         times**2, axis=1)
     slopes = slopes[np.isfinite(slopes)]
@@ -327,14 +339,20 @@ def _unskewed(items: Sequence[Acquisition], motion: Array, smooth: Array) -> Arr
     certainty = abs(slopes.mean()) / (slopes.std(ddof=1) / np.sqrt(slopes.size))
     if 2.0 * special.stdtr(slopes.size - 1, -certainty) > _CERTAIN:
         return motion
-    return np.asarray(motion - _slope(items, left) * times)
+    runs, slope = _runs(items, motion), _slope(_runs(items, left))
+    longest = max(float(np.ptp(time)) for time, _ in runs)
+    possible, weight = sizes_within_ticks(
+        lambda size: [error - size * time for time, error in runs],
+        slope + np.linspace(-0.5, 0.5, 101) / (grid.rate * longest),
+        float(np.nanmean([item.standard_errors**2 for item in items])), grid.rate)
+    return np.asarray(motion - (possible @ weight if possible.size else slope) * times)
 
 
-def _slope(items: Sequence[Acquisition], errors: Array) -> float:
+def _runs(items: Sequence[Acquisition], errors: Array) -> list[tuple[Array, Array]]:
     """
-    Return the slope over time of errors (acquisition, pulse), each less a mean of its own.
+    Return times, less their mean, and errors (acquisition, pulse) of unbroken runs.
 
-    Neighbours share a pulse, so that a run of them has one mean only.
+    Acquisitions have a mean each, but neighbours share a pulse, so that a run of them has one.
     """
     runs: list[tuple[list[Array], list[Array]]] = []
     end, last = -1, np.nan
@@ -347,6 +365,10 @@ def _slope(items: Sequence[Acquisition], errors: Array) -> float:
             values.append(new[np.isfinite(row)])
         end, last = item.first + item.times.size - 1, row[-1]
     rows = [(np.concatenate(time), np.concatenate(error)) for time, error in runs]
-    centred = [(time - time.mean(), error) for time, error in rows if time.size]
-    return float(sum(time @ error for time, error in centred)
-                 / sum(time @ time for time, _ in centred))
+    return [(time - time.mean(), error) for time, error in rows if time.size]
+
+
+def _slope(runs: Sequence[tuple[Array, Array]]) -> float:
+    """Return the slope over time of the errors of runs, each with a mean of its own."""
+    return float(sum(time @ error for time, error in runs)
+                 / sum(time @ time for time, _ in runs))

@@ -28,12 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import ODDS
-from sa_jitter_ros.effects.lattice import ticks_leave_room, ticks_log_likelihood
+from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
-from scipy import special
 
 Array = NDArray[Any]
 
@@ -161,12 +160,11 @@ class Chooser:
         (column,) = found[min(names)]
         step = _STEP / (self.setting.clock_rate * self.data.unit * float(np.ptp(column)))
         tried = fit.sizes[0] + step * np.arange(-_STEPS, _STEPS + 1)
-        possible = tried[[self._room([size * column]) for size in tried]]
+        _, variance, rate = self._left([])
+        possible, weight = sizes_within_ticks(
+            lambda size: self._left([size * column])[0], tried, variance, rate)
         if not possible.size:
             return None
-        likely = np.array([ticks_log_likelihood(*self._left([size * column]))
-                           for size in possible])
-        weight = np.exp(likely - special.logsumexp(likely))
         fit = copy(fit)
         fit.sizes = np.array([possible @ weight])
         fit.size_covariance = np.array([[(possible - fit.sizes) ** 2 @ weight + step**2 / 12.0]])
