@@ -220,7 +220,8 @@ def scores(runs: Sequence[Run]) -> str:
     """
     Return how well held-out acquisitions were predicted, in Markdown.
 
-    Only machines of which a line is compared count: medians of RMS, means of chi2 and coverage.
+    Only machines of which a line is compared count: medians of RMS, means of chi2, with the
+    standard error of that of the oracle, and of coverage.
     """
     lines = ['| undeclared | machines | RMS before, after, oracle | near | chi2 per degree of '
              'freedom before, after, oracle | coverage of 95 % before, after, oracle |',
@@ -232,9 +233,11 @@ def scores(runs: Sequence[Run]) -> str:
         found = np.array([[astuple(score) for score in (run.before, run.after, run.oracle)]
                           for run in rows])
         rms, (chi2, coverage) = np.median(found[..., 0], axis=0), found[..., 1:].mean(axis=0).T
+        error = found[:, -1, 1].std(ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.nan
         lines.append(
             f'| {effects} | {len(rows)} | {", ".join(f"{value:.4f}" for value in rms)} | '
-            f'{sum(run.near for run in rows)} | {", ".join(f"{value:.3g}" for value in chi2)} | '
+            f'{sum(run.near for run in rows)} | {", ".join(f"{value:.3g}" for value in chi2)} +- '
+            f'{error:.2g} | '
             f'{", ".join(f"{value:.1%}" for value in coverage)} |')
     return '\n'.join(lines)
 
