@@ -175,7 +175,11 @@ class Bench:
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
-        """Return the residual of the held-out acquisitions; the others measured the levels."""
+        """
+        Return the residual of the held-out acquisitions.
+
+        The others measured levels and parameters, whose errors the held-out ones share.
+        """
         attenuation, variance, amplitude = self.observed(self.held_out)
         level = (self._corrected_variance(effects) + unsteadiness**2) / len(self.fit)
         unsure = np.sqrt(level + unsteadiness**2)
@@ -188,6 +192,9 @@ class Bench:
                 float(np.mean((other.attenuation_variance - expected.attenuation_variance)
                               / (expected.attenuation_variance + variance))),
                 float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
+        level = level + sum(item.mean**2 for item in moved)
+        expected = self.expect(effects, self.held_out,
+                               unsteadiness=np.sqrt(level + unsteadiness**2))
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
