@@ -13,8 +13,9 @@
 from hypothesis import given, strategies as st
 import numpy as np
 import pytest
-from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
+from sa_jitter_ros.averaging.noise import noise_floor, radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import BlockMean, ExponentialMean, SlidingMean
+from scipy import signal
 
 VALUES = st.lists(st.complex_numbers(max_magnitude=1e6), min_size=1, max_size=40)
 
@@ -181,6 +182,22 @@ def test_leakage_between_orders_is_taken_out(length):
     np.testing.assert_allclose(clean, np.broadcast_to(amplitudes, clean.shape), atol=2e-3)
     cycles[0, 0, 1] = np.nan  # an undefined order leaves the others
     assert np.isfinite(without_leakage(cycles, tuple(orders), length, angles)[1:, 0, ::2]).all()
+
+
+@pytest.mark.parametrize('count', [5, 10, 40])
+def test_noise_that_is_added_to_coloured_noise_and_orders_adds_its_power(rng, count):
+    angle = np.arange(count * 512) / 512
+    orders = np.geomspace(1.0, 0.02, 200) @ np.cos(
+        2.0 * np.pi * np.outer(np.arange(1, 201), angle))
+    found = []
+    for std in (0.0, 0.3):
+        noise = signal.lfilter([0.2], [1.0, -0.5], rng.standard_normal((60, angle.size)))
+        added = std * rng.standard_normal(noise.shape)
+        grid = (orders + noise + added).T.reshape(count, 512, -1)
+        floor = noise_floor(grid, 1.0, np.array([20.0]), 256.0)
+        found.append(np.mean(floor**2) * angle.size / 2.0)
+    coloured = 0.04 / abs(1.0 - 0.5 * np.exp(-2j * np.pi * 20.0 / 512)) ** 2
+    np.testing.assert_allclose(found, [coloured, coloured + 0.09], rtol=0.1)
 
 
 def test_radial_noise_of_too_little_is_undefined():

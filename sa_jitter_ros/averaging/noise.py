@@ -136,9 +136,9 @@ def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float)
     Return the noise (channel, order) of the mean of trigger cycles along the radius.
 
     `grid` (cycle, point, channel) are consecutive cycles of `cycles` fundamental cycles without
-    their ends; their band ends at order `top`. The noise is the mean of the spectrum around the
-    order, in phase with it (pulse errors only turn the order), without lines of other orders and
-    tones.
+    their ends; their band ends at order `top`. The noise is the mean of the spectrum near the
+    order, in phase with it (pulse errors only turn the order), between the lines of the shafts and
+    without other tones.
     """
     flat = np.ascontiguousarray(grid.reshape(-1, grid.shape[2]).T)
     window, waves = _windowed_waves(cycles, grid.shape[1], flat.shape[1], tuple(orders.tolist()))
@@ -148,10 +148,26 @@ def noise_floor(grid: FloatArray, cycles: float, orders: FloatArray, top: float)
         phase = np.angle(flat @ cos - 1j * (flat @ sin))[:, None]
         in_phase = 2.0 * flat * window
         in_phase *= np.cos(phase) * cos - np.sin(phase) * sin
-        reach = int(np.clip((top - order) * lines, 4 * _LOBE, max(_AROUND, 100.0 * lines)))
-        spectrum = np.fft.rfft(in_phase, axis=1)[:, _LOBE:reach]
-        floors.append(_without_lines(np.abs(spectrum) ** 2))
+        reach = int(np.clip((top - order) * lines, 4 * _LOBE, max(_AROUND, 5 * len(grid))))
+        bins = _between_lines(np.arange(_LOBE, reach), order * lines, (len(grid), lines))
+        floors.append(_without_lines(np.abs(np.fft.rfft(in_phase, axis=1)[:, bins]) ** 2))
     return np.asarray(np.sqrt(np.array(floors).T / (flat.shape[1] * np.sum(window**2))))
+
+
+def _between_lines(bins: NDArray[Any], middle: float, steps: tuple[float, ...]) -> NDArray[Any]:
+    """
+    Return the bins on both sides of a `middle` that no multiple of the `steps` reaches.
+
+    Through the window a line reaches less than two bins. All are returned if less than a third
+    is left.
+
+    >>> _between_lines(np.arange(3, 63), 40.0, (5, 20.0))[:6]
+    array([ 3,  7,  8, 12, 13, 17])
+    """
+    place, step = np.stack([middle + bins, middle - bins]), np.reshape(steps, (-1, 1, 1))
+    away = np.abs(place - step * np.rint(place / step)).min(axis=(0, 1))
+    left = bins[away.round(6) >= 2.0]
+    return left if 3 * left.size >= bins.size else bins
 
 
 @lru_cache(maxsize=4)
