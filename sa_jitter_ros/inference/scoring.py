@@ -142,7 +142,8 @@ class Bench:
         Return the scatter of the corrected amplitudes beyond what noise and effects predict.
 
         It is the root mean square over acquisitions and lines, relative to the level; 0 if it is
-        not significant. No line counts with more than a steady machine has.
+        not significant. No line counts with more than a steady machine has; lines count by how
+        well they tell it, since white noise may be too much for weak lines of coloured noise.
         """
         orders = self.observation.orders.size
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
@@ -151,7 +152,9 @@ class Bench:
         chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
         if np.mean(power / known) < 1.0 + chance:
             return 0.0
-        return float(np.sqrt(max(np.mean(np.minimum(power - known, STEADY**2)), 0.0)))
+        beyond = np.average(np.minimum(power - known, STEADY**2),
+                            weights=(known + STEADY**2) ** -2.0)
+        return float(np.sqrt(max(beyond, 0.0)))
 
     def _corrected_variance(self, effects: Sequence[Effect]) -> Array:
         """Return the variance (line,) that noise and effects give a corrected amplitude."""
