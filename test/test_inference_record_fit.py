@@ -132,3 +132,21 @@ def test_sidebands_that_do_not_change_are_no_bend_of_all_cycles(rng):
                        jitter_std=5e-5, known=(np.zeros(0), np.zeros(0)))
     wrong = np.abs(found.amplitudes[0, :5]) - [lines[order] for order in declared]
     assert np.all(np.abs(wrong) < 4.0 * found.amplitude_errors[0, :5])
+
+
+def test_declared_lines_alone_tell_how_fast_the_angle_runs(rng):
+    """The orders of the others are free, and follow a clock that is wrong by 2e-4."""
+    speed, rate, count, skew = 14.0, 2200.0, 800, -2e-4
+    lines = {13: 1.0, 27: 0.3, 12: 0.4, 14: 0.3, 15: 0.2, 25: 0.4, 26: 1.5, 1: 0.3, 2: 0.2,
+             18.18: 0.6, 19.04: 0.3}
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(lines))
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    turns = speed * time + 0.05 * np.sin(2.0 * np.pi * 0.1 * time)
+    vibration = sum(size * np.cos(2.0 * np.pi * order * turns + phase)
+                    for (order, size), phase in zip(lines.items(), phases))
+    true = np.interp(np.arange(count) + 0.5, turns, time)
+    times = true * (1.0 + skew) + rng.normal(0.0, 2e-5, count)
+    found = fit_record((vibration + 0.5 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+                       times, measured=np.ones(count, bool), cycle_length=1.0,
+                       orders=[13, 27], jitter_std=2e-5)
+    assert np.polyfit(times, found.errors, 1)[0] == pytest.approx(skew, rel=0.005)

@@ -597,7 +597,11 @@ class _States:
         self.tones = np.append(self.tones, tones)
 
     def refine(self) -> None:
-        """Move each undeclared line to where the residual has nothing left of it."""
+        """
+        Move each undeclared line to where the residual has nothing left of it.
+
+        The declared lines alone tell how fast the angle runs: so do not those that may move.
+        """
         self._make_tables()
         residual = self._residual()
         cycle = np.arange(self.times.size - 1) - 0.5 * (self.times.size - 1)
@@ -611,6 +615,12 @@ class _States:
             top += weight * np.real(2j * np.pi * row * moved)
             bottom += weight * 2.0 * np.pi**2 * np.abs(row) ** 2
         whole = self.whole[:, None]
+        declared = self.orders[:self.declared]
+        stretch = float(top[:self.declared] @ declared) / max(
+            float(bottom[:self.declared] @ declared**2) * float(np.sum(angle**2 * whole)),
+            np.finfo(np.float64).tiny)
+        most = 0.5 / float(np.ptp(angle)) / declared.max()
+        stretch = min(max(stretch, -most), most)
         for chosen, coordinate in ((slice(self.declared, count), angle),
                                    (slice(count, None), time)):
             most = 0.5 / float(np.ptp(coordinate))
@@ -620,6 +630,10 @@ class _States:
                                      neginf=0.0).clip(-most, most)
             lines = self.orders[self.declared:] if chosen.stop else self.tones
             lines += step
+        self.orders[self.declared:] *= 1.0 - stretch
+        pulses = np.arange(self.times.size) - 0.5 * (self.times.size - 1)
+        self.states[:, 0] += stretch * pulses * float(np.diff(self.times).mean())
+        self._read()
 
     def prune(self, least: float) -> None:
         """Take out undeclared lines whose amplitudes are noise."""
