@@ -99,14 +99,14 @@ class AmplitudeModulation(DirectEffect):
         if not noise.size:
             return None
         if noise.size == 1:  # all that it scatters may be a modulation
-            power = largest_power(float(np.mean(radial**2)), radial.size, 0.0, 0.0,
-                                  memory(SLOW_BAND))
-            return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
-        weight = 1.0 / noise**2
-        pairs = weight.sum() ** 2 - np.sum(weight**2)
-        product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of different orders
-        power = largest_power(float(product.mean()), product.size, 1.0 / weight.sum(),
-                              1.0 / pairs, memory(SLOW_BAND))
+            product, known, square = radial**2, 0.0, 0.0
+        else:
+            weight = 1.0 / noise**2
+            pairs = weight.sum() ** 2 - np.sum(weight**2)
+            known, square = 1.0 / weight.sum(), 1.0 / pairs
+            product = ((radial @ weight) ** 2 - radial**2 @ weight**2) / pairs  # of others
+        power = largest_power(float(product.mean()), product.size, known, square,
+                              memory(SLOW_BAND))
         return cls(min(math.sqrt(power / _variance_of_mean(1, SLOW_BAND)), 1.0))
 
     @classmethod

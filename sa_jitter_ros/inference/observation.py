@@ -331,8 +331,8 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         corrected_pulses = errors.mean() + pulses.reference[
             span.start - law.before:span.stop + law.after]
     errors = errors - errors.mean()
-    corrected_ripple = ripple if pulses.reference is None and ripple_is_clear and not reason else (
-        None)
+    corrects_ripple = pulses.reference is None and ripple_is_clear and not reason
+    corrected_ripple = ripple if corrects_ripple else None
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
     clean_cycles = without_leakage(

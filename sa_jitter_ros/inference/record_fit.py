@@ -600,7 +600,7 @@ class _States:
         """
         Move each undeclared line to where the residual has nothing left of it.
 
-        The declared lines alone tell how fast the angle runs: so do not those that may move.
+        The declared lines alone tell how fast the angle runs; those that may move do not.
         """
         self._make_tables()
         residual = self._residual()
@@ -614,17 +614,15 @@ class _States:
                               self._sums(time * residual[c])[:, count:].sum(axis=0))
             top += weight * np.real(2j * np.pi * row * moved)
             bottom += weight * 2.0 * np.pi**2 * np.abs(row) ** 2
-        whole = self.whole[:, None]
+        curves = [float(np.sum(x**2 * self.whole[:, None])) for x in (angle, time)]
+        most_of = [0.5 / float(np.ptp(x)) for x in (angle, time)]
         declared = self.orders[:self.declared]
         stretch = float(top[:self.declared] @ declared) / max(
-            float(bottom[:self.declared] @ declared**2) * float(np.sum(angle**2 * whole)),
-            np.finfo(np.float64).tiny)
-        most = 0.5 / float(np.ptp(angle)) / declared.max()
-        stretch = min(max(stretch, -most), most)
-        for chosen, coordinate in ((slice(self.declared, count), angle),
-                                   (slice(count, None), time)):
-            most = 0.5 / float(np.ptp(coordinate))
-            curve = float(np.sum(coordinate**2 * whole))
+            float(bottom[:self.declared] @ declared**2) * curves[0], np.finfo(np.float64).tiny)
+        most_stretched = most_of[0] / declared.max()
+        stretch = min(max(stretch, -most_stretched), most_stretched)
+        for chosen, curve, most in zip((slice(self.declared, count), slice(count, None)), curves,
+                                       most_of):
             with np.errstate(divide='ignore', invalid='ignore'):
                 step = np.nan_to_num(top[chosen] / (bottom[chosen] * curve), posinf=0.0,
                                      neginf=0.0).clip(-most, most)

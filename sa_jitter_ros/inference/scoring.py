@@ -195,9 +195,10 @@ class Bench:
                 float(np.mean((other.attenuation_variance - expected.attenuation_variance)
                               / (expected.attenuation_variance + variance))),
                 float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
-        level = level + sum(item.mean**2 for item in moved)
-        expected = self.expect(effects, self.held_out,
-                               unsteadiness=np.sqrt(level + unsteadiness**2))
+        if moved:
+            level = level + sum(item.mean**2 for item in moved)
+            expected = self.expect(effects, self.held_out,
+                                   unsteadiness=np.sqrt(level + unsteadiness**2))
         return residual(
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
