@@ -258,6 +258,16 @@ def test_what_reaches_all_channels_is_a_modulation_if_it_is_slow(rng, std, band)
         assert not found
 
 
+def test_orders_that_a_trigger_cycle_does_not_resolve_count_as_one(rng):
+    lines = evidence_of(rng, np.zeros((3, 5))).lines
+    for length, groups in ((1.0, 4), (0.9, 1), (1.0 / 3.0, 1), (2.0, 4)):
+        evidence = evidence_of(rng, np.zeros((3, 5)))
+        evidence = replace(evidence, model=replace(MODEL, ratio=length), lines=lines)
+        radial, noise = evidence.of_orders
+        assert radial.shape == (3, 4, groups)
+        assert noise == pytest.approx(np.full(groups, 0.01 / np.sqrt(4 / groups)))
+
+
 def test_few_acquisitions_tell_no_noise_that_is_declared(rng):
     """Their own scatter is uncertain: Student's distribution."""
     model = replace(MODEL, noise_std=1.0)

@@ -31,7 +31,6 @@ Array = NDArray[Any]
 
 #: Relative spread of speeds below which they count as one speed.
 SAME_SPEED = 5e-3
-_RESOLVED = 1e-6  # of a trigger cycle, by which orders may be nearer than one
 
 
 @dataclass(frozen=True)
@@ -145,7 +144,7 @@ class Evidence:
         """
         lines = self.lines
         found, place = np.unique(lines.order, return_inverse=True)
-        apart = np.diff(found) * self.model.cycle_length > 1.0 - _RESOLVED
+        apart = (np.diff(found) * self.model.cycle_length).round(6) >= 1.0
         group = np.concatenate(([0], np.cumsum(apart)))[place]
         weight = (group[:, None] == np.unique(group)) / np.maximum(
             lines.radial_noise, 1e-9)[:, None] ** 2
