@@ -319,6 +319,7 @@ def test_noise_that_hides_the_pulse_errors_is_found():
     content = report(trace([observe(recording, model)], [recording]))
     assert content['error_before']['rms'] is None
     assert 'no line is compared' in ' '.join(content['remarks'])
+    assert verdict_sentence(content).startswith('Lines and pulse times show additive_noise;')
     effect, = content['missing_effects']
     assert effect['name'] == 'additive_noise'
     std = effect['parameters']['std']

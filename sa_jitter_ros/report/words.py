@@ -56,6 +56,10 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
     others = dict.fromkeys(item['name'] for item in other_numbers(content))
     names = _listed([*(item['name'] for item in content['missing_effects']),
                      *(f'the right numbers of {name}' for name in others)], 'and')
+    if not content['lines'] and content['candidates']:  # the vibration holds lines
+        found = f'Lines and pulse times show {names or "nothing"}'
+        return (f'{found}; no attenuation can be compared with its prediction, since the errors '
+                'of single pulses do not show.')
     if not content['lines']:
         found = f'The pulse times alone show {names}; nothing else' if names else (
             'Nothing was found, and nothing')
