@@ -17,12 +17,12 @@ The nodes of `config/machine.yaml` average its simulated gearbox for some second
 
 import argparse
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
 
+from graph_speed import resident
 from sa_jitter_ros.commands.chain import NODES
 from sa_jitter_ros.parameter_file import shipped
 
@@ -37,14 +37,6 @@ def start(module: str, *arguments: str) -> subprocess.Popen[bytes]:
         env=environment, stderr=subprocess.DEVNULL)
 
 
-def resident(process: subprocess.Popen[bytes]) -> float:
-    """Return the resident memory of a process, MB."""
-    with open(f'/proc/{process.pid}/status', encoding='utf-8') as status:
-        found = re.search(r'VmRSS:\s+(\d+) kB', status.read())
-    assert found is not None
-    return int(found[1]) / 1e3
-
-
 def measure(seconds: float, commands: dict[str, list[str]]) -> dict[str, float]:
     """Return the memory of processes by name after they ran so long, MB."""
     file = str(shipped('machine.yaml'))
@@ -52,7 +44,11 @@ def measure(seconds: float, commands: dict[str, list[str]]) -> dict[str, float]:
         'machine_simulator': ['nodes.machine_simulator', '--ros-args', '--params-file', file],
         **commands}.items()}
     time.sleep(seconds)
-    found = {name: resident(process) for name, process in running.items()}
+    found = {}
+    for name, process in running.items():
+        if (held := resident(process.pid)) is None:
+            raise RuntimeError(f'{name} has ended within {seconds:g} s')
+        found[name] = held
     for process in running.values():
         process.send_signal(signal.SIGTERM)
         process.wait()

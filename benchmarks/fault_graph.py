@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 import os
-from pathlib import Path
 import signal
 import subprocess
 import sys
@@ -28,7 +27,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from fault_machine import MESH
-from graph_speed import free_domain
+from graph_speed import free_domain, resident
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -256,9 +255,8 @@ class Graph:
             if life.process.poll() is not None:
                 self.died.append(f'{role} with status {life.process.returncode}')
                 continue
-            status = Path(f'/proc/{life.process.pid}/status').read_text()
-            line = next(line for line in status.splitlines() if line.startswith('VmRSS'))
-            life.rss.append((time.monotonic() - self.begin, int(line.split()[1]) / 1e3))
+            if (held := resident(life.process.pid)) is not None:  # else it ends in this moment
+                life.rss.append((time.monotonic() - self.begin, held))
 
     def close(self) -> dict[str, int]:
         """End all nodes by SIGINT; return their exit statuses."""

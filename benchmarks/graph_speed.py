@@ -22,6 +22,7 @@ import json
 import os
 from pathlib import Path
 import random
+import re
 import signal
 import socket
 import subprocess
@@ -111,6 +112,13 @@ def free_domain() -> int:
                 continue
             return domain
     raise RuntimeError('no free ROS domain on this host')
+
+
+def resident(process: int) -> float | None:
+    """Return the megabytes that a process holds, None when it has ended and nobody waited yet."""
+    status = Path(f'/proc/{process}/status').read_text()
+    found = re.search(r'VmRSS:\s+(\d+) kB', status)
+    return None if found is None else int(found[1]) / 1e3
 
 
 def usage(process: int) -> tuple[float, float]:

@@ -33,7 +33,7 @@ import time
 from typing import Any
 
 import graph_speed
-from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, Sink, SPEED,
+from graph_speed import (block_samples, free_domain, KEYS, ORDERS, RATE, resident, Sink, SPEED,
                          transport, TRIGGER_CYCLES, usage)
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
@@ -50,13 +50,6 @@ NODES = {
     'synchronous_averager': {'shaft.orders': list(ORDERS)},
     'jitter_predictor': {'follow_shaft_speed': True, 'trigger_cycles': TRIGGER_CYCLES,
                          'orders': list(ORDERS)}}
-
-
-def resident(process: int) -> float:
-    """Return the megabytes that a process holds."""
-    status = Path(f'/proc/{process}/status').read_text()
-    return int(next(line for line in status.splitlines() if line.startswith('VmRSS')).split()[1]
-               ) / 1e3
 
 
 @contextmanager
@@ -117,7 +110,8 @@ def soak(channels: int, seconds: float, *, correct: bool, shafts: int, trigger_c
         begin = time.monotonic()
         while source.poll() is None:
             for name, process in watched.items():
-                rss[name].append((time.monotonic() - begin, resident(process)))
+                if (held := resident(process)) is not None:  # else it ends in this moment
+                    rss[name].append((time.monotonic() - begin, held))
             report(f'{time.monotonic() - begin:.0f} of {seconds:.0f} s, {len(sink.ends)} averages')
             spin(lambda: source.poll() is not None, PERIOD)
         sent = json.loads(source.communicate()[0])

@@ -16,6 +16,7 @@ How fast they find the package depends on what else the machine does: no test as
 
 import importlib
 import json
+import os
 from pathlib import Path
 import re
 import subprocess
@@ -276,6 +277,14 @@ def test_soak_says_which_averages_a_full_queue_lost(benchmark):
     assert soak.overwritten(found) == (2, pytest.approx(8.0 - 5.02))
     every = {key: list(range(40)) for key in ('sequence', 'end', 'latency')}
     assert soak.overwritten({**every, 'published': 40}) == (0, np.inf)
+
+
+def test_process_that_has_ended_holds_no_memory(benchmark):
+    resident = benchmark('graph_speed').resident
+    assert resident(os.getpid()) > 10.0
+    with subprocess.Popen([sys.executable, '-c', '']) as process:
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # a zombie, as poll() left it
+        assert resident(process.pid) is None
 
 
 @pytest.mark.campaign
