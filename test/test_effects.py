@@ -190,8 +190,8 @@ def test_slow_motion_over_few_cycles_is_sampled(rng, cycles):
     u = (np.arange(8) + 0.5) / 8.0
     errors = 25.0 * rng.uniform(-5e-5, 5e-5, (10_000, cycles + 1))
     angle = (errors[:, :-1, None] * (1.0 - u) + errors[:, 1:, None] * u
-             + 0.02 / (2.0 * np.pi) * bands(rng, 10_000, cycles, (0.02, 0.1), u))
-    gain = 1.0 + 0.2 * bands(rng, 10_000, cycles, (0.02, 0.4), u)
+             + 0.02 / (2.0 * np.pi) * bands(rng, 10_000, cycles, (0.0, 0.1), u))
+    gain = 1.0 + 0.2 * bands(rng, 10_000, cycles, (0.0, 0.4), u)
     check(predict(model, effects), np.abs(np.stack([
         (gain * np.exp(2j * np.pi * g * angle)).mean(axis=(1, 2)) for g in MODEL.orders], 1)))
 
@@ -428,13 +428,11 @@ def test_slow_motions_keep_their_spectrum_in_long_averages(cycles):
     model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 1e12, 'trigger_cycles': cycles,
                              'orders': (1.0,)})
     steps = (np.arange(20_000) + 0.5) / 20_000
-    for band, effect in (((0.02, 0.4), make_effect('amplitude_modulation', std=0.1)),
-                         ((0.02, 0.1), make_effect('phase_wander', std=1e-3, bandwidth=0.1)),
-                         ((0.004, 0.01), make_effect('phase_wander', std=1e-3, bandwidth=0.01)),
-                         ((0.004, 0.01), make_effect('amplitude_modulation', std=0.1,
-                                                     bandwidth=0.01))):
-        frequency = band[0] + (band[1] - band[0]) * steps
-        exact = effect.std**2 * np.mean(np.sinc(cycles * frequency) ** 2)
+    for effect in (make_effect('amplitude_modulation', std=0.1),
+                   make_effect('phase_wander', std=1e-3, bandwidth=0.1),
+                   make_effect('phase_wander', std=1e-3, bandwidth=0.01),
+                   make_effect('amplitude_modulation', std=0.1, bandwidth=0.01)):
+        exact = effect.std**2 * np.mean(np.sinc(cycles * effect.bandwidth * steps) ** 2)
         # Beyond 200 cycles the spectrum is blurred; a correlation cut off was 90 % off at 200.
         assert predict(model, [effect]).moments.variance[0] == pytest.approx(
             exact, rel=3e-4 if cycles <= 200 else 0.05)

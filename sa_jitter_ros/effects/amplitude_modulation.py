@@ -132,7 +132,7 @@ class AmplitudeModulation(DirectEffect):
 def _variance_of_mean(cycles: int, band: tuple[float, float]) -> float:
     """Return the variance of the mean over some cycles of a unit modulation."""
     x = cycles * np.array(band)
-    integral = (special.sici(2.0 * np.pi * x)[0] - np.sin(np.pi * x) ** 2 / (np.pi * x)) / np.pi
+    integral = special.sici(2.0 * np.pi * x)[0] / np.pi - x * np.sinc(x) ** 2
     return float(np.diff(integral)[0] / np.diff(x)[0])  # of sinc(x)^2
 
 

@@ -23,7 +23,8 @@ from sa_jitter_ros.prediction.angle_error import unit_nodes
 Array = NDArray[Any]
 
 #: Of what wanders or modulates, as a fraction of the trigger rate: below half of it by definition.
-SLOW_BAND = (0.02, 0.4)
+#: It may be slower than any record, as load and temperature are.
+SLOW_BAND = (0.0, 0.4)
 #: Of an acceleration, which is nearly constant within a trigger cycle.
 ACCELERATION_BAND = (0.05, 0.2)
 
@@ -41,8 +42,8 @@ def slow_band(bandwidth: float, usual: tuple[float, float] = SLOW_BAND) -> tuple
 
     It begins where the `usual` one does, or at 0.4 of the bandwidth where that is lower.
 
-    >>> slow_band(0.4), slow_band(0.01), slow_band(0.3, ACCELERATION_BAND)
-    ((0.02, 0.4), (0.004, 0.01), (0.05, 0.3))
+    >>> slow_band(0.01), slow_band(0.3, ACCELERATION_BAND), slow_band(0.1, ACCELERATION_BAND)
+    ((0.0, 0.01), (0.05, 0.3), (0.04000000000000001, 0.1))
     """
     return min(usual[0], 0.4 * bandwidth), bandwidth
 

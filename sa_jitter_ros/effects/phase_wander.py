@@ -24,6 +24,7 @@ from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngl
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _NARROW = 0.05
+_STEEPEST = 4.0  # logarithm of half the order of a spectrum: it falls within 2 % of its width
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,7 @@ class PhaseWander(Effect):
     """
     Slow random angle of `std` rad between the shaft of interest and its vibration.
 
-    Its spectrum is flat from a fiftieth of the trigger rate to `bandwidth` times that rate; where
-    the bandwidth is below 0.05, from 0.4 of it.
+    Its spectrum is flat up to `bandwidth` times the trigger rate.
     """
 
     name: ClassVar[str] = 'phase_wander'
@@ -44,8 +44,8 @@ class PhaseWander(Effect):
     pulse_times_correct: ClassVar[bool] = True
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,
-        tuple((0.0, float(np.log(edge)), 0.7) for edge in (_NARROW, 0.15, 0.4)),
-        (-9.0, None, 0.0), (14.0, float(np.log(0.5)), 2.0),
+        tuple((0.0, float(np.log(width)), 0.7) for width in (_NARROW, 0.15, 0.4)),
+        (-9.0, None, 0.0), (14.0, float(np.log(WIDEST)), _STEEPEST),
         limited=(-9.0, float(np.log(_NARROW)), 0.0))
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
@@ -76,15 +76,21 @@ class PhaseWander(Effect):
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting
                   ) -> tuple['PhaseWander', Mapping[str, Any]]:
-        """Return standard deviation and bandwidth of logarithms of power and edge."""
+        """
+        Return standard deviation and bandwidth of logarithms of power and width.
+
+        The bandwidth of a spectrum that falls gradually is no surer than where it falls, from 88
+        to 12 % of its height.
+        """
         rad = 2.0 * np.pi * setting.model.fundamental_frequency
         std = float(rad * setting.unit * np.exp(0.5 * sizes[0]))
-        edge = float(np.exp(sizes[1]))
-        return cls(std, float(np.clip(edge, _NARROW, 0.5))), {
-            'std': 0.5 * std * float(errors[0]), 'bandwidth': edge * float(errors[1])}
+        width, fall = np.exp(sizes[1]), np.exp(-sizes[2])
+        return cls(std, float(np.clip(width, _NARROW, WIDEST))), {
+            'std': 0.5 * std * float(errors[0]),
+            'bandwidth': float(width * np.hypot(errors[1], fall))}
 
     def in_timing(self, setting: Setting) -> Array:
-        """Return the logarithms of power and edge, and of a steep slope."""
+        """Return the logarithms of power and width, and of the steepest slope."""
         rad = 2.0 * np.pi * setting.model.fundamental_frequency
         return np.array([2.0 * np.log(max(self.std / rad / setting.unit, 1e-9)),
-                         np.log(self.bandwidth), 2.0])
+                         np.log(self.bandwidth), _STEEPEST])

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.prediction.model import DeclaredModel
+from scipy import special
 
 Array = NDArray[Any]
 
@@ -105,8 +106,9 @@ def autoregressive(parameters: Array, frequency: Array) -> Array:
 
 
 def low_passed(parameters: Array, frequency: Array) -> Array:
-    """Return a Butterworth density: logarithms of power, edge and half the order of its slope."""
-    edge, slope = np.exp(parameters[1]), np.exp(parameters[2])
+    """Return a Butterworth density: logarithms of power, width and half the order of its slope."""
+    width, slope = np.exp(parameters[1]), np.exp(parameters[2])
     flat = 0.5 * np.pi / slope
-    height = np.exp(parameters[0]) / (2.0 * edge * flat / np.sin(flat))
-    return np.asarray(height / (1.0 + np.minimum(np.abs(frequency) / edge, 1e6) ** (2.0 * slope)))
+    with np.errstate(divide='ignore'):  # frequency 0
+        above = np.log(np.abs(frequency) / width * (flat / np.sin(flat)))
+    return np.asarray(np.exp(parameters[0]) / (2.0 * width) * special.expit(-2.0 * slope * above))

@@ -37,6 +37,7 @@ Array = NDArray[Any]
 #: have and that no effect describes (docs/measured_cases.md).
 STEADY = 0.02
 _CHANCE = 3.0
+_FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
 @dataclass(frozen=True)
@@ -174,29 +175,35 @@ class Bench:
         return Comparison(
             attenuation - expected.attenuation, np.sqrt(expected.attenuation_variance + variance),
             tuple(self.expect(others, self.held_out).attenuation - expected.attenuation
-                  for others in _moved(effects, findings)))
+                  for others, scatters in _moved(effects, findings) if not scatters))
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
         """
         Return the residual of the held-out acquisitions.
 
-        The others measured levels and parameters, whose errors the held-out ones share.
+        The others measured levels and parameters, whose errors the held-out ones share: amplitudes
+        whose variance is estimated scatter as Student's variable does.
         """
         attenuation, variance, amplitude = self.observed(self.held_out)
         level = (self._corrected_variance(effects) + unsteadiness**2) / len(self.fit)
         unsure = np.sqrt(level + unsteadiness**2)
         expected = self.expect(effects, self.held_out, unsteadiness=unsure)
-        moved = []
-        for others in _moved(effects, findings):
+        moved, doubt = [], 0.0
+        for others, scatters in _moved(effects, findings):
             other = self.expect(others, self.held_out, unsteadiness=unsure)
-            moved.append(Sensitivity(
-                (other.attenuation - expected.attenuation).mean(axis=0),
-                float(np.mean((other.attenuation_variance - expected.attenuation_variance)
-                              / (expected.attenuation_variance + variance))),
-                float(np.mean(other.amplitude_variance / expected.amplitude_variance - 1.0))))
-        if moved:
-            level = level + sum(item.mean**2 for item in moved)
+            wider = other.amplitude_variance / expected.amplitude_variance - 1.0
+            doubt += float(np.mean(wider)) ** 2
+            if not scatters:
+                moved.append(Sensitivity(
+                    (other.attenuation - expected.attenuation).mean(axis=0),
+                    float(np.mean((other.attenuation_variance - expected.attenuation_variance)
+                                  / (expected.attenuation_variance + variance))),
+                    float(np.mean(wider))))
+        if doubt:
+            freedom = max(2.0 / doubt, _FREEDOM)
+            level = level + sum(item.mean**2 for item in moved) + (
+                2.0 / (freedom - 2.0) * expected.amplitude_variance.mean(axis=0))
             expected = self.expect(effects, self.held_out,
                                    unsteadiness=np.sqrt(level + unsteadiness**2))
         return residual(
@@ -205,17 +212,18 @@ class Bench:
             level_variance=level, sensitivities=moved)
 
 
-def _moved(effects: Sequence[Effect], findings: Sequence[Finding]) -> Iterator[list[Effect]]:
-    """Yield the effects with each of their numbers one standard error larger."""
+def _moved(effects: Sequence[Effect], findings: Sequence[Finding]
+           ) -> Iterator[tuple[list[Effect], bool]]:
+    """Yield the effects with each number one standard error larger, and whether that scatters."""
     for i, finding in enumerate(findings):
         for shifted in _shifted(finding):
-            yield [*effects[:i], shifted, *effects[i + 1:]]
+            yield [*effects[:i], shifted, *effects[i + 1:]], shifted.scatters
 
 
 def _shifted(finding: Finding) -> list[Effect]:
     """Return the effect with each of its numbers one standard error larger."""
     found: list[Effect] = []
-    if finding.effect is None or finding.effect.scatters:
+    if finding.effect is None:
         return found
     for name, error in finding.standard_errors.items():
         value = finding.effect.values[name]
