@@ -55,8 +55,12 @@ class Waves:
         return replace(self, size=factor * self.size)
 
 
-def band(rng: Generator, low: float, high: float, count: int = 24) -> Waves:
-    """Return nearly normal noise of standard deviation 1 between two frequencies (Hz)."""
+def band(rng: Generator, low: float, high: float, count: int = 400) -> Waves:
+    """
+    Return nearly normal noise of standard deviation 1 between two frequencies (Hz).
+
+    So many waves a recording does not tell apart; it does 24, which are no noise then.
+    """
     edges = np.linspace(low, high, count + 1)
     return Waves(rng.uniform(edges[:-1], edges[1:]), np.full(count, np.sqrt(2.0 / count)),
                  rng.uniform(0.0, 2.0 * np.pi, count))
