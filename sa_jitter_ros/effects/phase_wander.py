@@ -85,7 +85,7 @@ class PhaseWander(Effect):
         rad = 2.0 * np.pi * setting.model.fundamental_frequency
         std = float(rad * setting.unit * np.exp(0.5 * sizes[0]))
         width, fall = np.exp(sizes[1]), np.exp(-sizes[2])
-        return cls(std, float(np.clip(width, _NARROW, WIDEST))), {
+        return cls(std, float(np.clip(width, NARROWEST, WIDEST))), {
             'std': 0.5 * std * float(errors[0]),
             'bandwidth': float(width * np.hypot(errors[1], fall))}
 

@@ -154,7 +154,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
     bends = np.nan_to_num(recovery.ripple[here.start:here.stop - 1])
     error_std = float(np.median(recovery.bridged_standard_errors[here][measured]))
     prior = expected[0]
-    bend_prior = expected[1]
+    bend_std, bend_prior = recovery.ripple_standard_error, expected[1]
     # where the vibration resolves the errors, it shows more than the reference keyphasor does
     referenced = observation.pulses.reference is not None and not error_std < _RESOLVED * unit
     if referenced and observation.pulses.reference is not None:
@@ -164,7 +164,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
         errors = np.where(known, bridged - better, 0.0)
         errors = errors - errors[measured].mean()
         error_std, prior = _REFERENCE * unit, math.inf
-        bends, bend_prior = np.zeros(bridged.size - 1), _REFERENCE * unit
+        bend_std = math.inf  # what shows no errors shows no bends
     smooth, grid = _grid(recovery.times, clock), None
     if smooth is not None:
         grid = np.zeros(recovery.bridged.size)
@@ -173,7 +173,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
     setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
                       float(recovery.bridged[0]), recovery.bridged[part], grid, clock.rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
-                   recovery.ripple_standard_error, bend_prior, referenced)
+                   bend_std, bend_prior, referenced)
 
 
 def _grid(times: Array, clock: Clock) -> Array | None:
