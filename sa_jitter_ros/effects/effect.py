@@ -31,8 +31,10 @@ from scipy import special
 
 Array = NDArray[Any]
 
-#: What a normal variable exceeds with 5 %, in standard deviations.
-ONE_SIDED = 1.6449
+#: Chance of what is beyond a limit, and of what is taken for decided and is not.
+RARE = 0.05
+#: What a normal variable exceeds so seldom, in standard deviations.
+ONE_SIDED = -float(special.ndtri(RARE))
 #: Standard errors of a power, where there is none, below which no limit is.
 SEEN = 0.25
 #: Logarithm of the odds against an effect before any data: one in 150.

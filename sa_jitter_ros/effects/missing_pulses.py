@@ -25,7 +25,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.polynomial import legendre
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter)
+    absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter, RARE)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, joint_characteristic, unit_nodes)
@@ -36,7 +36,6 @@ from scipy import special
 
 _SCENARIOS, _SEED = 256, 4
 _RULE = unit_nodes(20)
-_RARE = 1e-12  # probability of the losses that are left out
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class MissingPulses(DirectEffect):
         """Return the probability of which as few losses are as rare as 5 % (Clopper, Pearson)."""
         missing = evidence.record_missing
         return cls(min(float(special.betaincinv(
-            missing.sum() + 1.0, max(missing.size, 1), 0.95)), 0.9))
+            missing.sum() + 1.0, max(missing.size, 1), 1.0 - RARE)), 0.9))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
@@ -121,7 +120,8 @@ def loss_moments(
     that of a pulse to be lost.
     """
     u = _RULE[0]
-    most = max(1, int(np.ceil(np.log(_RARE) / np.log(probability))))
+    # what is left out is less than rounding
+    most = max(1, int(np.ceil(np.log(np.finfo(np.float64).eps) / np.log(probability))))
     lost = np.arange(most + 1)
     chance = (1.0 - probability) * probability**lost
     omega = 2.0 * np.pi * np.multiply.outer(turns, lost)  # (order, lost)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
-    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, SEEN)
+    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
@@ -41,8 +41,6 @@ from scipy import special
 
 Array = NDArray[Any]
 
-_CONFIDENCE = 0.95
-_TWO_SIDED = float(special.ndtri(0.5 * (1.0 + _CONFIDENCE)))
 _LEAST = -9.0  # logarithm of a power that is nothing
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 _SLOWEST = 0.2  # share of a step by which the next one is shorter
@@ -161,13 +159,14 @@ def _farthest(sizes: Array, covariance: Array) -> Array:
     distance = min(float(sizes @ np.linalg.pinv(covariance) @ sizes), _CERTAIN)
     if not distance > 0.0:
         return sizes
-    true = max(float(special.chndtrinc(distance, sizes.size, 1.0 - _CONFIDENCE)), 1.0)
+    true = max(float(special.chndtrinc(distance, sizes.size, RARE)), 1.0)
     return np.asarray(sizes * math.sqrt(true / distance))
 
 
 def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
     """Return the interval of the size of the declared jitter."""
-    low, high = (_bound(timing, JITTER, -_LEAST, sign * _TWO_SIDED) for sign in (-1.0, 1.0))
+    far = float(special.ndtri(0.5 * RARE))  # on either side
+    low, high = (_bound(timing, JITTER, -_LEAST, side) for side in (far, -far))
     return (None if low is None else math.exp(0.5 * low[0]),
             None if high is None else JitterScale(math.exp(0.5 * high[0])))
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import ODDS
+from sa_jitter_ros.effects.effect import ODDS, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
@@ -41,13 +41,9 @@ RIPPLE = 'ripple'
 #: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.
 SIDEBANDS = 'sidebands'
 NO_EFFECTS = RIPPLE, SIDEBANDS
-#: Logarithm of the odds of two explanations, 20 to 1, from which on one of them is the answer.
-DECIDED = math.log(20.0)
-_MOST = 4  # effects at once
-_BESIDE_CLOCK = 2  # patterns beside that of a clock
+#: Logarithm of the odds of two explanations from which on one of them is the answer.
+DECIDED = -math.log(RARE)
 _STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
-_BETTER = 0.01
-_RARE = 1e9
 
 
 @dataclass(frozen=True)
@@ -83,7 +79,7 @@ class Choice:
         if self.ticked:
             return {name: float(name in self.best) for name in names}
         top = max(self.scores.values())
-        odds = {key: math.exp(max(value - top, -700.0)) for key, value in self.scores.items()}
+        odds = {key: math.exp(value - top) for key, value in self.scores.items()}
         total = sum(odds.values())
         return {name: sum(value for key, value in odds.items() if name in key) / total
                 for name in names}
@@ -94,7 +90,7 @@ class Choice:
             return ()
         least = self.scores[self.best] - DECIDED
         return tuple(other for other in self.probabilities if other not in self.best and (
-            self.scores.get((self.best - {name}) | {other}, -_RARE) > least))
+            self.scores.get((self.best - {name}) | {other}, -math.inf) > least))
 
 
 class Chooser:
@@ -193,11 +189,11 @@ class Chooser:
         for name in names & fit.columns.keys():
             pattern, size = fit.patterns[name][0], fit.pattern(name)[0]
             if pattern.about is not None and abs(size[0] - pattern.about[0]) > pattern.about[1]:
-                return -_RARE
+                return -math.inf
             if pattern.usual is not None:
                 prior += 0.5 * float(size[0] / pattern.usual(self.setting)) ** 2
         if not math.isfinite(fit.value):
-            return -_RARE
+            return -math.inf
         shape = max(self.of_shape(fit, power) for power in self._powers(fit))
         return fit.value + shape - prior - self._gained_by_chance(fit) - ODDS * len(names)
 
@@ -313,10 +309,9 @@ class Chooser:
             moves += [(best - {name}) | {other} for name in best for other in pool
                       if other not in best]
             start = self.fits[best].starts
-            scores = {move: self.score(move, self.fit(move, start)) for move in moves
-                      if len(move) <= _MOST}
+            scores = {move: self.score(move, self.fit(move, start)) for move in moves}
             better = max(scores, key=lambda move: scores[move])
-            if scores[better] <= top + _BETTER:
+            if scores[better] <= top:
                 break
             best, top = better, scores[better]
         return self.choice(best)
@@ -326,7 +321,7 @@ class Chooser:
         clocks = {name for name, (item, _) in self.patterns.items() if item.replaces_jitter}
         others = sorted(self.patterns.keys() & EFFECTS.keys() - clocks)
         if clocks:
-            for count in range(_BESIDE_CLOCK + 1):
+            for count in range(len(others) + 1):
                 for some in combinations(others, count):
                     alone = frozenset(some)
                     fit = self._on_ticks(alone)
@@ -339,7 +334,7 @@ class Chooser:
         """Return what ticks leave, and sidebands beside it if these make bends in the cycles."""
         more = alone | {SIDEBANDS}
         if SIDEBANDS not in self.spectra or self.score(more, self.fit(more)) < self.score(
-                alone, self.fit(alone)) + _BETTER:
+                alone, self.fit(alone)):
             return best
         fit, ticked = copy(self.fit(more)), self.fits[best]
         fit.sizes, fit.size_covariance = ticked.sizes, ticked.size_covariance
@@ -350,7 +345,7 @@ class Chooser:
         """Return the choice of a set."""
         scores = {names: self.score(names, fit) for names, fit in self.fits.items()}
         possible = {names: fit for names, fit in self.fits.items()
-                    if names == best or scores[names] > -_RARE}
+                    if names == best or scores[names] > -math.inf}
         return Choice(best, possible, {names: scores[names] for names in possible}, self.setting,
                       tuple(self.declared.values()))
 
