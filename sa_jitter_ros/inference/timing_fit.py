@@ -37,10 +37,10 @@ _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # logarithm of the noise power
-_ROUNDS, _FIRST_STEPS, _STEPS, _SAME = 4, 150, 60, 0.05
-_STEP, _CURVED = 1e-5, 1e-3
-_NOTHING = 1e-12  # information
-_LOW, _HIGH = -16.0, 16.0
+_SAME = 0.05  # gain in log likelihood that ends a search
+_STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
+_CURVED = 1e-3
+_FAR = 16.0  # logarithm of a power, in unit^2, beyond which there is none
 
 
 def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
@@ -111,7 +111,7 @@ class TimingFit:
         level = float(np.log(np.mean(np.abs(self.ordinates[:few, 0]) ** 2) + 1e-12))
         blocks: dict[str, tuple[Sequence[float], Sequence[float], Sequence[float]]] = {
             SHAFT: ((min(level, 3.0),) * (_KNOTS - 1) + (-3.0, _EDGE_SLOPE[0]),
-                    (_LOW,) * _KNOTS + (0.7,), (_HIGH,) * _KNOTS + (2.3,)),
+                    (-_FAR,) * _KNOTS + (0.7,), (_FAR,) * _KNOTS + (2.3,)),
             NOISE: ((0.0,), (-2.5,), (3.0,))}
         if self.free_jitter:
             replaced = any(item.replaces_jitter for item, _ in self.patterns.values())
@@ -135,18 +135,14 @@ class TimingFit:
         self._held = len(held)
 
     def _maximise(self) -> None:
-        before = np.inf
-        for number in range(_ROUNDS):
+        self.value, before = -np.inf, -np.inf
+        while before == -np.inf or (self.columns and self.value > before + _SAME):
+            before = self.value
             self.sizes, self.size_covariance, left = self._patterns(self.spectrum(self.parameters))
             self.power = self.data.binned(left)
             found = minimize(self._cost, self.parameters, method='L-BFGS-B', jac=True,
-                             bounds=list(zip(self.lower, self.upper)),
-                             options={'maxiter': _STEPS if number else _FIRST_STEPS})
-            self.parameters, now = found.x, float(found.fun)
-            self.value = -now
-            if not self.columns or abs(before - now) < _SAME:
-                break
-            before = now
+                             bounds=list(zip(self.lower, self.upper)))
+            self.parameters, self.value = found.x, -float(found.fun)
 
     @property
     def count(self) -> int:
@@ -283,10 +279,10 @@ class TimingFit:
         known = prior[:, chosen] + np.einsum('f,afij,bfji->ab', size, change, change).real
         known[1:, 1:] += np.diag(12.0 / (self.upper - self.lower)[chosen[1:]] ** 2)
         share = np.append(1.0, -np.linalg.solve(known[1:, 1:], known[1:, 0]))
-        information = max(float(share @ known[0]), _NOTHING)
-        weight = np.einsum('a,afij->fij', share, change)
-        if not np.any(weight):  # a source that moves, against a reference keyphasor
+        information = float(share @ known[0])
+        if not information > 0.0:  # a source that moves, against a reference keyphasor
             return 0.0, 0.0
+        weight = np.einsum('a,afij->fij', share, change)
         declared = np.einsum('f,fij,fji->', size, weight @ self.inverse, self._at_zero(PULSES)
                              ).real * self.data.measured
         if JITTER in self.place:  # more may be of normal errors beside
