@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.timing import PULSES, SOURCE
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser
-from sa_jitter_ros.inference.timing_data import steering, Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
 
@@ -33,7 +33,6 @@ Array = NDArray[Any]
 _DRAWS, _SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
-_MOTIONS = -1, 0, 1  # aliases of a motion that needs no explanation
 _FEWEST = 40  # pulses whose distribution is looked at
 _EVEN, _TINY = 513, 1e-12  # frequencies of a response; power that is none, in unit^2
 _OFTEN, _TAIL = 0.02, 0.9  # shares of the draws: of the p values that they tell, and their tail
@@ -63,8 +62,8 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
         EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
     fit = choice.fit
     # where a smooth motion does not end, nothing is known: it may leave out any frequency
-    found = [max((check(fit, fit.beside_motion(alias), direction) for alias in _MOTIONS),
-                 key=lambda item: item.p_value)
+    found = [max((check(fit, fit.beside_motion(alias), direction)
+                  for alias in range(ALIASES.size)), key=lambda item: item.p_value)
              for direction in directions for check in (_power, _sinusoid)]
     lasting = [name for name, item in fit.spectra.items()
                if name in EFFECTS and len(item.upper) > 1]

@@ -29,14 +29,13 @@ from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
 Array = NDArray[Any]
 
-ALIASES = np.arange(-2, 3)
-_ZERO = 2  # the one of the frequency itself
+#: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
+ALIASES = np.array([0, 1, -1])
 _TAPER = 0.05  # of a stretch, at either end
 _BINS, _WIDER, _NARROW = 60, 1.12, 6
 #: Trigger cycles of a stretch from which it shows something.
 FEWEST = 12
 _POINTS = 64  # in a cycle
-_NO_NOISE = 1e-8  # of second differences, in unit^2
 _U = (np.arange(_POINTS) + 0.5) / _POINTS
 
 
@@ -107,7 +106,7 @@ class TimingData:
                 name, self.frequency, self.frequency + n, referenced=self._referenced))
                 for n in ALIASES])
             self.steer[name] = outer(passed)
-        self.steer[PULSES] = self.steer[PULSES][_ZERO:_ZERO + 1]
+        self.steer[PULSES] = self.steer[PULSES][:1]
         self.ordinates = self.transform([self._series(item) for item in self.stretches])
 
     @property
@@ -152,7 +151,6 @@ class TimingData:
         passed[:, 1:, 1:] = (inverse @ information)[:, :2]
         corrected = _corrected(self.frequency)
         noise = np.zeros((self.frequency.size, 3, 3), complex)
-        noise[:, 0, 0] = _NO_NOISE
         noise[:, 1:, 1:] = (inverse @ information @ inverse)[:, :2, :2]
         return (np.asarray(corrected @ passed),
                 np.asarray(corrected @ noise @ corrected.conj().swapaxes(1, 2)))

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
-from sa_jitter_ros.inference.timing_data import ALIASES, TimingData
+from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
 
 Array = NDArray[Any]
@@ -102,7 +102,7 @@ class TimingFit:
     def _of(self, direction: str, density: Array) -> Array:
         steer = self.data.steer[direction]
         if direction == PULSES:
-            density = density[len(density) // 2][None] * self.data.measured
+            density = density[:1] * self.data.measured
         return np.asarray(np.einsum('af,afij->fij', density, steer))
 
     def _lay_out(self, start: Mapping[str, Array], held: Mapping[tuple[str, int], float]) -> None:
@@ -221,7 +221,7 @@ class TimingFit:
                 moved[i] += _STEP
                 step = (self.density(name, moved) - base) / _STEP
                 if direction == PULSES:
-                    step = step[len(step) // 2][None]
+                    step = step[:1]
                 slope[i] += np.sum(step * along[direction])
         return value, slope
 
@@ -283,8 +283,8 @@ class TimingFit:
         if not information > 0.0:  # a source that moves, against a reference keyphasor
             return 0.0, 0.0
         weight = np.einsum('a,afij->fij', share, change)
-        declared = np.einsum('f,fij,fji->', size, weight @ self.inverse, self._at_zero(PULSES)
-                             ).real * self.data.measured
+        declared = np.einsum('f,fij,fji->', size, weight @ self.inverse,
+                             self.data.steer[PULSES][0]).real * self.data.measured
         if JITTER in self.place:  # more may be of normal errors beside
             power = float(at[self.place[JITTER]][0])
             declared *= math.exp(power if name == JITTER else min(power, 0.0))
@@ -311,23 +311,20 @@ class TimingFit:
         return np.asarray(np.linalg.inv(self.spectrum(self.parameters)))
 
     def beside_motion(self, alias: int) -> Array:
-        """Return the inverse (bin, 3, 3) in which any motion at an alias counts nothing."""
-        steer = self.data.steer[MOTION][len(ALIASES) // 2 + alias]
+        """Return the inverse (bin, 3, 3) in which any motion at that of `ALIASES` counts nothing."""
+        steer = self.data.steer[MOTION][alias]
         found = self.inverse @ steer @ self.inverse
         return np.asarray(self.inverse - found / np.einsum(
             'fij,fji->f', self.inverse, steer).real[:, None, None])
 
     def floor(self, direction: str, inverse: Array) -> Array:
         """Return the variance (bin,), in unit^2, of what the data tell of power in a direction."""
-        return np.asarray(1.0 / np.einsum('fij,fji->f', inverse, self._at_zero(direction)).real)
+        steer = self.data.steer[direction][0]
+        return np.asarray(1.0 / np.einsum('fij,fji->f', inverse, steer).real)
 
     def excess(self, direction: str, inverse: Array) -> Array:
         """Return the power (bin,) in a direction over that of the fit; 1 where all is right."""
-        steer = self._at_zero(direction)
+        steer = self.data.steer[direction][0]
         weight = inverse @ steer @ inverse
         return np.asarray(np.einsum('fij,fji->f', weight, self.data.binned(self.left)).real
                           / np.einsum('fij,fji->f', inverse, steer).real)
-
-    def _at_zero(self, direction: str) -> Array:
-        steer = self.data.steer[direction]
-        return np.asarray(steer[len(steer) // 2])
