@@ -32,7 +32,7 @@ Array = NDArray[Any]
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
 ALIASES = np.array([0, 1, -1])
 _TAPER = 0.05  # of a stretch, at either end
-_BINS, _WIDER, _NARROW = 60, 1.12, 6
+_BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one
 #: Trigger cycles of a stretch from which it shows something.
 FEWEST = 12
 _POINTS = 64  # in a cycle
@@ -253,9 +253,8 @@ def _effective(count: int) -> float:
 
 def _edges(count: int, stretches: int) -> Array:
     """Return the edges of bins of ordinates: single frequencies first, then wider ones."""
-    edges, width = [0], 1.0
+    edges = [0]
     while edges[-1] < count:
-        if len(edges) > _NARROW:
-            width = min(width * _WIDER, max(1.0, count / _BINS / stretches))
-        edges.append(min(edges[-1] + max(1, int(width)) * stretches, count))
+        width = min(edges[-1] // _SHARP, count // _BINS) // stretches
+        edges.append(min(edges[-1] + max(1, width) * stretches, count))
     return np.array(edges)
