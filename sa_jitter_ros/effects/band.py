@@ -34,6 +34,8 @@ NARROWEST, WIDEST = 1e-4, 0.5
 # Cycles over which a correlation is followed: enough for ten periods of the highest frequency.
 _MEMORY, _LONGEST, _PERIODS = 200, 2000, 10.0
 _RULE = unit_nodes(256)  # enough for the turns of some hundred lags
+#: Nodes and weights inside a cycle, enough for what turns once in it.
+INSIDE = unit_nodes(20)
 
 
 def slow_band(bandwidth: float, usual: tuple[float, float] = SLOW_BAND) -> tuple[float, float]:
@@ -59,8 +61,7 @@ def fading(lag: ArrayLike, trigger_cycles: int, band: tuple[float, float]) -> Ar
 
     1 where an average is no longer than the memory, so that they are exact. To cut them off would
     leave power at frequency 0, which no length of an average takes out; to fade them blurs the
-    spectrum by 1/300 of the trigger rate, less than its lowest frequencies, and less the slower
-    the motion is, down to 1/3000.
+    spectrum by 1/300 of the trigger rate, and less the slower the motion is, down to 1/3000.
     """
     reach = _reach(band)
     if trigger_cycles <= reach:
@@ -91,8 +92,8 @@ def recovered_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:
 
     A motion that is fast enough to bend within a cycle pulls the fitted errors a little.
     """
-    frequency, weight = _even(band)
-    gain = _recovered(frequency)[0] ** 2
+    frequency, weight = even_in(band)
+    gain = recovered(frequency, frequency)[:, 0].real ** 2
     return np.asarray(np.cos(2.0 * np.pi * np.multiply.outer(lag, frequency)) @ (weight * gain))
 
 
@@ -116,30 +117,34 @@ def band_of_ripple(correlation: Array) -> Array:
 
 def _ripple_covariance(band: tuple[float, float], lag: int) -> float:
     """Return the autocovariance of the recovered ripple of a unit acceleration."""
-    frequency, weight = _even(band)
-    gain = _recovered(frequency)[1] / (2.0 * np.pi * frequency) ** 2
+    frequency, weight = even_in(band)
+    gain = np.abs(recovered(frequency, frequency)[:, 1]) / (2.0 * np.pi * frequency) ** 2
     return float(weight @ (gain**2 * np.cos(2.0 * np.pi * frequency * lag)))
 
 
-def _even(band: tuple[float, float]) -> tuple[Array, Array]:
+def even_in(band: tuple[float, float]) -> tuple[Array, Array]:
+    """Return frequencies in a band and their weights, whose sum is 1."""
     u, weight = _RULE
     return band[0] + (band[1] - band[0]) * u, weight
 
 
-def _recovered(frequency: Array) -> tuple[Array, Array]:
-    """
-    Return pulse errors and ripple, as factors, that the recovery fits to exp(2 pi j frequency t).
+def recovered_shapes(frequency: Array) -> tuple[Array, Array]:
+    """Return the shapes (f, u, 3) that the recovery fits inside a cycle, and their products."""
+    u, weight = INSIDE
+    z = np.exp(2j * np.pi * frequency)[:, None]
+    bump = np.broadcast_to(u * (1.0 - u), (frequency.size, u.size))
+    shapes = np.stack([1.0 - u + u * z, bump, bump * (2.0 * u - 1.0)], axis=-1)
+    return shapes, np.einsum('fui,u,fuj->fij', shapes.conj(), weight, shapes, optimize=True)
 
-    It fits hats between the pulses, and in every cycle a bump u (1 - u) and a bend
-    u (1 - u) (2 u - 1), by least squares; hats and bump are in phase with the motion, the bump in
-    the middle of its cycle.
+
+def recovered(frequency: Array, turning: Array) -> Array:
     """
-    u, weight = _RULE
-    turn = 2.0 * np.pi * np.multiply.outer(u - 0.5, frequency)
-    bump = (weight * u * (1.0 - u)) @ np.cos(turn)
-    bend = (weight * u * (1.0 - u) * (2.0 * u - 1.0)) @ np.sin(turn)
-    half = np.cos(np.pi * frequency)
-    hats = 30.0 * (np.sinc(frequency) ** 2 - 5.0 * half * bump
-                   - 7.0 * np.sin(np.pi * frequency) * bend) / (
-        4.0 + np.cos(2.0 * np.pi * frequency))
-    return hats, 30.0 * (bump - half * hats / 6.0)
+    Return pulse errors, bumps and bends (f, 3) that the recovery fits to exp(2 pi j turning u).
+
+    It fits hats between pulses that turn by `frequency`, and in every cycle a bump u (1 - u) and a
+    bend u (1 - u) (2 u - 1), by least squares.
+    """
+    shapes, normal = recovered_shapes(frequency)
+    wave = INSIDE[1] * np.exp(2j * np.pi * turning[:, None] * INSIDE[0])
+    right = np.einsum('fui,fu->fi', shapes.conj(), wave)
+    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])

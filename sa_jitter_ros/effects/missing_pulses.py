@@ -24,18 +24,17 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.polynomial import legendre
+from sa_jitter_ros.effects.band import INSIDE
 from sa_jitter_ros.effects.effect import (
     absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter, RARE)
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.prediction.angle_error import (
-    AngleErrorProcess, joint_characteristic, unit_nodes)
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, joint_characteristic
 from sa_jitter_ros.prediction.influence import mean_period, Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 from scipy import special
 
 _SCENARIOS, _SEED = 256, 4
-_RULE = unit_nodes(20)
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ def loss_moments(
     `turns` (order,) are the cycles of each order in a trigger cycle; `probability` in (0, 1) is
     that of a pulse to be lost.
     """
-    u = _RULE[0]
+    u = INSIDE[0]
     # what is left out is less than rounding
     most = max(1, int(np.ceil(np.log(np.finfo(np.float64).eps) / np.log(probability))))
     lost = np.arange(most + 1)
@@ -159,7 +158,7 @@ def loss_moments(
 
 def _fourier_weights(omega: Array) -> Array:
     """Return the weights (..., u) of int_0^1 exp(j omega u) f(u) du for a smooth f."""
-    u, w = _RULE
+    u, w = INSIDE
     degree = np.arange(u.size)
     polynomials = legendre.legvander(2.0 * u - 1.0, u.size - 1)  # (u, degree)
     bessel = special.spherical_jn(degree, 0.5 * omega[..., None])

@@ -17,13 +17,13 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.band import (
-    ACCELERATION_BAND, fading, NARROWEST, ripple_of_acceleration, slow_band, slow_memory, WIDEST)
+    ACCELERATION_BAND, even_in, fading, NARROWEST, ripple_of_acceleration, slow_band, slow_memory,
+    WIDEST)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
-from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError, unit_nodes
+from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights
 
-_FREQUENCIES, _FREQUENCY_WEIGHTS = unit_nodes(128)  # enough for the memory of slow motions
 _MOST_KEPT = 500  # covariances at the same places
 
 
@@ -84,8 +84,8 @@ def _unit_covariance(weights: PulseWeights, cycles: int, band: tuple[float, floa
     motion. All orders at all speeds ask for the same places, so that it is kept for these. It
     fades over an average of so many `cycles`.
     """
-    low, high = band
-    turn = 2j * np.pi * (low + (high - low) * _FREQUENCIES)
+    frequency, weight = even_in(band)
+    turn = 2j * np.pi * frequency
     at_pulses = np.exp(np.multiply.outer(turn, np.arange(weights.pulses) - weights.before))
 
     def missed(u: Array) -> Array:
@@ -100,7 +100,7 @@ def _unit_covariance(weights: PulseWeights, cycles: int, band: tuple[float, floa
         if key not in known:
             if len(known) >= _MOST_KEPT:
                 known.clear()
-            later = missed(v) * np.exp(turn * lag) * _FREQUENCY_WEIGHTS
+            later = missed(v) * np.exp(turn * lag) * weight
             known[key] = np.einsum('...f,...f', missed(u).conj(), later).real * fading(
                 lag + v - u, cycles, band)
         return known[key]

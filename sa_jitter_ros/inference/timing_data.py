@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.band import recovered, recovered_shapes
 from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
 Array = NDArray[Any]
@@ -35,8 +36,6 @@ _TAPER = 0.05  # of a stretch, at either end
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one
 #: Trigger cycles of a stretch from which it shows something.
 FEWEST = 12
-_POINTS = 64  # in a cycle
-_U = (np.arange(_POINTS) + 0.5) / _POINTS
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ class TimingData:
         priors = np.array([stretch.prior_std, stretch.bend_prior_std, stretch.bend_prior_std])
         prior = np.diag((self.unit / priors) ** 2)
         variance = float(np.mean([item.error_std for item in self.stretches]) / self.unit) ** 2
-        normal = _normal(self.frequency)[1]
+        normal = recovered_shapes(self.frequency)[1]
 
         def spread(information: float) -> float:
             inverse = np.linalg.inv(information * normal + prior)
@@ -199,7 +198,7 @@ def steering(direction: str, frequency: Array, turning: Array, *, referenced: bo
     z = np.exp(2j * np.pi * turning)
     none = np.zeros_like(z)
     pulses = np.stack([(z - 1.0) ** 2, np.ones_like(z), none, none], axis=-1)
-    followed = _projected(frequency, turning)
+    followed = recovered(frequency, turning)
     if referenced:  # the pulses are compared with other pulses, and bends are those of the speed
         followed[:, 0] = 0.0 if direction == SOURCE else 1.0
     source = np.concatenate([none[:, None], -followed], axis=1)
@@ -217,22 +216,6 @@ def _corrected(frequency: Array) -> Array:
 def outer(vectors: Array) -> Array:
     """Return vector times its conjugate, of the last axis."""
     return np.asarray(vectors[..., :, None] * vectors[..., None, :].conj())
-
-
-def _normal(frequency: Array) -> tuple[Array, Array]:
-    """Return hat function and bends of a wave over a cycle (f, u, 3) and their products."""
-    z = np.exp(2j * np.pi * frequency)[:, None]
-    bend = np.broadcast_to(_U * (1.0 - _U), (frequency.size, _POINTS))
-    shapes = np.stack([1.0 - _U + _U * z, bend, bend * (2.0 * _U - 1.0)], axis=-1)
-    return shapes, np.einsum('fui,fuj->fij', shapes.conj(), shapes) / _POINTS
-
-
-def _projected(frequency: Array, turning: Array) -> Array:
-    """Return the least squares fit (f, 3) of hat function and bends to a wave."""
-    shapes, normal = _normal(frequency)
-    wave = np.exp(2j * np.pi * turning[:, None] * _U)
-    right = np.einsum('fui,fu->fi', shapes.conj(), wave) / _POINTS
-    return np.asarray(np.linalg.solve(normal, right[..., None])[..., 0])
 
 
 def _frequencies(count: int) -> Array:
