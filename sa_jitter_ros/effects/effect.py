@@ -39,7 +39,7 @@ ONE_SIDED = -float(special.ndtri(RARE))
 SEEN = 0.25
 #: Logarithm of the odds against an effect before any data: one in 150.
 ODDS = 5.0
-_MOST_ERRORS = 4_000_000  # of pulses in all scenarios
+_SCENARIOS, _MOST_ERRORS = 128, 4_000_000  # of an effect; of pulses in all of them
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def largest_power(value: float, count: float, noise: float, square: float, memor
     return max((middle + beyond) / left, SEEN * math.sqrt(2.0 * square / count))
 
 
-def most_scenarios(model: DeclaredModel, wanted: int) -> int:
+def most_scenarios(model: DeclaredModel, wanted: int = _SCENARIOS) -> int:
     """Return how many scenarios of a model's averages to list: fewer where averages are long."""
     return int(np.clip(_MOST_ERRORS // model.trigger_cycles, 1, wanted))
 

@@ -18,8 +18,7 @@ from sa_jitter_ros.effects.effect import (
     absent, Array, DirectEffect, Effect, Finding, ONE_SIDED, parameter, require_below, weighed)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.model import DeclaredModel
-
-_MOST = 1e6
+from sa_jitter_ros.prediction.moments import MOST_NOISE
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class InterferingTone(DirectEffect):
 
     def line_variance(self, model: DeclaredModel) -> Array:
         """Return the power that the comb filter of the average passes (Eq. 8)."""
-        require_below('interfering_tone.amplitude', self.amplitude, _MOST, 'components',
+        require_below('interfering_tone.amplitude', self.amplitude, MOST_NOISE, 'components',
                       'no component is visible beside it; lower it')
         line = np.asarray(model.orders) * model.fundamental_frequency
         passed = (np.sinc((self.frequency - line) * model.duration) ** 2

@@ -25,15 +25,15 @@ import numpy as np
 from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, parameter, require_in_turn)
 from sa_jitter_ros.effects.evidence import root
+from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
-_PHASES, _SEED = 128, 6
-_SAME_RATE = 0.01
+_SEED = 6
 _PARTS = 8
-_SLOPE = 1.0, 0.25  # of the errors over those that a grid imposes, and what it may be off by
+_OFF = 0.25  # what the slope of the errors over those that a grid imposes may be off by
 
 
 def _of_grid(setting: Setting) -> Array:
@@ -53,7 +53,7 @@ class KeyphasorQuantisation(Effect):
         'a clock rounds the pulse times to its ticks, so that the errors of neighbouring '
         'pulses depend on each other')
     remedy: ClassVar[str] = 'sample the keyphasor faster, or time its edges by a counter'
-    timing: ClassVar[Pattern] = Pattern(_of_grid, about=_SLOPE, replaces_jitter=True)
+    timing: ClassVar[Pattern] = Pattern(_of_grid, off_by=_OFF, replaces_jitter=True)
     clock_rate: float = parameter(10000.0, 'rate of the clock that times the pulses', 'Hz',
                                   above=0.0)
     period_std: float = parameter(0.0, 'standard deviation of the trigger period', 's',
@@ -65,7 +65,7 @@ class KeyphasorQuantisation(Effect):
                         model)
         require_in_turn('the spread of keyphasor_quantisation.period_std',
                         Normal(self.period_std).width, model)
-        return self.drawn_scenarios(model, most_scenarios(model, _PHASES))
+        return self.drawn_scenarios(model, most_scenarios(model))
 
     def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array:
         """Return the errors for as many evenly spread phases."""
@@ -85,7 +85,7 @@ class KeyphasorQuantisation(Effect):
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one."""
-        return abs(self.clock_rate / model.keyphasor_rate - 1.0) < _SAME_RATE
+        return abs(self.clock_rate / model.keyphasor_rate - 1.0) < SAME_RATE
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting
@@ -100,4 +100,4 @@ class KeyphasorQuantisation(Effect):
 
     def in_timing(self, setting: Setting) -> Array:
         """Return the slope of the errors over those that a grid imposes."""
-        return np.array([_SLOPE[0]])
+        return np.ones(1)

@@ -21,8 +21,10 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Array = NDArray[Any]
 
-_TOLERANCE = 0.02  # of a tick
-_ROOM = 0.02  # of a tick
+#: Relative difference of rates below which two clocks count as one.
+SAME_RATE = 0.01
+#: Of a tick: what errors that a clock makes may be wrong by, and what none is seen below.
+ROOM = 0.02
 _STEPS = 3000
 _FEWEST = 8
 # Ticks that an interval holds at least: with fewer, pulses are no time measurement.
@@ -49,7 +51,7 @@ def find_clock(times: Array) -> Clock:
     intervals = intervals[intervals < 1.5 * np.median(intervals)]
     if intervals.size < _FEWEST:
         return none
-    resolution = 4.0 * np.spacing(np.max(np.abs(times)))
+    resolution = rounding(times)
     gaps = np.diff(intervals)
     steps = gaps[gaps > max(resolution, 1e-3 * float(np.max(gaps)), 1e-12)]
     if steps.size == 0:
@@ -73,11 +75,16 @@ def find_clock(times: Array) -> Clock:
     centred = ticks - ticks.mean()
     tick = float(elapsed @ centred / (centred @ centred))
     scatter = float(np.std(elapsed - tick * ticks))
-    if scatter > _TOLERANCE * tick or np.gcd.reduce(ticks.astype(np.int64)) > 1:
+    if scatter > ROOM * tick or np.gcd.reduce(ticks.astype(np.int64)) > 1:
         return none
     # Rounding is no chance: it need not average out over the pulses.
     error = np.hypot(scatter / np.sqrt(centred @ centred), resolution / ticks[-1]) / tick**2
     return Clock(1.0 / tick, float(error))
+
+
+def rounding(times: Array) -> float:
+    """Return what the difference of two intervals of `times` may be wrong by, as numbers."""
+    return 4.0 * float(np.spacing(np.max(np.abs(times))))
 
 
 def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Array:
@@ -137,7 +144,7 @@ def ticks_leave_room(errors: Sequence[Array], variance: float, clock_rate: float
     `variance` is that of what the errors are wrong by.
     """
     beyond = np.mean([placed_on_grid(row, clock_rate)[1] ** 2 for row in errors])
-    return bool(beyond < max(variance, (_ROOM / clock_rate) ** 2))
+    return bool(beyond < max(variance, (ROOM / clock_rate) ** 2))
 
 
 def ticks_log_likelihood(errors: Sequence[Array], variance: float, clock_rate: float) -> float:
@@ -147,7 +154,7 @@ def ticks_log_likelihood(errors: Sequence[Array], variance: float, clock_rate: f
     They are uniform over a tick, and wrong by normal errors of `variance`, as large as
     `ticks_leave_room` lets them be at least.
     """
-    std = max(np.sqrt(variance) * clock_rate, _ROOM)
+    std = max(np.sqrt(variance) * clock_rate, ROOM)
     total = 0.0
     for row in errors:
         placed = clock_rate * np.abs(placed_on_grid(row, clock_rate)[0])

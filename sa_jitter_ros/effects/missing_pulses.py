@@ -34,7 +34,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 from scipy import special
 
-_SCENARIOS, _SEED = 256, 4
+_SEED = 4
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class MissingPulses(DirectEffect):
         """Return how far the counted angle is behind, as a delay, for some draws of losses."""
         if self.probability == 0.0:
             return None
-        return self.drawn_scenarios(model, most_scenarios(model, _SCENARIOS))
+        return self.drawn_scenarios(model, most_scenarios(model))
 
     def drawn_scenarios(self, model: DeclaredModel, count: int) -> Array:
         """Return the delays for as many draws of losses."""

@@ -22,13 +22,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    Array, Effect, most_scenarios, parameter, require_in_turn)
+    Array, Effect, most_scenarios, ODDS, parameter, require_in_turn)
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-
-_CERTAIN = 10.0  # gain of likelihood from which on a recording begins with another mark
 
 
 def _own(model: DeclaredModel) -> tuple[int, int]:
@@ -102,7 +100,7 @@ class TargetGeometry(Effect):
             left.append(np.nansum((rest - np.nanmean(rest, axis=1, keepdims=True)) ** 2))
         best = int(np.argmin(left))
         gain = 0.5 * np.isfinite(errors).sum() * math.log(left[0] / left[best])
-        return turned[best] if gain > _CERTAIN else self
+        return turned[best] if gain - math.log(angles.size) > ODDS else self
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting

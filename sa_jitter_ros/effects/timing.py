@@ -19,6 +19,7 @@ Sizes are in parts of a `unit` (s), frequencies in cycles a trigger cycle.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -79,15 +80,15 @@ class Pattern:
     """
     Known errors of unknown sizes: `columns` of a setting (column, pulse), in parts of the unit.
 
-    With `about` (value, tolerance) the size of the first column is a number that the effect
-    prescribes. `replaces_jitter` says that the declared jitter is no longer of known size. Errors
+    With `off_by` the effect prescribes the size of the column: 1, and it may be off by so much.
+    `replaces_jitter` says that the declared jitter is no longer of known size. Errors
     that do not `show_in_times` are those of all pulses alike, relative to the vibration; they may
     absorb a part of what is none of them. `usual` returns the size that machines have, in units:
     a normal prior, None for any size.
     """
 
     columns: Callable[[Setting], Array]
-    about: tuple[float, float] | None = None
+    off_by: float = math.inf
     replaces_jitter: bool = False
     show_in_times: bool = True
     usual: Callable[[Setting], float] | None = None

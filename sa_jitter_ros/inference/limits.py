@@ -31,6 +31,7 @@ from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
     DirectEffect, largest_power, ONE_SIDED, parameter_ranges, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.lattice import rounding
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Pattern, Spectrum
@@ -41,11 +42,8 @@ from scipy import special
 
 Array = NDArray[Any]
 
-_LEAST = -9.0  # logarithm of a power that is nothing
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 _SLOWEST = 0.2  # share of a step by which the next one is shorter
-_CERTAIN = 1e8  # squared standard errors from 0
-_RESOLUTION = 4.0  # spacings of a number: finer grids are its own
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
             lower, effect = _of_scale(timing)
         elif name == SpeedFluctuation.name:
             effect = _of_speed(timing)
-        elif isinstance(kind.timing, Pattern) and kind.timing.about is not None:
+        elif isinstance(kind.timing, Pattern) and kind.timing.replaces_jitter:
             lower = _coarsest_clock(np.concatenate([
                 item.setting.times[item.measured] for item in timing.chooser.data.stretches]))
         else:
@@ -111,7 +109,7 @@ def largest(timing: Timing, name: str) -> Effect | None:
         sizes, covariance = chooser.fit(choice.best | {name}, choice.fit.starts).pattern(name)
         found, errors = _farthest(sizes, covariance), covariance
     elif isinstance(kind.timing, Spectrum):
-        power = _bound(timing, name, kind.timing.upper[0], ONE_SIDED)
+        power = _bound(timing, name, ONE_SIDED)
         if power is None:
             return None
         found, errors = power, np.zeros(len(kind.timing.upper))
@@ -123,16 +121,17 @@ def largest(timing: Timing, name: str) -> Effect | None:
         return None
 
 
-def _bound(timing: Timing, name: str, top: float, far: float) -> Array | None:
+def _bound(timing: Timing, name: str, far: float) -> Array | None:
     """
     Return the parameters of a component that has `far` standard errors more power than is seen.
 
-    A negative number stands for less; None is returned where the logarithm is beyond `top`.
+    A negative number stands for less; None is returned where it is beyond all that is tried.
     """
     chooser, choice = timing.chooser, timing.choice
     names, kurtosis = choice.best | {name}, chooser.shapes.kurtosis if chooser.shapes else 0.0
     fit = chooser.fit(names, choice.fit.starts)
-    at, low, high = max(float(fit.starts[name][0]), _LEAST), -math.inf, top
+    at, low, high = float(fit.starts[name][0]), -math.inf, float(fit.upper[fit.place[name]][0])
+    top = high
     last: tuple[float, float] | None = None
     for _ in range(_STEPS):
         fit = chooser.fit(names, fit.starts, held={(name, 0): at})
@@ -156,17 +155,17 @@ def _farthest(sizes: Array, covariance: Array) -> Array:
 
     How far estimates are from 0, in squared standard errors, has a noncentral chi2 distribution.
     """
-    distance = min(float(sizes @ np.linalg.pinv(covariance) @ sizes), _CERTAIN)
-    if not distance > 0.0:
+    distance = float(sizes @ np.linalg.pinv(covariance) @ sizes)
+    true = float(special.chndtrinc(distance, sizes.size, RARE))
+    if not distance > 0.0 or math.isnan(true):  # so far from 0 that it makes no difference
         return sizes
-    true = max(float(special.chndtrinc(distance, sizes.size, RARE)), 1.0)
-    return np.asarray(sizes * math.sqrt(true / distance))
+    return np.asarray(sizes * math.sqrt(max(true, 1.0) / distance))
 
 
 def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
     """Return the interval of the size of the declared jitter."""
     far = float(special.ndtri(0.5 * RARE))  # on either side
-    low, high = (_bound(timing, JITTER, -_LEAST, side) for side in (far, -far))
+    low, high = (_bound(timing, JITTER, side) for side in (far, -far))
     return (None if low is None else math.exp(0.5 * low[0]),
             None if high is None else JitterScale(math.exp(0.5 * high[0])))
 
@@ -188,5 +187,5 @@ def _coarsest_clock(times: Array) -> float | None:
     """Return the rate of the coarsest clock whose grid the pulse times could lie on."""
     intervals = np.sort(np.diff(times))
     steps = np.diff(intervals)
-    steps = steps[steps > _RESOLUTION * np.spacing(np.max(np.abs(times)))]
+    steps = steps[steps > rounding(times)]
     return float(1.0 / steps.min()) if steps.size else None

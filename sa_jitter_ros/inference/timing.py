@@ -30,7 +30,7 @@ from sa_jitter_ros.effects.effect import (
     beyond_chance, departs, Finding, parameter_ranges)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
-from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
+from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
@@ -48,7 +48,6 @@ from scipy import special
 Array = NDArray[Any]
 
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
-_VISIBLE = 0.02  # of a tick: errors of a grid below it are none
 _CERTAIN = 1e-12  # p value of what the pulse times themselves show
 _APART, _FASTEST = 1.5, 1.0  # cycles in a stretch; a trigger cycle: of sidebands
 _PART, _FEWEST_PARTS, _CHANCE = 20, 4, 1e-4  # cycles whose mean power scatters by itself
@@ -181,7 +180,7 @@ def _grid(times: Array, clock: Clock) -> Array | None:
     if not clock.rate > 0.0:
         return None
     smooth = smooth_on_grid(times, clock.rate)
-    return smooth if np.std(smooth) > _VISIBLE / clock.rate else None
+    return smooth if np.std(smooth) > ROOM / clock.rate else None
 
 
 def read_timing(parts: Sequence[Stretch], declared: Sequence[Effect] = (), *,

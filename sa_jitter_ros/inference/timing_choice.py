@@ -188,7 +188,7 @@ class Chooser:
         prior = 0.0
         for name in names & fit.columns.keys():
             pattern, size = fit.patterns[name][0], fit.pattern(name)[0]
-            if pattern.about is not None and abs(size[0] - pattern.about[0]) > pattern.about[1]:
+            if abs(size[0] - 1.0) > pattern.off_by:
                 return -math.inf
             if pattern.usual is not None:
                 prior += 0.5 * float(size[0] / pattern.usual(self.setting)) ** 2

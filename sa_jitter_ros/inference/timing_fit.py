@@ -311,7 +311,7 @@ class TimingFit:
         return np.asarray(np.linalg.inv(self.spectrum(self.parameters)))
 
     def beside_motion(self, alias: int) -> Array:
-        """Return the inverse (bin, 3, 3) in which any motion at one of `ALIASES` counts nothing."""
+        """Return the inverse (bin, 3, 3) in which motion at one of `ALIASES` counts nothing."""
         steer = self.data.steer[MOTION][alias]
         found = self.inverse @ steer @ self.inverse
         return np.asarray(self.inverse - found / np.einsum(

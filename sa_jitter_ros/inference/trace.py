@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.effects.lattice import Clock
+from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.effects.timing import Pattern, SOURCE
 from sa_jitter_ros.errors import ModelError
@@ -69,7 +69,6 @@ _UNSEEN = 'nothing of it shows in this recording'
 _AS_DECLARED = 'it is declared, and shows no other numbers than these'
 _FEWEST = 4
 _HELD_OUT = 6
-_SAME_CLOCK = 0.01
 
 
 @dataclass(frozen=True)
@@ -463,7 +462,7 @@ def _one_clock(clocks: Sequence[Clock]) -> Clock:
     """Return the clock of all recordings; raise ModelError where they have different ones."""
     first = clocks[0]
     for number, other in enumerate(clocks[1:], start=2):
-        if abs(other.rate - first.rate) > _SAME_CLOCK * first.rate:
+        if abs(other.rate - first.rate) > SAME_RATE * first.rate:
             raise ModelError(f'pulse times of recording 1 lie on {_grid(first)}, those of '
                              f'recording {number} on {_grid(other)}: one declared model holds for '
                              'one clock; run the loop on each alone')

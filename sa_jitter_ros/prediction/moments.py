@@ -39,7 +39,8 @@ Array = NDArray[Any]
 
 NODES = 64
 _NEAR, _FAR_NODES = 2, 8  # cycles further apart depend on each other smoothly
-_MOST_NOISE = 1e9
+#: Noise, in components, from which on none is visible.
+MOST_NOISE = 1e9
 
 
 @dataclass(frozen=True)
@@ -156,9 +157,9 @@ def noise_line_variance(noise_std: float, sample_rate: float, duration: float) -
     ModelError for noise that buries every component.
     """
     size = 2.0 * noise_std / math.sqrt(sample_rate * duration)
-    if not size < _MOST_NOISE:
+    if not size < MOST_NOISE:
         raise ModelError(f'noise of {noise_std:.6g} per sample leaves {size:.3g} in each line, '
-                         f'not below {_MOST_NOISE:g} components: lower it, or average longer')
+                         f'not below {MOST_NOISE:g} components: lower it, or average longer')
     return size**2
 
 
