@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, parameter_ranges)
+    beyond_chance, departs, Finding, ODDS, parameter_ranges)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
@@ -35,10 +35,11 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
+from sa_jitter_ros.inference.record_recovery import RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
-from sa_jitter_ros.inference.timing_data import FEWEST, Stretch
+from sa_jitter_ros.inference.timing_data import ALIASES, APART, FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
@@ -48,10 +49,7 @@ from scipy import special
 Array = NDArray[Any]
 
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
-_CERTAIN = 1e-12  # p value of what the pulse times themselves show
-_APART, _FASTEST = 1.5, 1.0  # cycles in a stretch; a trigger cycle: of sidebands
-_PART, _FEWEST_PARTS, _CHANCE = 20, 4, 1e-4  # cycles whose mean power scatters by itself
-_RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
+_PART = 20  # cycles whose mean power scatters by itself
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
@@ -98,10 +96,10 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
 
 def _sidebands(fit: RecordFit, model: DeclaredModel) -> Array:
     """Return how far sidebands of several lines are from these, in cycles a trigger cycle."""
-    declared, least = fit.orders[:fit.declared], _APART / fit.errors.size
+    declared, least = fit.orders[:fit.declared], APART / fit.errors.size
     apart = np.abs(fit.orders[fit.declared:, None] - declared)
     turns = np.sort(apart.min(axis=1, initial=math.inf) * model.cycle_length)
-    turns = turns[(turns > least) & (turns < _FASTEST)]
+    turns = turns[(turns > least) & (turns < ALIASES.max())]
     groups = np.split(turns, np.flatnonzero(np.diff(turns) > least) + 1)
     return np.array([group.mean() for group in groups if group.size > 1])
 
@@ -155,7 +153,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
     prior = expected[0]
     bend_std, bend_prior = recovery.ripple_standard_error, expected[1]
     # where the vibration resolves the errors, it shows more than the reference keyphasor does
-    referenced = observation.pulses.reference is not None and not error_std < _RESOLVED * unit
+    referenced = observation.pulses.reference is not None and not error_std < RESOLVED * unit
     if referenced and observation.pulses.reference is not None:
         better = observation.pulses.reference[here]
         known = np.isfinite(better)
@@ -241,7 +239,7 @@ def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, 
 def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
     """Return the p value of the likelihood gained by an effect beside the others."""
     if choice.ticked and name == _CLOCK:
-        return _CERTAIN
+        return 0.0  # the pulse times themselves show it
     without = chooser.fit(choice.best - {name}, choice.fit.starts)
     gain = max(choice.fit.value - without.value, 0.0)
     return float(special.chdtrc(max(choice.fit.count - without.count, 1), 2.0 * gain))
@@ -368,13 +366,13 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
             parts.append(np.mean(part**2) - passed * item.bend_std**2)
             next_.append(np.mean(part[1:] * part[:-1]))
             count += part.size
-    if len(parts) < _FEWEST_PARTS:
+    if len(parts) < 2:
         return None
     power, error = _mean(parts)
     noise = passed * float(np.mean([item.bend_std**2 for item in data.stretches]))
     certainty = power / (noise * math.sqrt(2.0 / count) + 1e-300)
-    chance = float(special.ndtr(-certainty))
-    if power <= 0.0 or chance > _CHANCE:
+    gain = beyond_chance(0.5 * certainty**2, 1, data.cycles)
+    if power <= 0.0 or gain < ODDS:
         return None
     size, size_error = root(power, error)
     together = float(np.mean(next_)) / power  # correlation of neighbours
@@ -388,10 +386,10 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
            for known in declared):
         return None
     return Finding(
-        _SPEED, effect, errors, chance,
+        _SPEED, effect, errors, float(special.ndtr(-certainty)),
         'the speed changes within a trigger cycle: the angle between the pulses errs by '
         f'u (1 - u) times {size:.3g} s',
-        gain=beyond_chance(0.5 * certainty**2, len(errors), data.cycles))
+        gain=gain)
 
 
 def _mean(values: Sequence[float] | Array) -> tuple[float, float]:

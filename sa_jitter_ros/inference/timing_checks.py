@@ -34,8 +34,7 @@ _DRAWS, _SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
 _FEWEST = 40  # pulses whose distribution is looked at
-_EVEN, _TINY = 513, 1e-12  # frequencies of a response; power that is none, in unit^2
-_OFTEN, _TAIL = 0.02, 0.9  # shares of the draws: of the p values that they tell, and their tail
+_TAIL = 0.1  # share of the draws that are their tail
 
 
 @dataclass(frozen=True)
@@ -142,9 +141,9 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
     fit, data = choice.fit, chooser.data
     total = fit.spectrum(fit.parameters)[:, 1, 1].real
     made = fit.contribution(name)[:, 1, 1].real
-    even = np.linspace(0.0, 0.5, _EVEN)
+    even = np.linspace(0.0, 0.5, data.longest)
     response = np.interp(data.frequency, even, _minimum_phase(
-        np.interp(even, data.frequency, np.log(made + _TINY))))
+        np.interp(even, data.frequency, np.log(made + np.finfo(np.float64).eps))))
     return Check(_likeness(chooser, choice, response.conj() / total), fit.moves(name),
                  data.unit * math.sqrt(float(np.average(made, weights=data.size))),
                  f'the pulse errors have the memory of {name}, but come from single events, each '
@@ -248,9 +247,7 @@ def _moments(values: Array) -> Array:
 
 def _chance(value: float, draws: Array) -> float:
     """Return the chance of draws as large as a value; their tail is taken as exponential."""
-    share = float(np.mean(draws >= value))
-    if share > _OFTEN:
-        return share
-    high = float(np.quantile(draws, _TAIL))
-    width = float(np.mean(draws[draws > high] - high))
-    return float((1.0 - _TAIL) * math.exp(-(value - high) / max(width, 1e-300)))
+    high = float(np.quantile(draws, 1.0 - _TAIL))
+    if value <= high:
+        return float(np.mean(draws >= value))
+    return _TAIL * math.exp((high - value) / float(np.mean(draws[draws > high] - high)))

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
-from sa_jitter_ros.inference.timing_data import TimingData
+from sa_jitter_ros.inference.timing_data import APART, TimingData
 from scipy.optimize import minimize
 
 Array = NDArray[Any]
@@ -81,7 +81,7 @@ class TimingFit:
                  held: Mapping[tuple[str, int], float] | None = None) -> None:
         self.data, self.spectra, self.patterns = data, spectra, patterns
         self.free_jitter = scaled or any(item.replaces_jitter for item, _ in patterns.values())
-        self.lowest = 1.5 / data.longest
+        self.lowest = APART / data.longest
         self.columns, total = {}, 0
         stack = []
         for name, (_, columns) in patterns.items():

@@ -32,7 +32,6 @@ Array = NDArray[Any]
 
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
-_LEAST = 0.02  # of the declared jitter: what is beside it at least
 _STRAY = 0.02  # share of errors that may be anything
 _DRAWN, _SEED, _PARTS = 4000, 11, 50
 
@@ -76,7 +75,7 @@ class Shapes:
         data = fit.data
         inverse = 1.0 / fit.spectrum(fit.parameters)[:, 1, 1].real
         mean = float(np.average(inverse, weights=data.size))
-        rest = max(1.0 / mean - power, _LEAST**2)
+        rest = max(1.0 / mean - power, 0.0)
         total = 0.0
         for item, values in zip(data.stretches, errors):
             if item.error_std > _CLEAR * data.unit:
