@@ -29,14 +29,15 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 
 _USUAL = 5e-3  # s: filters and converters seldom delay by more
-_STEADY = 1e-4  # relative spread of the speed: below it a delay is a phase
+#: Relative spread of speeds below which nothing follows the speed, and a delay is a phase.
+STEADY = 1e-4
 
 
 def _of_speed(setting: Setting) -> Array:
     """Return a delay less the turn of all, which takes longer when slow; none if steady."""
     period = trigger_periods(setting.true_times)
     longer = period / period.mean() - 1.0
-    return np.asarray(-longer)[None] if np.std(longer) > _STEADY else np.zeros((0, period.size))
+    return np.asarray(-longer)[None] if np.std(longer) > STEADY else np.zeros((0, period.size))
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import Check
@@ -30,16 +31,13 @@ from scipy import special
 Array = NDArray[Any]
 
 LINES = 'lines'
-_ROUNDS = 3
 _TURN = 0.03  # rad, by which the lines of steady machines turn each by itself at most
 _FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
-_FEWEST = 8  # acquisitions
-_STEADY = 1e-4  # relative spread of the speed
 
 
 def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     """Return the checks of the amplitudes of all acquisitions of a recording that has lines."""
-    if not lines.count or len(observation.acquisitions) < 4 or not observation.recoveries:
+    if not lines.count or not observation.recoveries:
         return ()
     orders = observation.orders.size
     amplitude = lines.of(observation.stacked('corrected')[..., :orders])
@@ -52,10 +50,9 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     turned *= np.exp(-2j * np.pi * np.outer(_late(observation) / _periods(observation)
                                             * observation.model.cycle_length, order))
     weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
-    for _ in range(_ROUNDS):  # all lines of an acquisition may be late by one time
-        ratio = turned / turned.mean(axis=0)
-        late = np.angle(ratio) / order @ (weight / weight.sum())
-        turned = turned * np.exp(-1j * np.outer(late, order))
+    # all lines of an acquisition may be late by one time
+    late = np.angle(turned / turned.mean(axis=0)) / order @ (weight / weight.sum())
+    turned = turned * np.exp(-1j * np.outer(late, order))
     mean = turned.mean(axis=0)
     ratio, noise = turned / mean, noise / np.abs(mean)
     # the angle of a speed that rises bends, which makes orders leak into those beside them
@@ -105,17 +102,16 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
     speed = 1.0 / _periods(observation)
     speed = speed / speed.mean() - 1.0
     spread = float(np.std(speed))
-    count = speed.size
-    if count < _FEWEST or spread < _STEADY:
+    freedom = speed.size - 4  # of the parabola and the acceleration
+    if freedom < 1 or spread < STEADY:
         return ()
-    shape = np.stack([np.ones(count), speed / spread, (speed / spread) ** 2], axis=1)
+    shape = np.stack([np.ones(speed.size), speed / spread, (speed / spread) ** 2], axis=1)
     fitted = shape @ np.linalg.lstsq(shape, size, rcond=None)[0]
     total, left = np.var(size, axis=0), np.mean((size - fitted) ** 2, axis=0)
     explained = np.where(total - left > _FOLLOWS * total, total - left, 0.0)
     worst = int(np.argmax(explained / noise**2))
     if not explained[worst] > _TURN**2:
         return ()
-    freedom = count - 4  # of the parabola and the acceleration
     ratio = (total[worst] - left[worst]) / 2.0 / (left[worst] / freedom)
     return (Check(float(special.fdtrc(2, freedom, ratio)) * size.shape[1], LINES,
                   math.sqrt(float(explained[worst])),

@@ -31,7 +31,6 @@ _STRONG = 0.2  # of its order's strongest channel
 _NOISE = 0.1  # of its amplitude that a line may scatter by
 _SPEED = 0.1
 _MOST_PULSES = 1000  # per revolution
-_BEGINNINGS = 1000  # of averages in a run, from which the number of whole cycles in them follows
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,10 @@ def require_comparable(averages: Sequence[ReceivedAverage], published: Published
                          f'the averages have {last.trigger_cycles}: set trigger_cycles of '
                          'averager and predictor to the same')
     cycles = exact_cycles(published.ratio) * _share(last) * last.trigger_cycles
-    possible = {math.floor(cycles * (n + 1)) - math.ceil(cycles * n) for n in range(_BEGINNINGS)}
+    # one whole cycle less is in an average that begins soon behind the beginning of one
+    least = math.floor(cycles) - (0 < cycles.numerator % cycles.denominator
+                                  < cycles.denominator - 1)
+    possible = {math.floor(cycles), least}
     for count in {item.fundamental_cycles for item in averages} - possible:
         raise ModelError(
             f'the prediction is for the ratio {published.ratio:g}, which makes '

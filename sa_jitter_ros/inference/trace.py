@@ -44,7 +44,7 @@ from sa_jitter_ros.inference.gathering import (
 from sa_jitter_ros.inference.line_checks import check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
-from sa_jitter_ros.inference.residual import ACCURACY, Residual, UNDEFINED
+from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
@@ -60,8 +60,6 @@ _SPEED = 'speed_fluctuation'
 # A tone turns a line by itself, and errors that grow turn it by more than its phase tells.
 _TURNING = {'interfering_tone', 'clock_skew'}
 _UNDECIDED = 1e-2  # change of an average by what may be there
-_REMAINS = 0.005  # p value of what is unexplained
-_UNEXPLAINED, _CHECKS = 0.005, 8  # false alarms of all checks, and how many there are
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
@@ -269,7 +267,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     unexplained = remains(after, moves) or left is not None
     of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
         unexplained) else ''
-    of_lines = _SCATTER if left is None and after.p_amplitude < _REMAINS else ''
+    of_lines = _SCATTER if left is None and after.p_amplitude < FALSE_ALARM else ''
     if of_timing or of_lines:
         chosen, candidates = _beyond_doubt(chosen, candidates, of_timing, of_lines)
         effects = _effects(chosen)
@@ -418,18 +416,18 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     model = bench.observation.model
     rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
     names = {finding.name for finding in chosen}
-    checks = [check for check in (timing.checks if timing is not None else ())
-              if 0.5 * (rad * check.size) ** 2 > ACCURACY
-              and not (check.direction == SOURCE and _SPEED in names)]
-    if not names & _TURNING:
-        checks += check_lines(bench.observation, bench.lines)
-    left = [check for check in checks if check.p_value < _UNEXPLAINED / _CHECKS]
-    return min(left, key=lambda check: check.p_value) if left else None
+    of_timing = timing.checks if timing is not None else ()
+    of_lines = () if names & _TURNING else check_lines(bench.observation, bench.lines)
+    chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
+    left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
+        check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
+                              and not (check.direction == SOURCE and _SPEED in names)))]
+    return min(left, key=lambda check: check.p_value, default=None)
 
 
 def remains(left: Residual, moves: Sequence[Dependence]) -> bool:
     """Return whether a residual or one of its dependences is significant."""
-    return left.p_value < _REMAINS or moving(moves) is not None
+    return left.p_value < FALSE_ALARM or moving(moves) is not None
 
 
 def make_bench(observation: Observation, observations: Sequence[Observation],
