@@ -21,6 +21,8 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Array = NDArray[Any]
 
+#: A clock this much faster than the declared one has no visible effect.
+FINE = 50.0
 #: Relative difference of rates below which two clocks count as one.
 SAME_RATE = 0.01
 #: Of a tick: what errors that a clock makes may be wrong by, and what none is seen below.
@@ -87,17 +89,16 @@ def rounding(times: Array) -> float:
     return 4.0 * float(np.spacing(np.max(np.abs(times))))
 
 
-def smooth_on_grid(times: Array, clock_rate: float, *, slack: float = 0.0) -> Array:
+def smooth_on_grid(times: Array, clock_rate: float) -> Array:
     """
     Return the errors (n,) in s, less half a tick, of `times` rounded up to a clock.
 
     The true times are those of the smoothest motion that lies within one tick of the measured
     ones: the least sum of squared second differences under these bounds, by the alternating
-    direction method of multipliers. `slack` in s widens the bounds for jitter in front of the
-    clock.
+    direction method of multipliers.
     """
     n = times.size
-    half = 0.5 + slack * clock_rate
+    half = 0.5
     index = np.arange(n)
     trend = np.polynomial.Polynomial.fit(index, times, 1)(index)
     middle = (times - trend) * clock_rate  # ticks; the true time lies within `half` of it

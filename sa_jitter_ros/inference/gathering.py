@@ -21,7 +21,7 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, FINE, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
@@ -37,8 +37,6 @@ _PRECISE = 0.25
 _CERTAIN = 1e-4
 _GROUPS = 3
 _LEAKS = 0.5  # lines of the average between which everything leaks
-# A clock this much faster than the declared one has no visible effect.
-_FINE = 50.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     model, pulses = observation.model, observation.pulses
     found = find_clock(pulses.times)
     clock = found.rate
-    usable = 0.0 < clock < _FINE * model.keyphasor_rate
+    usable = 0.0 < clock < FINE * model.keyphasor_rate
     grid = _Grid(clock, smooth_on_grid(pulses.times, clock)) if usable else None
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
     if usable and group.max() > 0:

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import LineEvidence
-from sa_jitter_ros.effects.lattice import Clock, find_clock, smooth_on_grid
+from sa_jitter_ros.effects.lattice import (
+    Clock, find_clock, FINE, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, Observation
@@ -39,10 +40,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
 
-# A clock this much faster than the declared one has no effect.
-_FINE = 50.0
-# Errors that correlate more with those of a grid, and span fewer ticks, are caused by its clock.
-_FOLLOWS, _ONE_TICK = 0.5, 1.1
 _DECISIVE = 'close_loop on a recording, which contains the signals within trigger cycles,'
 _REASON = 'the topics do not contain {}: run close_loop on a recording'
 ONLY_OFF_LINE = {
@@ -149,21 +146,19 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
 
     For each acquisition, the first errors are those of the smoothest motion that the grid of the
     clock allows: they test the clock. The second errors predict: they are the recovered ones, if
-    these follow the first and span no more than a tick, so that the clock causes them.
+    the ticks of the clock can make these.
     """
     times = observation.pulses.times
     items = observation.acquisitions
     clock = find_clock(times)
-    if not 0.0 < clock.rate < _FINE * observation.model.keyphasor_rate:
+    if not 0.0 < clock.rate < FINE * observation.model.keyphasor_rate:
         return Clock(0.0, 0.0), [
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     smooth = smooth_on_grid(times, clock.rate)
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
     recovered = np.asarray(observation.stacked('errors'))
-    follow = np.corrcoef(
-        (grid - grid.mean(axis=1, keepdims=True)).ravel(), recovered.ravel())[0, 1]
-    span = float(np.median(np.ptp(recovered, axis=1))) * clock.rate
-    better = recovered if follow > _FOLLOWS and span < _ONE_TICK else grid
+    variance = float(np.mean(np.square(observation.stacked('standard_errors'))))
+    better = recovered if ticks_leave_room(list(recovered), variance, clock.rate) else grid
     return clock, [
         [Pulses(item.times, item.first, errors, item.missing) for errors in pair]
         for item, pair in zip(items, zip(grid, better))]

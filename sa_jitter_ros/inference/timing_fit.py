@@ -39,7 +39,7 @@ _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # logarithm of the noise power
 _SAME = 0.05  # gain in log likelihood that ends a search
 _STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
-_CURVED = 1e-3
+_CURVED = float(np.sqrt(_STEP))  # by which a curvature is
 _FAR = 16.0  # logarithm of a power, in unit^2, beyond which there is none
 
 
