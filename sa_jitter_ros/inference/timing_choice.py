@@ -19,7 +19,7 @@ were tried give each effect its probability.
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import combinations, product
 import math
 from typing import Any
@@ -31,7 +31,7 @@ from sa_jitter_ros.effects.effect import ODDS, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
-from sa_jitter_ros.inference.timing_fit import Fixed, JITTER, TimingFit
+from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
 
 Array = NDArray[Any]
@@ -265,7 +265,7 @@ class Chooser:
         """Return the fit of a set; `held` maps (name, number) to a parameter that stays."""
         if not held and names in self.fits:
             return self.fits[names]
-        fixed: list[Fixed] = []
+        fixed: list[tuple[str, Callable[[Array], Array]]] = []
         known: Array | float = 0.0
         start = dict(start or {})
         for name, effect in self.declared.items():
@@ -274,7 +274,8 @@ class Chooser:
                 if name in names:
                     start.setdefault(name, sizes)
                 else:
-                    fixed.append(Fixed(effect.timing.direction, _of(effect.timing, sizes)))
+                    fixed.append((effect.timing.direction,
+                                  partial(effect.timing.density, sizes)))
             elif name not in names and name in self.patterns:
                 known = known + self.patterns[name][1] @ sizes
         spectra = {name: self.spectra[name] for name in sorted(names & self.spectra.keys())}
@@ -348,7 +349,3 @@ class Chooser:
                     if names == best or scores[names] > -math.inf}
         return Choice(best, possible, {names: scores[names] for names in possible}, self.setting,
                       tuple(self.declared.values()))
-
-
-def _of(spectrum: Spectrum, sizes: Array) -> Callable[[Array], Array]:
-    return lambda frequency: spectrum.density(sizes, frequency)

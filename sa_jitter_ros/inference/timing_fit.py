@@ -17,7 +17,6 @@ is smooth, of the declared jitter, of the noise of the recovery, and of random e
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 import math
 from typing import Any
@@ -57,27 +56,20 @@ def _knots(lowest: float) -> Array:
     return np.linspace(math.log(lowest), math.log(0.5), _KNOTS)
 
 
-@dataclass(frozen=True)
-class Fixed:
-    """A random error of known size: what was declared and is not in question."""
-
-    direction: str
-    density: Callable[[Array], Array]
-
-
 class TimingFit:
     """
     The fit of some components; `value` is the logarithm of the greatest likelihood.
 
     `spectra` and `patterns` are the components in question by name; JITTER among the names lets
-    the declared jitter have any size. `fixed` are declared random errors, `known` (ordinate, 3)
-    the declared patterns. `held` maps (name, number) to the value of a parameter that stays.
+    the declared jitter have any size. `fixed` are directions and densities of declared random
+    errors, `known` (ordinate, 3) the declared patterns. `held` maps (name, number) to the value of
+    a parameter that stays.
     """
 
     def __init__(self, data: TimingData, spectra: Mapping[str, Spectrum],
                  patterns: Mapping[str, tuple[Pattern, Array]], *, scaled: bool = False,
-                 fixed: Sequence[Fixed] = (), known: Array | float = 0.0,
-                 start: Mapping[str, Array] | None = None,
+                 fixed: Sequence[tuple[str, Callable[[Array], Array]]] = (),
+                 known: Array | float = 0.0, start: Mapping[str, Array] | None = None,
                  held: Mapping[tuple[str, int], float] | None = None) -> None:
         self.data, self.spectra, self.patterns = data, spectra, patterns
         self.free_jitter = scaled or any(item.replaces_jitter for item, _ in patterns.values())
@@ -92,8 +84,8 @@ class TimingFit:
             (*data.ordinates.shape, 0))
         self.ordinates = data.ordinates - known
         self._fixed = data.noise * 0.0
-        for item in fixed:
-            self._fixed = self._fixed + self._of(item.direction, item.density(data.alias))
+        for direction, density in fixed:
+            self._fixed = self._fixed + self._of(direction, density(data.alias))
         if not self.free_jitter:
             self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
         self._lay_out(start or {}, held or {})

@@ -185,7 +185,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
     fit, held_out = parted(count)
     parts = stretches(observation, range(count), Clock(0.0, 0.0)) if observation.recoveries else []
-    timing = read_timing(parts, declared, names=frozenset()) if parts else None
+    timing = read_timing(parts, declared, names=frozenset())
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
         without, with_it = (predict(observation.model, known) for known in (
@@ -302,27 +302,21 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
 
 
 def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:
-    """Return the effects on the timing that change an average, and those that hardly do."""
-    parts = stretches(bench.observation, bench.fit, bench.clock)
-    timing = read_timing(parts, bench.declared) if parts else None
-    return *_sorted(timing, bench.change), timing
-
-
-def _sorted(timing: Timing | None, change: Change) -> tuple[list[Finding], list[Finding]]:
-    """Return the effects that change an average, those that change it most first, and others."""
+    """Return the effects that change an average, the most important first, and others."""
+    timing = read_timing(stretches(bench.observation, bench.fit, bench.clock), bench.declared)
     chosen: list[Finding] = []
     present: list[Finding] = []
     findings = timing.findings if timing is not None else ()
     for finding in findings:
         others = [item.effect for item in findings if item is not finding
                   and item.effect is not None and item.name != _SPEED]
-        assert finding.effect is not None
-        finding = replace(finding, largest_change=change(others, finding.effect))
-        matters = finding.effect is not None and (
-            finding.largest_change >= least_change(finding.effect))
+        effect = finding.effect
+        assert effect is not None
+        finding = replace(finding, largest_change=bench.change(others, effect))
+        matters = finding.largest_change >= least_change(effect)
         (chosen if matters else present).append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
-    return chosen, [item for item in present if item.name != _SPEED]
+    return chosen, [item for item in present if item.name != _SPEED], timing
 
 
 def _refitted(bench: Bench, timing: Timing | None) -> Timing | None:
