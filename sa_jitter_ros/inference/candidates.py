@@ -21,10 +21,8 @@ from dataclasses import dataclass, replace
 
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
-from sa_jitter_ros.inference.residual import ACCURACY
+from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
 from sa_jitter_ros.inference.scoring import Bench
-
-_KNOWN_CHANGE = 1e-3  # of an average by what is no chance, from which on its cause is named
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def _scored(bench: Bench, others: Sequence[Effect], finding: Finding) -> Candida
 
 def least_change(effect: Effect) -> float:
     """Return the change of mean or scatter of an average from which on an effect is named."""
-    return ACCURACY if effect.random else _KNOWN_CHANGE
+    return ACCURACY if effect.random else ACCURACY_OF_CHANGE
 
 
 def too_small(finding: Finding) -> str:

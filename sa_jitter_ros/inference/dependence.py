@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.evidence import SAME_SPEED
-from sa_jitter_ros.inference.residual import ACCURACY
+from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
 from sa_jitter_ros.inference.scoring import Bench, Comparison
 from sa_jitter_ros.prediction.influence import mean_period
 from scipy import special
@@ -34,8 +34,6 @@ Array = NDArray[Any]
 #: A change of the residual with a smaller p value is significant; up to four are tested.
 CERTAIN = 1e-3
 _FREEDOM = 3
-# Error of the difference of predictions for the same lines at the same speed.
-_ALIKE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -115,7 +113,7 @@ def _over_cycles(whole: Comparison, fewer: Comparison, weights: Array, counts: A
     both = Comparison(less(whole.difference, fewer.difference), whole.scale, tuple(
         less(one, other) for one, other in zip(whole.moved, fewer.moved)))
     return _judged('trigger_cycles', '', counts, both, weights / weights.sum(),
-                   np.ones(len(whole.scale)), accuracy=_ALIKE)
+                   np.ones(len(whole.scale)), accuracy=ACCURACY_OF_CHANGE)
 
 
 def _judged(on: str, unit: str, values: Array, comparison: Comparison, across: Array,

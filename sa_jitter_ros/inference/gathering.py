@@ -32,7 +32,9 @@ from scipy import special
 
 Array = NDArray[Any]
 
-_STRONG, _COHERENT = 0.2, 0.9
+#: Of its order's strongest channel, from which on a line is worth comparing.
+STRONG = 0.2
+_COHERENT = 0.9
 _PRECISE = 0.25
 _CERTAIN = 1e-4
 _GROUPS = 3
@@ -60,7 +62,7 @@ def choose_lines(observation: Observation) -> Lines:
     with np.errstate(divide='ignore', invalid='ignore'):
         coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
             np.abs(cycles) ** 2, axis=(0, 1))
-    good = (level >= _STRONG * np.nanmax(level, axis=0)) & (
+    good = (level >= STRONG * np.nanmax(level, axis=0)) & (
         coherence > CHANCE / cycles.shape[1])
     if good.any():
         good &= coherence >= _COHERENT * coherence[good].max()

@@ -21,15 +21,15 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.cycle import exact_cycles
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import RESOLUTION
+from sa_jitter_ros.inference.gathering import STRONG
+from sa_jitter_ros.inference.record_pulses import SPEED_TOLERANCE
 from sa_jitter_ros.inference.residual import Residual, residual
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy.special import ndtr
 
 Array = NDArray[Any]
 
-_STRONG = 0.2  # of its order's strongest channel
 _NOISE = 0.1  # of its amplitude that a line may scatter by
-_SPEED = 0.1
 _MOST_PULSES = 1000  # per revolution
 
 
@@ -120,7 +120,7 @@ def require_comparable(averages: Sequence[ReceivedAverage], published: Published
             f'{float(cycles):.5g} fundamental cycles, and an average has {count} whole ones: set '
             'ratio of averager and predictor to the same')
     speed = float(np.mean([item.trigger_speed for item in averages]))
-    if abs(speed / published.trigger_speed - 1.0) > _SPEED:
+    if abs(speed / published.trigger_speed - 1.0) > SPEED_TOLERANCE:
         raise ModelError(f'the prediction is for {published.trigger_speed:g} Hz and the tach '
                          f'shaft turns at {speed:.4g} Hz: set trigger_speed or '
                          'follow_shaft_speed of the predictor')
@@ -186,7 +186,7 @@ def good_lines(averages: Sequence[ReceivedAverage], chosen: Array) -> Array:
     noise = np.sqrt(np.mean([item.noise[:, chosen] ** 2 for item in averages], axis=0))
     attenuation = np.array([item.attenuation[:, chosen] for item in averages])
     good = np.isfinite(attenuation).all(axis=0) & (noise <= _NOISE * level)
-    good &= level >= _STRONG * np.where(good, level, 0.0).max(axis=0)
+    good &= level >= STRONG * np.where(good, level, 0.0).max(axis=0)
     if not good.any():
         raise SignalError(f'none of the orders {named(averages[-1].orders[chosen])} stands ten '
                           'times above its noise on any channel: average more trigger cycles, '

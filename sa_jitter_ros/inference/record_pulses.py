@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
@@ -24,12 +25,12 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_SPEED_TOLERANCE = 0.1  # of the declared speed, relative
+#: Of the declared speed, relative.
+SPEED_TOLERANCE = 0.1
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
-_SAME_RATE = 0.01  # relative difference of a declared rate
 # Pulses used to align two keyphasors, and the fraction of the pulses that the reference must have.
 _ALIGNED, _COVERED = 15, 0.5
 _AS_MANY = 0.6  # fraction of the pulses: a reference with fewer has one pulse per trigger cycle
@@ -134,7 +135,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
                              f'pulses: the loop needs {_FEWEST} in a row; record longer')
     speed = model.trigger_revolutions / float(np.median(np.diff(found.times)[found.missing == 0]))
-    if abs(speed / model.trigger_speed - 1.0) > _SPEED_TOLERANCE:
+    if abs(speed / model.trigger_speed - 1.0) > SPEED_TOLERANCE:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {speed:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
@@ -236,7 +237,7 @@ def _remarks(counts: PulseCounts, total: int) -> Sequence[str]:
 def _tach_rate_remark(recording: Recording, model: DeclaredModel) -> Sequence[str]:
     """Return a remark if the tach was sampled at another rate than the declared one."""
     rate = recording.tach_rate
-    if not rate or abs(model.keyphasor_rate / rate - 1.0) <= _SAME_RATE:
+    if not rate or abs(model.keyphasor_rate / rate - 1.0) <= SAME_RATE:
         return []
     return [f'keyphasor_rate is declared as {model.keyphasor_rate:.6g} Hz but the '
             f"recording's tach was sampled at {rate:.6g} Hz: declare {rate:.6g}"]

@@ -28,6 +28,8 @@ Array = NDArray[Any]
 
 #: Accuracy of a predicted attenuation: smaller residuals do not change the verdict.
 ACCURACY = 3e-3
+#: Accuracy of the difference of two predictions for the same lines at the same speed.
+ACCURACY_OF_CHANGE = 1e-3
 #: Chance of one kind of false alarm: that something is left where the model is right.
 FALSE_ALARM = 0.005
 _DRAWS, _SEED = 4000, 17
