@@ -50,19 +50,15 @@ BoolArray = NDArray[np.bool_]
 _BEYOND, _BEYOND_LINES = 6.0, 3.0
 _EDGE = 1.15  # of the band, where the low pass ends
 _FULL_BAND = 0.4  # of the sample rate
-_POINTS, _SAMPLES = 2 * _EDGE, 3.7  # in a period of the band's end: of the angle, and of time
-_FEWEST_POINTS = 8
+_SAMPLES = 3.7  # in a period of the band's end
 # A first guess of the states: of bends in parts of the declared jitter, of gains.
 _BEND, _GAIN = 0.1, 0.03
 _FIXED = 1e-4  # of the first guess, while the lines are still looked for
 _LEAST_BEND, _LEAST_GAIN = 0.003, 1e-3
-_LEAST_JITTER, _MOST_JITTER = 0.1, 30.0  # of the declared one
-# Pulses that were not measured are known this much worse than the others.
-_NOT_MEASURED = 100.0
-# Largest change of the pulse errors in a step, in periods of the highest declared order.
-_STEP = 0.25
-_ROUNDS, _MOST_LINES, _A_ROUND = 14, 60, 8
-_EARLY_ROUNDS, _EARLY_LINES = 7, 30
+_LEAST_JITTER = 0.1  # of the declared one
+# Turns of the highest declared order, beyond which its phase tells errors ambiguously.
+_MOST_TURNS = 0.25
+_MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
 _LAST_STEPS, _CONVERGED = 6, 1e-3
 # A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
 # it must not be far below the strongest, which may leave images of itself.
@@ -72,14 +68,13 @@ _APART = 1.5  # bins between lines
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
 _TRIED = 10  # frequencies a bin
 _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
-# Neighbourhoods of which the median is the floor: half an order, at least some bins; the skirt.
-_WIDE, _SKIRT = 20, 24
+_SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
 _SLOPES, _SLOPE_STEP, _SLOPE_GAIN = 400, 0.3, 0.7
 _MOST_SLOPE = 5e-3  # beyond it, other lines are taken for the declared ones
 _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
 # The last fit expects pulse errors that are so many times as large as they, or their standard
-# errors, are, so that they are hardly shrunk; up to so many turns of the highest declared order.
-_WEAK, _MOST_TURNS = 3.0, 0.25
+# errors, are, so that they are hardly shrunk.
+_WEAK = 3.0
 _SAMPLED = 60  # variances of which the median stands for all
 _LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
 _LEAST_KEPT = 1e-6  # of a bend by its prior, below which the vibration tells nothing of it
@@ -184,26 +179,25 @@ class OpenRecord:
 
 def _search(states: '_States', look: bool) -> None:
     """Fit states and lines by turns until no line is found any more."""
-    for number in range(_ROUNDS):
-        for _ in range(3 if number == 0 else 2):
+    states.step()
+    while True:
+        for _ in range(2):
             states.step()
         orders, tones = states.new_lines() if look else ([], [])
-        done = not orders and not tones
-        if not states.all_free and (done or number >= _EARLY_ROUNDS
-                                    or states.lines_found > _EARLY_LINES):
+        if orders or tones:
+            states.add(orders, tones)
+            states.fit_amplitudes()
+            states.refine()
+            states.fit_amplitudes()
+        elif states.all_free:
+            break
+        else:
             states.free_all()
             for _ in range(4):
                 states.step()
             if look:
                 states.prune(_PRUNED_EARLY)
                 states.fit_amplitudes()
-            continue
-        if done or states.lines_found >= _MOST_LINES:
-            break
-        states.add(orders, tones)
-        states.fit_amplitudes()
-        states.refine()
-        states.fit_amplitudes()
     if look:
         states.refine()
         states.fit_amplitudes()
@@ -243,8 +237,7 @@ class _States:
         self.tones = np.zeros(0)
         self.highest = top
         self.jitter_std = jitter_std
-        points = next_fast_len(
-            max(_FEWEST_POINTS, math.ceil(_POINTS * top * cycle_length)), real=True)
+        points = next_fast_len(math.ceil(2.0 * _EDGE * top * cycle_length), real=True)
         self.u = u = (np.arange(points) + 0.5) / points
         # of the states of a cycle, and of the error of its last pulse
         self.shapes = np.stack([1.0 - u, u * (1.0 - u), u * (1.0 - u) * (2.0 * u - 1.0),
@@ -371,7 +364,7 @@ class _States:
         self.change = change[:, 0]
         size = float(np.sqrt(np.mean(self.change**2)))
         if move:
-            most = _STEP / (self.orders[:self.declared].max() * self.frequency)
+            most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency)
             part = min(1.0, most / max(size, 1e-300))
             self.states = self.states + part * change
             self._take_out_mean_bend()
@@ -410,7 +403,6 @@ class _States:
                 cells[:-1, np.array(others)[:, None], states] = np.moveaxis(found, 1, 2)
         size = self.size * np.append(weak, np.ones(width - 1))
         precision = np.tile(size**-2.0, (pulses, 1))
-        precision[~self.measured, 0] /= _NOT_MEASURED**2
         expected = self.states.copy()
         expected[:, 0] -= self.slow
         total = precision + np.einsum('kii->ki', cells)[:, :-1]
@@ -496,8 +488,7 @@ class _States:
         self.slow = np.asarray(np.polyval(
             np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
         power = np.mean((errors - self.slow)[inner] ** 2) + np.median(self._variances(0, _SAMPLED))
-        self.size[0] = np.clip(np.sqrt(power), _LEAST_JITTER * self.jitter_std,
-                               _MOST_JITTER * self.jitter_std)
+        self.size[0] = max(np.sqrt(power), _LEAST_JITTER * self.jitter_std)
         if self.all_free:
             least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
             for i, limit in enumerate(least, 1):
@@ -534,7 +525,7 @@ class _States:
             g * (1.0 + slope) * span, np.arange(power.size), power)) for g in self.orders],
             axis=0)
         best = slope[np.argmax(score - 1e-3 * np.abs(number))]
-        ratio = sum(item * np.log(2.0) / _medians(item, max(_WIDE, int(span / 2)))
+        ratio = sum(item * np.log(2.0) / _medians(item, max(int(span / 2), _SKIRT))
                     for item in spectrum.T)
         places = np.rint(self.orders * (1.0 + best) * span).astype(int)
         chance = gammaincc(spectrum.shape[1], ratio[places])
@@ -547,7 +538,7 @@ class _States:
             self._read()
 
     def new_lines(self) -> tuple[list[float], list[float]]:
-        """Return orders, and tones in Hz, that stand out of the residual."""
+        """Return orders, and tones in Hz, that stand out of the residual; some if too many do."""
         self._make_tables()
         span = self.cycle_length * self.transformed
         residual = self._residual()[:, :self.transformed]
@@ -574,8 +565,9 @@ class _States:
         found.sort(reverse=True)
         orders: list[float] = []
         tones: list[float] = []
-        for size, place, tone in found[:4 * _A_ROUND]:
-            if size < _SHARE * found[0][0] or len(orders) + len(tones) == _A_ROUND:
+        room = _MOST_LINES // (1 if self.all_free else 2) - self.lines_found
+        for size, place, tone in found:
+            if size < _SHARE * found[0][0] or len(orders) + len(tones) >= room:
                 break
             others = np.array([*self.orders, *orders])
             beside = np.array([*self.tones, *tones])
@@ -829,8 +821,8 @@ def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
     ratio = np.zeros(power.shape[1])
     for channel, limit in zip(power, (0.5 * least * window.sum()) ** 2):
         floor = np.full(channel.size, limit)
-        for wide in (max(_WIDE, int(span / 2)), _SKIRT):
-            np.maximum(floor, _medians(channel, wide), out=floor)
+        for reach in (max(int(span / 2), _SKIRT), _SKIRT):
+            np.maximum(floor, _medians(channel, reach), out=floor)
         ratio += channel * np.log(2.0) / floor
     return ratio, power.sum(axis=0)
 
