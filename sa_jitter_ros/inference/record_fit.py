@@ -51,10 +51,9 @@ _BEYOND, _BEYOND_LINES = 6.0, 3.0
 _EDGE = 1.15  # of the band, where the low pass ends
 _FULL_BAND = 0.4  # of the sample rate
 _SAMPLES = 3.7  # in a period of the band's end
-# A first guess of the states: of bends in parts of the declared jitter, of gains.
-_BEND, _GAIN = 0.1, 0.03
-_FIXED = 1e-4  # of the first guess, while the lines are still looked for
-_LEAST_BEND, _LEAST_GAIN = 0.003, 1e-3
+# Bends in parts of the declared jitter, and gains: a first guess, and before they are free.
+_FREE, _FIXED = 0.1, 1e-4
+_LEAST_GAIN = 1e-3
 _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
@@ -64,21 +63,20 @@ _LAST_STEPS, _CONVERGED = 6, 1e-3
 # it must not be far below the strongest, which may leave images of itself.
 _FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
-_APART = 1.5  # bins between lines
+#: Bins between lines that are kept apart.
+APART = 1.5
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
-_TRIED = 10  # frequencies a bin
+_FINE = 0.3  # bins between frequencies that are tried
 _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
 _SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
-_SLOPES, _SLOPE_STEP, _SLOPE_GAIN = 400, 0.3, 0.7
+_SLOPE_GAIN = 0.7
 _MOST_SLOPE = 5e-3  # beyond it, other lines are taken for the declared ones
 _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
 _SAMPLED = 60  # variances of which the median stands for all
-_LAGS = 32  # of the autocovariance of what the pulse errors are wrong by
-_LEAST_KEPT = 1e-6  # of a bend by its prior, below which the vibration tells nothing of it
-_RIDGE = 1e-9
+_ROUNDING = float(np.sqrt(np.finfo(np.float64).eps))  # half of the digits
 
 
 @dataclass(frozen=True)
@@ -87,8 +85,8 @@ class RecordFit:
     Pulse errors and lines of a stretch of a recording.
 
     `errors` and `standard_errors` (pulse,) in s, measured minus true, their mean 0;
-    `noise_autocovariance` (lag,) in s^2 is that of what the errors are wrong by. `bends` (cycle,
-    2) are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
+    `roughness` (s) is the RMS of what their second differences are wrong by. `bends` (cycle, 2)
+    are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
     `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
     lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
@@ -96,12 +94,13 @@ class RecordFit:
     imaginary parts. `turning` (order,) tells which orders certainly turn with the shaft: the speed
     varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s)
     is the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
-    bends that the fit expected, towards 0.
+    bends that the fit expected, towards 0. Declared lines that stand out of the noise have `held`
+    the angle to the pulses: others go along with any drift.
     """
 
     errors: Array
     standard_errors: Array
-    noise_autocovariance: Array
+    roughness: float
     bends: Array
     bend_standard_errors: Array
     declared: int
@@ -113,17 +112,7 @@ class RecordFit:
     turning: BoolArray
     jitter_std: float
     expected_std: Array
-
-    @property
-    def held(self) -> bool:
-        """
-        Tell whether declared lines stand out of the noise, at the best of the slopes tried.
-
-        Only lines of known orders hold the angle to the pulses: others go along with any drift.
-        """
-        lines = np.abs(self.amplitudes[:, :self.declared])
-        power = np.sum((lines / self.amplitude_errors[:, :self.declared]) ** 2)
-        return bool(gammaincc(lines.size, 0.5 * power) < _FALSE / _SLOPES)
+    held: bool
 
 
 def fit_record(samples: Array, sample_rate: float, start_time: float, times: Array, *,
@@ -340,7 +329,7 @@ class _States:
         gain = 1.0 + self.states[:-1, -1:]
         right = np.stack([self._sums(row / gain).conj().sum(axis=0)
                           for row in self.vibration], axis=1)
-        ridge = _RIDGE * self.normal[0, 0] * np.eye(len(self.normal))
+        ridge = _ROUNDING * self.normal[0, 0] * np.eye(len(self.normal))
         found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
         n = len(right)
         self.amplitudes = (found[:n] + 1j * found[n:]).T
@@ -443,7 +432,7 @@ class _States:
             below[c] = np.append(total.real, -total.imag)
             corner[c, :, c] = weight * self.normal
         flat = corner.reshape(below.size, -1)
-        flat[np.diag_indices(len(flat))] *= 1.0 + _RIDGE
+        flat[np.diag_indices(len(flat))] *= 1.0 + _ROUNDING
         return border.reshape(pulses, width, -1), flat, below.ravel()
 
     def _sums_of(self, values: Array, which: int, channel: int, shapes: Array) -> ComplexArray:
@@ -490,20 +479,19 @@ class _States:
         power = np.mean((errors - self.slow)[inner] ** 2) + np.median(self._variances(0, _SAMPLED))
         self.size[0] = max(np.sqrt(power), _LEAST_JITTER * self.jitter_std)
         if self.all_free:
-            least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
-            for i, limit in enumerate(least, 1):
+            for i in range(1, self.width):
                 before, variance = self.size[i]**2, np.median(self._variances(i, _SAMPLED))
                 gained = np.mean(self.states[2:-2, i] ** 2) + variance - before
                 # EM grows from small sizes too slowly, by a factor of what the vibration tells;
                 # it shrinks as slowly, so that errors have room for lines that were not found
-                told = max(1.0 - variance / before, _LEAST_KEPT) if gained > 0.0 else 1.0
-                self.size[i] = max(np.sqrt(before + gained / told), limit)
+                told = max(1.0 - variance / before, _ROUNDING) if gained > 0.0 else 1.0
+                self.size[i] = np.sqrt(before + gained / told)
+            self.size[-1] = max(self.size[-1], _LEAST_GAIN)
 
     def free_all(self) -> None:
         """Let bends and gains free."""
         self.all_free = True
-        self.size[1:-1] = _BEND * self.jitter_std
-        self.size[-1] = _GAIN
+        self.size[1:] *= _FREE / _FIXED
 
     # --- lines ---
 
@@ -517,21 +505,21 @@ class _States:
         flat = self.vibration[:, :self.transformed].reshape(len(self.vibration), -1)
         spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
         power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
-        step = _SLOPE_STEP / self.orders.max() / span
-        most = min(_SLOPES, int(_MOST_SLOPE / step))
-        number = np.arange(-most, most + 1)
-        slope = step * number
+        step = _FINE / self.orders.max() / span
+        most = int(_MOST_SLOPE / step)
+        slope = step * np.arange(-most, most + 1)
+        self.slopes = slope.size
         score = np.sum([np.log(1e-3 * power.max() + np.interp(
             g * (1.0 + slope) * span, np.arange(power.size), power)) for g in self.orders],
             axis=0)
-        best = slope[np.argmax(score - 1e-3 * np.abs(number))]
+        best = slope[np.argmax(score)]
         ratio = sum(item * np.log(2.0) / _medians(item, max(int(span / 2), _SKIRT))
                     for item in spectrum.T)
         places = np.rint(self.orders * (1.0 + best) * span).astype(int)
         chance = gammaincc(spectrum.shape[1], ratio[places])
         if (score.max() - score[most] > _SLOPE_GAIN * self.declared
                 and abs(best) > 1.5 * step
-                and np.mean(chance < _FALSE / number.size) > _SLOPE_LINES):
+                and np.mean(chance < _FALSE / slope.size) > _SLOPE_LINES):
             pulse = np.arange(self.times.size) - 0.5 * self.times.size
             self.slow = np.asarray(best * pulse * np.diff(self.times).mean())
             self.states[:, 0] = self.slow
@@ -572,10 +560,10 @@ class _States:
             others = np.array([*self.orders, *orders])
             beside = np.array([*self.tones, *tones])
             if tone:
-                near_one = np.any(np.abs(beside - place) * duration < _APART) or np.any(
-                    np.abs(others - place / self.frequency) * self.span < _APART)
+                near_one = np.any(np.abs(beside - place) * duration < APART) or np.any(
+                    np.abs(others - place / self.frequency) * self.span < APART)
             else:
-                near_one = np.any(np.abs(others - place) * self.span < _APART)
+                near_one = np.any(np.abs(others - place) * self.span < APART)
             if not near_one:
                 (tones if tone else orders).append(float(place))
         return orders, tones
@@ -657,32 +645,29 @@ class _States:
         for i in range(2):
             variance = float(np.median(self._variances(1 + i, _SAMPLED)))
             kept = 1.0 - variance / self.size[1 + i] ** 2  # not shrunk
-            if kept > _LEAST_KEPT:
+            if kept > _ROUNDING:  # the vibration tells something of it
                 bends[:, i] /= kept
                 bend_errors[i] = np.sqrt(variance / kept)
+        variances = self._amplitude_variances()
+        shown = (np.abs(self.amplitudes) ** 2 / variances)[:, :self.declared]
         return RecordFit(
-            errors, np.sqrt(self._variances(0)), self._autocovariance(), bends, bend_errors,
+            errors, np.sqrt(self._variances(0)), self._roughness(), bends, bend_errors,
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
             self.amplitudes[:, self.orders.size:],
-            np.sqrt(self._amplitude_variances()), self._families(self._turning()),
-            float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]))
+            np.sqrt(variances), self._families(self._turning()),
+            float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]),
+            bool(gammaincc(shown.size, 0.5 * shown.sum()) < _FALSE / self.slopes))
 
-    def _autocovariance(self) -> Array:
-        """Return the mean posterior autocovariance of the pulse errors about their mean."""
-        solved, pulses = self.solved, self.times.size
-        lags = min(_LAGS, pulses - 1)
-        chosen = np.unique(np.linspace(0, pulses - 1 - lags, _SAMPLED).astype(int))
-        scale = solved.scale[:, 0]
-        unit = np.zeros((pulses, chosen.size + 1))
-        unit[chosen, np.arange(chosen.size)] = scale[chosen]
-        unit[:, -1] = scale * self.measured / self.measured.sum()
-        found = solved.of_errors(unit) * scale[:, None]
-        shared = found[:, -1]
-        mean = float(shared @ self.measured) / self.measured.sum()
-        each = chosen[:, None] + np.arange(lags + 1)
-        return np.asarray(np.mean(
-            found[each, np.arange(chosen.size)[:, None]] - shared[each]
-            - shared[chosen][:, None] + mean, axis=0))
+    def _roughness(self) -> float:
+        """Return the RMS of what second differences of the pulse errors are wrong by."""
+        chosen = np.unique(np.linspace(0, self.times.size - 3, _SAMPLED).astype(int))
+        unit = np.zeros((self.times.size, chosen.size))
+        whole = np.ones(chosen.size, np.bool_)
+        for place, factor in zip((chosen, chosen + 1, chosen + 2), (1.0, -2.0, 1.0)):
+            unit[place, np.arange(chosen.size)] = factor * self.solved.scale[place, 0]
+            whole &= self.measured[place]
+        variance = np.sum(unit * self.solved.of_errors(unit), axis=0)
+        return float(np.sqrt(variance @ whole / max(whole.sum(), 1)))
 
     def _families(self, turning: BoolArray) -> BoolArray:
         """Return which orders turn: sidebands as far from declared lines or 0 turn alike."""
@@ -690,7 +675,7 @@ class _States:
         beside = np.abs(orders[:, None] - self.orders[:self.declared]).min(axis=1)
         distance = np.stack([beside, orders], axis=1)
         apart = np.abs(distance[:, None, :, None] - distance[:, None, :])
-        alike = apart.min(axis=(2, 3)) * self.span < _APART
+        alike = apart.min(axis=(2, 3)) * self.span < APART
         found = turning.copy()
         found[self.declared:] = np.any(alike & turning[self.declared:], axis=1)
         return found
@@ -701,7 +686,8 @@ class _States:
         residual = self._residual()
         middle = self.place.mean(axis=1)
         angle = self.cycle_length * (np.arange(self.times.size - 1) + 0.5)
-        near = np.arange(-_TRIED, _TRIED + 1) / _TRIED / float(np.ptp(middle))
+        reach = math.ceil(1.0 / _FINE)
+        near = _FINE * np.arange(-reach, reach + 1) / float(np.ptp(middle))
         found = np.zeros(self.orders.size, np.bool_)
         found[:self.declared] = True
         sums = [self._sums(item) for item in residual]

@@ -27,7 +27,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.inference.beat import METHODS
-from sa_jitter_ros.inference.record_fit import band_end, OpenRecord, RecordFit
+from sa_jitter_ros.inference.record_fit import APART, band_end, OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.resampling import gain
@@ -44,7 +44,6 @@ _LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
 _WIDER = 4.0, 16.0  # bands in which lines are looked for where the declared ones show no errors
-_APART = 1.5  # in what a stretch resolves: lines that it keeps apart
 # Second differences that are larger than this many of their median are no motion.
 _OUTLIER = 6.0
 # RMS of second differences, in that of what the errors are wrong by, that needs no other fit.
@@ -69,7 +68,7 @@ class RecordRecovery:
     mean 0 in each stretch, NaN outside of them; `bridged_errors` and `bridged_standard_errors`
     (m,) have those of the interpolated pulses, too. `ripple` and `bend` (m - 1,) are the factors
     of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s), NaN beside a missing
-    pulse, with their standard errors. `noise_autocovariance` (lag,) in s^2 is that of what
+    pulse, with their standard errors. `roughness` (s) is the RMS of what second differences of
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
     tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
     the `bridged` pulses. `expected_std` (3,) in s is what the fits expected of errors and bends.
@@ -84,7 +83,7 @@ class RecordRecovery:
     ripple_standard_error: float
     bend: FloatArray
     bend_standard_error: float
-    noise_autocovariance: FloatArray
+    roughness: float
     jitter_std: float
     undeclared: tuple[FloatArray, FloatArray]
     fits: tuple[RecordFit, ...]
@@ -160,8 +159,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
                 wider, recovery = more, _joined(pulses, stretches, fits(lines, more))
                 break
     if known is None and any(item.size for item in recovery.undeclared):
-        roughness, lags = _roughness(recovery), recovery.noise_autocovariance[:3]
-        if roughness**2 < _SMOOTH**2 * lags @ (6.0, -8.0, 2.0):
+        roughness = _roughness(recovery)
+        if roughness < _SMOOTH * recovery.roughness:
             return recovery
         none = np.zeros(0), np.zeros(0)
         bare = _joined(pulses, stretches, fits(none, wider))
@@ -211,8 +210,8 @@ def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,
         return None
     if known is not None:
         span = model.cycle_length * (times.size - 1)
-        known = (_apart(known[0], model.orders, _APART / span),
-                 _apart(known[1], (), _APART / float(np.ptp(times))))
+        known = (_apart(known[0], model.orders, APART / span),
+                 _apart(known[1], (), APART / float(np.ptp(times))))
     try:
         return record.fit(known)
     except np.linalg.LinAlgError:
@@ -246,7 +245,6 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
                           ) if good else np.full(2, np.inf)
     bends[:, ~np.isfinite(bend_errors)] = np.nan
     weights = [fit.errors.size for fit in good]
-    lags = min((fit.noise_autocovariance.size for fit in good), default=0)
 
     def mean(values: Sequence[FloatArray]) -> FloatArray:
         return np.asarray(np.average(values, axis=0, weights=weights))
@@ -256,7 +254,7 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
     return RecordRecovery(
         pulses.times, pulses.missing, pulses.number, errors, standard_errors, bends[:, 0],
         float(bend_errors[0]), bends[:, 1], float(bend_errors[1]),
-        mean([fit.noise_autocovariance[:lags] for fit in good]) if good else empty,
+        float(np.sqrt(mean([np.square(fit.roughness) for fit in good]))) if good else 0.0,
         float(np.sqrt(mean([np.square(fit.jitter_std) for fit in good]))) if good else 0.0,
         (empty, empty) if longest is None else (
             longest.orders[longest.declared:], longest.tones), tuple(good), pulses.bridged,
