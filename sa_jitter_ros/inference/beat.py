@@ -24,13 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.evidence import Beat
-from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.pulses.resampling import gain
 from scipy.ndimage import median_filter
 
 Array = NDArray[Any]
 
 METHODS = ('linear', 'cubic', 'spline')
-_PLACES = 32
 _KNOWN = 0.03  # error of the shape
 _FINER, _HARMONICS = 33, 4  # frequencies between those that are tried; of the beat
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
@@ -65,7 +64,9 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
                        np.maximum(alone, 0.0).sum(axis=0))
     best = -np.inf
     for method in METHODS:
-        mean, swing = _interpolated(method, frequency)
+        # over the place between two samples; the images of a line swing about it
+        below, mean, above = (gain(method, frequency + turn) for turn in (-1.0, 0.0, 1.0))
+        swing = np.abs(below + above)
         wanted = depth_left * swing / mean
         unsure = noise + (_KNOWN * wanted) ** 2
         along = 2.0 * np.abs(np.sum(swings * wanted / unsure, axis=1))
@@ -79,10 +80,10 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
             off = np.clip(np.abs(swings[peak]) / wanted[peak] - 1.0, -0.5, 0.5)
             name, at, kept = method, peak, 1.0 - (1.0 - mean) * (1.0 + share * off)
     tried += np.log(len(METHODS))
-    gain, p_value = float(best - tried), float(np.exp(min(tried - best, 0.0)))
-    if gain <= ODDS:
-        return Beat(gain, p_value)
-    return Beat(gain, p_value, name, kept, float(turns[at]))
+    gained, p_value = float(best - tried), float(np.exp(min(tried - best, 0.0)))
+    if gained <= ODDS:
+        return Beat(gained, p_value)
+    return Beat(gained, p_value, name, kept, float(turns[at]))
 
 
 def _of_sidebands(swings: Array, noise: Array) -> Array:
@@ -115,17 +116,3 @@ def without_beat(radial: Array, beat: Beat) -> Array:
     harmonics = np.stack([best**n for n in range(1, _HARMONICS + 1)], axis=1)
     parts = np.concatenate([harmonics.real, harmonics.imag], axis=1)
     return np.asarray(radial - parts @ np.linalg.lstsq(parts, radial, rcond=None)[0])
-
-
-def _interpolated(method: str, frequency: Array) -> tuple[Array, Array]:
-    """Return mean gain and amplitude of its first harmonic over the place between two samples."""
-    place = (np.arange(_PLACES) + 0.5) / _PLACES
-    index = np.arange(64)
-    mean, swing = np.empty(frequency.size), np.empty(frequency.size)
-    for i, nu in enumerate(frequency):
-        wave = np.stack((np.cos(2.0 * np.pi * nu * index), np.sin(2.0 * np.pi * nu * index)), 1)
-        value = interpolate(wave, 31.0 + place, method=method)
-        gain = (value[:, 0] + 1j * value[:, 1]) * np.exp(-2j * np.pi * nu * (31.0 + place))
-        mean[i] = gain.mean().real
-        swing[i] = 2.0 * abs(np.mean(gain.real * np.exp(-2j * np.pi * place)))
-    return mean, swing
