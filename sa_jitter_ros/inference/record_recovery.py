@@ -22,7 +22,6 @@ a shaft, which turns smoothly, plus what the errors are wrong by.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +42,7 @@ _DEAD = 1e-9  # range of a channel, in its largest value, that is rounding
 _LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
-_WIDER = 4.0, 16.0  # bands in which lines are looked for where the declared ones show no errors
+_WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
 # Second differences that are larger than this many of their median are no motion.
 _OUTLIER = 6.0
 # RMS of second differences, in that of what the errors are wrong by, that needs no other fit.
@@ -149,15 +148,11 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     stretches = _stretches(pulses, start_time, start_time + len(samples) / rate, _EDGE / rate)
     wider = 1.0
     recovery = _joined(pulses, stretches, fits(known, wider))
-    if not recovery.resolved:
-        for before, more in pairwise((wider, *_WIDER)):
-            if ends(more) == ends(before):  # the whole band of the samples
-                break
-            found = _joined(pulses, stretches, fits(known, more))
-            if found.resolved:  # orders that shafts must have tell how long the cycles are
-                lines = _made_exact(found.undeclared[0], model), found.undeclared[1]
-                wider, recovery = more, _joined(pulses, stretches, fits(lines, more))
-                break
+    if not recovery.resolved and ends(_WIDER) != ends(wider):
+        found = _joined(pulses, stretches, fits(known, _WIDER))
+        if found.resolved:  # orders that shafts must have tell how long the cycles are
+            lines = _made_exact(found.undeclared[0], model), found.undeclared[1]
+            wider, recovery = _WIDER, _joined(pulses, stretches, fits(lines, _WIDER))
     if known is None and any(item.size for item in recovery.undeclared):
         roughness = _roughness(recovery)
         if roughness < _SMOOTH * recovery.roughness:
