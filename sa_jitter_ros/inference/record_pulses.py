@@ -33,7 +33,6 @@ _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
 # Pulses used to align two keyphasors, and the fraction of the pulses that the reference must have.
 _ALIGNED, _COVERED = 15, 0.5
-_AS_MANY = 0.6  # fraction of the pulses: a reference with fewer has one pulse per trigger cycle
 _LONGEST_GAP = 1_000_000  # pulses
 
 
@@ -142,8 +141,9 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     reference = None
     if recording.reference_pulse_times is not None:
         better, _ = _validated(recording.reference_pulse_times, 1)
-        as_many = better.times.size >= _AS_MANY * pulses.times.size
-        reference = _matched(found, better.every(1), step if as_many else 1)
+        # one pulse of the reference in each trigger cycle, or as many as there are of the other
+        longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
+        reference = _matched(found, better.every(1), step if longer**2 < step else 1)
     remarks = [*_remarks(counts, measured.size), *_tach_rate_remark(recording, model)]
     return RecordPulses(found.times, found.missing, found.starts_run, found.doubtful,
                         found.bridged, reference, tuple(remarks))
