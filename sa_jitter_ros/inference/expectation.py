@@ -47,11 +47,8 @@ Distribution = AmplitudeDistribution | SampledDistribution
 
 #: Relative uncertainty of an amplitude that comes from resampling.
 RESOLUTION = 5e-4
-_NODES, _IN_PANEL = 32, 64  # of an integral over a cycle, and of each panel of a longer one
-_A_TURN = 4.5  # nodes
+_NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
-_CALM = 10.0  # rad by which errors turn a wave within a cycle; more than that takes all nodes
-_WITHIN = np.linspace(0.0, 1.0, 9)  # where in a cycle this is looked at
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
@@ -373,10 +370,8 @@ def _sharpening(orders: Array, doubt: IndependentPulseJitter) -> Array:
 @lru_cache(maxsize=8)
 def _nodes(count: int) -> tuple[Array, Array]:
     """Return at least so many nodes in [0, 1], and their weights."""
-    if count <= _IN_PANEL:
-        return unit_nodes(count)
-    panels = math.ceil(count / _IN_PANEL)
-    u, w = unit_nodes(_IN_PANEL)
+    panels = math.ceil(count / _NODES)
+    u, w = unit_nodes(_NODES)
     return ((np.arange(panels)[:, None] + u).ravel() / panels, np.tile(w / panels, panels))
 
 
@@ -395,32 +390,25 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     e = errors * model.fundamental_frequency
     turns = r * np.ptp(np.append(sources, observation.orders)) + float(
         np.ptp(np.diff(e), axis=1).max()) * sources.max()
-    u, w = _nodes(math.ceil(_NODES + _A_TURN * turns))
+    u, w = _nodes(math.ceil(_NODES + 2.0 * np.pi * turns))  # a wave takes half as many
     # errors turn a wave by little within a cycle: a polynomial through few places is exact
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
-    start = model.weights.path(e, np.zeros(1), count)  # (acquisition, cycle, 1)
-    most = 2.0 * np.pi * sources.max() * np.abs(
-        model.weights.path(e, _WITHIN, count) - start).max(axis=2)
-    wild = most > _CALM  # across missing pulses
-    places, gathered = _few_places(u, degree, float(most[~wild].max(initial=0.0)))
-    offset = model.weights.path(e, places, count) - start
-    all_offsets = [(model.weights.path(row, u, count) - first)[here]
-                   for row, first, here in zip(e, start, wild)]
-    cycle = np.arange(count)[:, None]
-    table = np.zeros((len(e), observation.orders.size, sources.size), complex)
-    first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
+    path = model.weights.path(e, np.linspace(0.0, 1.0, _PLACES), count)  # (acquisition, cycle, u)
+    most = 2.0 * np.pi * sources.max() * float(np.abs(path - path[..., :1]).max())
+    places, gathered = _few_places(u, degree, most)
     turn = 2j * np.pi * r
+    first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
     first = first * np.exp(turn * sources[:, None] * u)
     back = np.exp(-turn * observation.orders * u[:, None])
-    for s, source in enumerate(sources):
-        whole = first[s, :, None] * back
-        inside = gathered @ whole
-        between = np.exp(turn * (source - observation.orders) * cycle)
-        for a, row in enumerate(offset):
-            each = np.exp(2j * np.pi * source * row) @ inside
-            each[wild[a]] = np.exp(2j * np.pi * source * all_offsets[a]) @ whole
+    inside = gathered @ (first[..., None] * back)  # (source, place, order)
+    between = np.exp(turn * (sources[:, None, None] - observation.orders)
+                     * np.arange(count)[:, None])  # (source, cycle, order)
+    table = np.zeros((len(e), observation.orders.size, sources.size), complex)
+    for a, row in enumerate(e):
+        offset = model.weights.path(row, places, count)
+        for s, source in enumerate(sources):
             table[a, :, s] = np.mean(
-                each * np.exp(2j * np.pi * source * start[a]) * between, axis=0)
+                np.exp(2j * np.pi * source * offset) @ inside[s] * between[s], axis=0)
     return table
 
 
