@@ -26,12 +26,13 @@ from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.evidence import Beat
 from sa_jitter_ros.pulses.resampling import gain
 from scipy.ndimage import median_filter
+from scipy.optimize import minimize_scalar
 
 Array = NDArray[Any]
 
 METHODS = ('linear', 'cubic', 'spline')
 _KNOWN = 0.03  # error of the shape
-_FINER, _HARMONICS = 33, 4  # frequencies between those that are tried; of the beat
+_HARMONICS = 4  # of the beat
 _AROUND = 81  # frequencies, a quarter of what is resolved apart, whose median is the noise
 
 
@@ -109,10 +110,15 @@ def without_beat(radial: Array, beat: Beat) -> Array:
     if not beat.method:
         return radial
     count, window = len(radial), np.hanning(len(radial))
-    finer = beat.frequency + np.linspace(-0.5, 0.5, _FINER) / (4 * count)
-    waves = np.exp(2j * np.pi * np.multiply.outer(finer, np.arange(count)))
-    swings = np.abs((window * waves) @ radial) ** 2
-    best = waves[np.argmax(np.sum(swings / radial.var(axis=0), axis=1))]
+
+    def wave(place: float) -> Array:
+        turns = beat.frequency + place / (4 * count)  # between the frequencies that were tried
+        return np.asarray(np.exp(2j * np.pi * turns * np.arange(count)))
+
+    def rest(place: float) -> float:
+        return -float(np.sum(np.abs((window * wave(place)) @ radial) ** 2 / radial.var(axis=0)))
+
+    best = wave(minimize_scalar(rest, bounds=(-0.5, 0.5), method='bounded').x)
     harmonics = np.stack([best**n for n in range(1, _HARMONICS + 1)], axis=1)
     parts = np.concatenate([harmonics.real, harmonics.imag], axis=1)
     return np.asarray(radial - parts @ np.linalg.lstsq(parts, radial, rcond=None)[0])
