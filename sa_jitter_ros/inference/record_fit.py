@@ -53,7 +53,7 @@ _FULL_BAND = 0.4  # of the sample rate
 _SAMPLES = 3.7  # in a period of the band's end
 # Bends in parts of the declared jitter, and gains: a first guess, and before they are free.
 _FREE, _FIXED = 0.1, 1e-4
-_LEAST_GAIN = 1e-3
+_LEAST_GAIN = 1e-3  # of those that are free
 _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
