@@ -19,7 +19,7 @@ other with the amplitudes that the channel has.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
-from itertools import chain
+from itertools import chain, product
 import math
 from typing import Any
 
@@ -49,6 +49,7 @@ Distribution = AmplitudeDistribution | SampledDistribution
 RESOLUTION = 5e-4
 _NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
+_CALM = 10.0  # rad by which errors turn a wave within a cycle; more than that takes all nodes
 _MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
@@ -394,22 +395,25 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     # errors turn a wave by little within a cycle: a polynomial through few places is exact
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
     path = model.weights.path(e, np.linspace(0.0, 1.0, _PLACES), count)  # (acquisition, cycle, u)
-    most = 2.0 * np.pi * sources.max() * float(np.abs(path - path[..., :1]).max())
-    places, gathered = _few_places(u, degree, most)
+    most = 2.0 * np.pi * sources.max() * np.abs(path - path[..., :1]).max(axis=2)
+    calm = most < _CALM
+    places, gathered = _few_places(u, degree, float(most[calm].max(initial=0.0)))
     turn = 2j * np.pi * r
     first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
     first = first * np.exp(turn * sources[:, None] * u)
     back = np.exp(-turn * observation.orders * u[:, None])
-    inside = gathered @ (first[..., None] * back)  # (source, place, order)
+    whole = first[..., None] * back  # (source, u, order)
+    ways = (calm, places, gathered @ whole), (~calm, u, whole)
     between = np.exp(turn * (sources[:, None, None] - observation.orders)
                      * np.arange(count)[:, None])  # (source, cycle, order)
     table = np.zeros((len(e), observation.orders.size, sources.size), complex)
-    for a, row in enumerate(e):
-        offset = model.weights.path(row, places, count)
-        for s, source in enumerate(sources):
-            table[a, :, s] = np.mean(
-                np.exp(2j * np.pi * source * offset) @ inside[s] * between[s], axis=0)
-    return table
+    for (a, row), (here, nodes, inside) in product(enumerate(e), ways):
+        if here[a].any():
+            offset = model.weights.path(row, nodes, count)[here[a]]
+            for s, source in enumerate(sources):
+                table[a, :, s] += np.sum(np.exp(2j * np.pi * source * offset) @ inside[s]
+                                         * between[s, here[a]], axis=0)
+    return table / count
 
 
 def _few_places(u: Array, degree: int, turn: float) -> tuple[Array, Array]:
