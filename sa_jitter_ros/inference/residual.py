@@ -138,7 +138,8 @@ def residual(attenuation: Array, expected: Array, variance: Array, amplitude: Ar
         p_scatter=_scatter_p_value(difference - mean, scale,
                                    [item.variance for item in sensitivities]),
         p_amplitude_scatter=_scatter_p_value(
-            shift - shift.mean(axis=0), np.sqrt(amplitude_variance - level_variance),
+            shift - shift.mean(axis=0),
+            np.sqrt(np.maximum(amplitude_variance - level_variance, 0.0)),
             [item.amplitude_variance for item in sensitivities]),
         score=_log_score(difference, scale),
         amplitude_score=float(-0.5 * np.mean(z**2 + 2.0 * np.log(width))), z=z)

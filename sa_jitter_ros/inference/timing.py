@@ -35,7 +35,6 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
-from sa_jitter_ros.inference.record_recovery import RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
@@ -50,6 +49,7 @@ Array = NDArray[Any]
 
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
+_RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
@@ -153,7 +153,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
     prior = expected[0]
     bend_std, bend_prior = recovery.ripple_standard_error, expected[1]
     # where the vibration resolves the errors, it shows more than the reference keyphasor does
-    referenced = observation.pulses.reference is not None and not error_std < RESOLVED * unit
+    referenced = observation.pulses.reference is not None and not error_std < _RESOLVED * unit
     if referenced and observation.pulses.reference is not None:
         better = observation.pulses.reference[here]
         known = np.isfinite(better)
