@@ -287,18 +287,27 @@ def size_of(name: str, bench: Bench, change: float) -> float | None:
     if name == 'keyphasor_quantisation':  # it replaces the declared jitter
         keywords['keyphasor_rate'] = 1e9
     plain = sa.predict(**keywords)
+
+    def moved(size: float) -> float:
+        with_it = sa.predict(**{**keywords, 'effects': {name: KNOWN[name][1](bench, size)}})
+        return max(float(np.abs(getattr(with_it, key) - getattr(plain, key)).max())
+                   for key in ('mean_attenuation', 'standard_deviation'))
+
     size = _FIRST[name]
-    for _ in range(_STEPS):
-        try:
-            with_it = sa.predict(**{**keywords, 'effects': {name: KNOWN[name][1](bench, size)}})
-        except SaJitterError:
+    for step in _STEP**8, _STEP:  # coarse, then fine from the last coarse one that is too small
+        for _ in range(_STEPS):
+            try:
+                if moved(size) >= change:
+                    break
+            except SaJitterError:
+                if step == _STEP:
+                    return None
+                break
+            size *= step
+        else:
             return None
-        moved = max(float(np.abs(getattr(with_it, key) - getattr(plain, key)).max())
-                    for key in ('mean_attenuation', 'standard_deviation'))
-        if moved >= change:
-            return size
-        size *= _STEP
-    return None
+        size = size if step == _STEP else max(size / step, _FIRST[name])
+    return size
 
 
 def opened(title: str, data: Path) -> list[Bench]:
