@@ -311,6 +311,23 @@ def test_recording_that_hides_its_pulse_errors_says_what_it_cannot_exclude(share
     assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
 
 
+@pytest.mark.parametrize('day', [20130331, 20130405])
+@pytest.mark.parametrize('skew', [0.0, 1.4e-4])
+def test_turbine_whose_lines_come_and_go_has_no_limit_of_what_they_do_not_hold(
+        shared_data, day, skew):
+    recording = read(shared_data / f'turbine_{day}.npz')
+    times = recording.keyphasor_pulses()
+    recording = replace(recording, pulse_times=times + skew * (times - times[0]), tach=None,
+                        tach_rate=None, reference_pulse_times=None)
+    model = DeclaredModel(keyphasor_rate=3.125e6, trigger_speed=30.0, trigger_cycles=10,
+                          pulses_per_revolution=2, orders=(20.0, 40.0, 60.0))
+    content = report(trace([observe(recording, model)], [recording]))
+    assert content['verdict'] in ('none', 'traced')
+    assert {item['name'] for item in content['missing_effects']} <= {'interfering_tone'}
+    (limit,) = [item['upper_95'] for item in content['limits'] if item['name'] == 'clock_skew']
+    assert limit is None or limit > skew
+
+
 @pytest.mark.machines
 def test_noise_that_hides_the_pulse_errors_is_found():
     """No attenuation can be compared where single errors do not show; the noise is seen."""

@@ -53,7 +53,8 @@ _FULL_BAND = 0.4  # of the sample rate
 _SAMPLES = 3.7  # in a period of the band's end
 # Bends in parts of the declared jitter, and gains: a first guess, and before they are free.
 _FREE, _FIXED = 0.1, 1e-4
-_LEAST_GAIN = 1e-3  # of those that are free
+# Those that are free keep at least so much: a bend of nothing would be certain.
+_LEAST_BEND, _LEAST_GAIN = 0.003, 1e-3
 _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
@@ -76,6 +77,7 @@ _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noi
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
 _SAMPLED = 60  # variances of which the median stands for all
+_LEAST_KEPT = 1e-6  # of a state by its prior, below which the vibration tells nothing of it
 _ROUNDING = float(np.sqrt(np.finfo(np.float64).eps))  # half of the digits
 
 
@@ -479,14 +481,14 @@ class _States:
         power = np.mean((errors - self.slow)[inner] ** 2) + np.median(self._variances(0, _SAMPLED))
         self.size[0] = max(np.sqrt(power), _LEAST_JITTER * self.jitter_std)
         if self.all_free:
-            for i in range(1, self.width):
+            least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
+            for i, limit in enumerate(least, 1):
                 before, variance = self.size[i]**2, np.median(self._variances(i, _SAMPLED))
                 gained = np.mean(self.states[2:-2, i] ** 2) + variance - before
                 # EM grows from small sizes too slowly, by a factor of what the vibration tells;
                 # it shrinks as slowly, so that errors have room for lines that were not found
-                told = max(1.0 - variance / before, _ROUNDING) if gained > 0.0 else 1.0
-                self.size[i] = np.sqrt(before + gained / told)
-            self.size[-1] = max(self.size[-1], _LEAST_GAIN)
+                told = max(1.0 - variance / before, _LEAST_KEPT) if gained > 0.0 else 1.0
+                self.size[i] = max(np.sqrt(before + gained / told), limit)
 
     def free_all(self) -> None:
         """Let bends and gains free."""
@@ -645,7 +647,7 @@ class _States:
         for i in range(2):
             variance = float(np.median(self._variances(1 + i, _SAMPLED)))
             kept = 1.0 - variance / self.size[1 + i] ** 2  # not shrunk
-            if kept > _ROUNDING:  # the vibration tells something of it
+            if kept > _LEAST_KEPT:
                 bends[:, i] /= kept
                 bend_errors[i] = np.sqrt(variance / kept)
         variances = self._amplitude_variances()

@@ -185,7 +185,9 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
     fit, held_out = parted(count)
     parts = stretches(observation, range(count), Clock(0.0, 0.0)) if observation.recoveries else []
-    timing = read_timing(parts, declared, names=frozenset())
+    coherent = choose_lines(observation).count > 0  # else no line holds the angle to the pulses
+    timing = read_timing([replace(item, held=item.held and coherent) for item in parts], declared,
+                         names=frozenset())
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
         without, with_it = (predict(observation.model, known) for known in (
