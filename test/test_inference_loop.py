@@ -128,7 +128,8 @@ def test_moving_source_takes_from_the_average_with_a_reference_keyphasor_too():
     loss = (found.prediction_before.attenuation
             - found.prediction_after.attenuation)[list(found.held_out)]
     assert loss[:, highest].mean() > 0.01
-    assert abs(off[:, highest].mean()) < 0.2 * loss[:, highest].mean()
+    each = off[:, highest].mean(axis=1)  # channels of an acquisition share its wander
+    assert abs(each.mean()) < 3.0 * each.std(ddof=1) / np.sqrt(each.size) < loss[:, highest].mean()
 
 
 def test_declared_model_suffices():

@@ -98,7 +98,7 @@ def test_fluctuation_has_its_standard_deviation_and_band():
     (lambda: Motion(((0.0, 9.0),), torsion=(Torsion(4, 0.2),)), 'changes the speed by up to 0.8'),
     (lambda: machine(fluctuation=band_limited(std=0.2, band=(1, 2), seed=0, name='x')),
      'fluctuation may reach'),
-    (lambda: band_limited(std=1.0, band=(2.0, 1.0), seed=0, name='x'), '0 < low < high'),
+    (lambda: band_limited(std=1.0, band=(2.0, 1.0), seed=0, name='x'), '0 <= low < high'),
     (lambda: band_limited(std=-1.0, band=(1.0, 2.0), seed=0, name='x'), 'at least 0'),
     (lambda: machine(sample_rate=0.0), 'sample_rate 0.0: must be finite and above 0'),
     (lambda: machine(shafts={'input': 1.0}), "no shaft 'output'"),

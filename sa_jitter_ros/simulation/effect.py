@@ -97,14 +97,9 @@ class Effect:
 
 
 def slow_process(setting: Setting, std: float, name: str, bandwidth: float) -> SinusoidSum:
-    """
-    Return a random function of time whose spectrum is flat up to `bandwidth` times trigger rate.
-
-    It begins at a fiftieth of that rate, or at 0.4 of the bandwidth where that is lower.
-    """
-    rate = setting.trigger_rate
-    return band_limited(std=std, band=(min(0.02, 0.4 * bandwidth) * rate, bandwidth * rate),
-                        seed=setting.seed, name=name)
+    """Return a random function of time, flat up to `bandwidth` times the trigger rate."""
+    return band_limited(std=std, band=(0.0, bandwidth * setting.trigger_rate), seed=setting.seed,
+                        name=name)
 
 
 def require_bandwidth(name: str, value: float) -> None:

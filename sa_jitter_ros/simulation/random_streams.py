@@ -143,15 +143,15 @@ def band_limited(*, std: float, band: tuple[float, float], seed: int, name: str)
     Return a nearly normal random function of zero mean with a flat spectrum in `band` (Hz).
 
     Its standard deviation over a long time is `std`. Raises ParameterError if the band is not
-    0 < low < high or `std` is negative.
+    0 <= low < high or `std` is negative.
 
     >>> wander = band_limited(std=0.01, band=(0.5, 5.0), seed=1, name='wander')
     >>> float(wander.value(np.arange(0.0, 500.0, 0.02)).std().round(4))
     0.01
     """
     low, high = band
-    if not 0.0 < low < high < np.inf:
-        raise ParameterError(f'{name}: band is {low} to {high} Hz, must be 0 < low < high')
+    if not 0.0 <= low < high < np.inf:
+        raise ParameterError(f'{name}: band is {low} to {high} Hz, must be 0 <= low < high')
     if not 0.0 <= std < np.inf:
         raise ParameterError(f'{name}: standard deviation is {std}, must be at least 0')
     places, phases = RandomStream(seed, name, rows=2).uniform(0, _LINES)
