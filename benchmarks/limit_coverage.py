@@ -154,8 +154,7 @@ def lines(seed: int | Sequence[int], *, std: float = 0.0, gain: float = 0.0, los
         modulation + rng.standard_normal(shape), np.ones(_LINES))
     return Evidence(
         replace(MODEL, noise_std=1.0, sample_rate=20e3), (Pulses(none),), none, none, none,
-        np.nan, False, none,
-        rng.geometric(1.0 - lost, _COUNT) - 1, Clock(0.0, 0.0), evidence)
+        none, rng.geometric(1.0 - lost, _COUNT) - 1, Clock(0.0, 0.0), evidence)
 
 
 def limit_of(drawn: Stretch | Evidence, name: str) -> float:

@@ -289,25 +289,21 @@ def size_of(name: str, bench: Bench, change: float) -> float | None:
     plain = sa.predict(**keywords)
 
     def moved(size: float) -> float:
-        with_it = sa.predict(**{**keywords, 'effects': {name: KNOWN[name][1](bench, size)}})
+        try:
+            with_it = sa.predict(**{**keywords, 'effects': {name: KNOWN[name][1](bench, size)}})
+        except SaJitterError:
+            return np.inf
         return max(float(np.abs(getattr(with_it, key) - getattr(plain, key)).max())
                    for key in ('mean_attenuation', 'standard_deviation'))
 
-    size = _FIRST[name]
+    size, found = _FIRST[name], 0.0
     for step in _STEP**8, _STEP:  # coarse, then fine from the last coarse one that is too small
+        size = max(size / step**8, _FIRST[name])
         for _ in range(_STEPS):
-            try:
-                if moved(size) >= change:
-                    break
-            except SaJitterError:
-                if step == _STEP:
-                    return None
+            if (found := moved(size)) >= change:
                 break
             size *= step
-        else:
-            return None
-        size = size if step == _STEP else max(size / step, _FIRST[name])
-    return size
+    return size if change <= found < np.inf else None
 
 
 def opened(title: str, data: Path) -> list[Bench]:

@@ -40,8 +40,8 @@ COSINE = np.cos(np.pi * (np.arange(512) + 0.5) / 512)
 RIPPLE_VARIANCE = np.mean(1.0 / (1.0 / 30.0 - (1.0 + COSINE) / (24.0 * (2.0 + COSINE))))
 
 
-def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noise_density=None,
-                radial=None, explained=(), speed=None, known=0.0):
+def evidence_of(rng, errors, *, moving=None, ripple=None, noise_density=None, radial=None,
+                explained=(), speed=None, known=0.0):
     """
     Return evidence of pulse `errors` (acquisition, pulse) in s, recovered with some noise.
 
@@ -65,7 +65,7 @@ def evidence_of(rng, errors, *, moving=None, ripple=None, ripple_error=1e-7, noi
         errors=seen - seen.mean(axis=1, keepdims=True),
         standard_errors=np.full(errors.shape, NOISE),
         ripple=np.full((count, pulses - 1), np.nan) if ripple is None else ripple,
-        ripple_standard_error=ripple_error, against_reference=False, record_times=times.ravel(),
+        record_times=times.ravel(),
         record_missing=np.zeros(times.size - 1, int), clock=Clock(5_000.0, 1e-9),
         lines=lines, explained=tuple(explained))
 

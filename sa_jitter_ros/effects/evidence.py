@@ -97,8 +97,8 @@ class Evidence:
     Measurements of the acquisitions that a fit may use.
 
     `errors` and `standard_errors` (acquisition, N_t + 1) are pulse errors in s, of mean 0 in each
-    acquisition, less the patterns of the effects in `explained`; they were measured
-    `against_reference`, a better keyphasor, or else recovered from the vibration. `ripple`
+    acquisition, less the patterns of the effects in `explained`; they were measured against a
+    better keyphasor, or else recovered from the vibration. `ripple`
     (acquisition, N_t) is the factor of u (1 - u) in the error inside each cycle, in s.
     `record_times` are all pulses of the record, `record_missing` (interval,) the number of pulses
     that are missing in each of its intervals; `clock` is the one on whose ticks all pulse times
@@ -110,8 +110,6 @@ class Evidence:
     errors: Array
     standard_errors: Array
     ripple: Array
-    ripple_standard_error: float
-    against_reference: bool
     record_times: Array
     record_missing: Array
     clock: Clock

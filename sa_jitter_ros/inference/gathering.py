@@ -150,14 +150,9 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
     standard_errors = np.array([item.standard_errors for item in items])
     if observation.against_reference:
         standard_errors = np.zeros_like(standard_errors)
-    ripple = np.array([item.ripple for item in items])
-    resolved = [item.ripple_standard_error**2 for item in items
-                if np.isfinite(item.ripple_standard_error)]
     return Evidence(
         model=model, pulses=tuple(own), errors=np.array(errors),
-        standard_errors=standard_errors, ripple=ripple,
-        ripple_standard_error=float(np.sqrt(np.mean(resolved))) if resolved else float('nan'),
-        against_reference=observation.against_reference,
+        standard_errors=standard_errors, ripple=np.array([item.ripple for item in items]),
         record_times=observation.pulses.times, record_missing=observation.pulses.missing,
         clock=clock, explained=tuple(effects),
         lines=replace(scatter, radial=scatter.radial[list(usable)],
@@ -170,9 +165,9 @@ def pulse_evidence(observation: Observation) -> Evidence:
     nothing, no_cycles = np.zeros((0, 0)), np.zeros((0, 0, 0))
     return Evidence(
         model=observation.model, pulses=(), errors=nothing, standard_errors=nothing,
-        ripple=nothing, ripple_standard_error=float('nan'), against_reference=False,
-        record_times=observation.pulses.times, record_missing=observation.pulses.missing,
-        clock=Clock(0.0, 0.0), lines=LineEvidence(none, none, none, nothing, no_cycles, none))
+        ripple=nothing, record_times=observation.pulses.times,
+        record_missing=observation.pulses.missing, clock=Clock(0.0, 0.0),
+        lines=LineEvidence(none, none, none, nothing, no_cycles, none))
 
 
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:

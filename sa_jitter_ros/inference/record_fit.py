@@ -64,7 +64,7 @@ _LAST_STEPS, _CONVERGED = 6, 1e-3
 # it must not be far below the strongest, which may leave images of itself.
 _FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
-#: Bins between lines that are kept apart.
+#: Bins between lines, or cycles in a stretch between waves, that are told apart.
 APART = 1.5
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
 _FINE = 0.3  # bins between frequencies that are tried

@@ -200,10 +200,10 @@ class Bench:
                     float(np.mean((other.attenuation_variance - expected.attenuation_variance)
                                   / (expected.attenuation_variance + variance))),
                     float(np.mean(wider))))
-        if doubt:
-            freedom = max(2.0 / doubt, _FREEDOM)
+        if findings:
+            doubt = min(doubt, 2.0 / _FREEDOM)  # 2 over the degrees of freedom of the variance
             level = level + sum(item.mean**2 for item in moved) + (
-                2.0 / (freedom - 2.0) * expected.amplitude_variance.mean(axis=0))
+                doubt / (1.0 - doubt) * expected.amplitude_variance.mean(axis=0))
             expected = self.expect(effects, self.held_out,
                                    unsteadiness=np.sqrt(level + unsteadiness**2))
         return residual(

@@ -34,11 +34,11 @@ from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
-from sa_jitter_ros.inference.record_fit import RecordFit
+from sa_jitter_ros.inference.record_fit import APART, RecordFit
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
-from sa_jitter_ros.inference.timing_data import ALIASES, APART, FEWEST, Stretch
+from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text

@@ -34,8 +34,6 @@ Array = NDArray[Any]
 ALIASES = np.array([0, 1, -1])
 _TAPER = 0.05  # of a stretch, at either end
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one
-#: Cycles in a stretch from which two waves are told apart, and one from the trend.
-APART = 1.5
 #: Trigger cycles of a stretch from which it shows something.
 FEWEST = 12
 

@@ -18,13 +18,15 @@ is smooth, of the declared jitter, of the noise of the recovery, and of random e
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, lru_cache
+from itertools import count
 import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
-from sa_jitter_ros.inference.timing_data import APART, TimingData
+from sa_jitter_ros.inference.record_fit import APART
+from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
 
 Array = NDArray[Any]
@@ -127,14 +129,16 @@ class TimingFit:
         self._held = len(held)
 
     def _maximise(self) -> None:
-        self.value, before = -np.inf, -np.inf
-        while before == -np.inf or (self.columns and self.value > before + _SAME):
+        self.value = -np.inf
+        for restart in count():  # a search that starts again where it ended goes on a little
             before = self.value
             self.sizes, self.size_covariance, left = self._patterns(self.spectrum(self.parameters))
             self.power = self.data.binned(left)
             found = minimize(self._cost, self.parameters, method='L-BFGS-B', jac=True,
                              bounds=list(zip(self.lower, self.upper)))
             self.parameters, self.value = found.x, -float(found.fun)
+            if restart and not (self.columns and self.value > before + _SAME):
+                break
 
     @property
     def count(self) -> int:
