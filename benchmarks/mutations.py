@@ -106,7 +106,7 @@ def noticed(number: Number, up: bool, cases: Sequence[str]) -> str:
     lines[number.line - 1] = line[:number.start] + moved + line[number.end:]
     path.write_text(''.join(lines))
     try:
-        return next((case for case in cases if differs(case)), '')
+        return differs(cases)
     finally:
         path.write_text(before)
 
@@ -120,16 +120,24 @@ def _copy() -> 'tempfile.TemporaryDirectory[str]':
     return copy
 
 
-def differs(case: str) -> bool:
-    """Return whether the copy has another result; a search that does not end has one, too."""
+def differs(cases: Sequence[str]) -> str:
+    """
+    Return the first case that has another result in the copy; '' if none has.
+
+    A search that does not end is another result, too.
+    """
     command = [sys.executable, str(_ROOT / 'benchmarks' / 'published_results.py'), '--first',
-               '--cases', case]
+               '--cases', *cases]
     environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONDONTWRITEBYTECODE': '1'}
-    try:
-        return subprocess.run(command, capture_output=True, timeout=_LONGEST,
-                              env=environment).returncode != 0
-    except subprocess.TimeoutExpired:
-        return True
+    with tempfile.TemporaryFile('w+') as asked:
+        try:
+            if not subprocess.run(command, stdout=subprocess.DEVNULL, stderr=asked,
+                                  timeout=_LONGEST, env=environment).returncode:
+                return ''
+        except subprocess.TimeoutExpired:
+            pass
+        asked.seek(0)
+        return [line.strip() for line in asked if line.strip() in cases][-1]
 
 
 def kept() -> dict[str, list[str]]:

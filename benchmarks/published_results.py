@@ -98,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     published = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     count = 0
     for name in options.cases:
+        print(name, file=sys.stderr, flush=True)
         found = json.loads(json.dumps(result(name)))
         if options.write:
             published[name] = found

@@ -22,7 +22,7 @@ def test_numbers_of_constants_are_found():
 
 @pytest.mark.machines
 def test_without_a_move_nothing_changes():
-    assert not differs('clock_skew 1000')
+    assert not differs(['clock_skew 1000'])
 
 
 @pytest.mark.machines

@@ -57,7 +57,7 @@ def choose_lines(observation: Observation) -> Lines:
     of 0.9 times that of the best line, which noise and modulation lower too. There may be none.
     """
     orders = observation.orders.size
-    cycles = _cycles(observation)
+    cycles = cycle_amplitudes(observation)
     level = np.abs(observation.stacked('corrected')[..., :orders]).mean(axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):
         coherence = np.mean(np.abs(cycles.mean(axis=1)) ** 2, axis=0) / np.mean(
@@ -68,6 +68,16 @@ def choose_lines(observation: Observation) -> Lines:
         good &= coherence >= _COHERENT * coherence[good].max()
     channel, order = np.nonzero(good)
     return Lines(channel, order)
+
+
+def hidden_lines(observation: Observation, lines: Lines) -> Lines:
+    """Return declared orders without any of the `lines` where they are well above the noise."""
+    orders = observation.orders.size
+    level, floor = (np.abs(observation.stacked(name)[..., :orders]).mean(axis=0)
+                    for name in ('corrected', 'noise_floor'))
+    channel = level.argmax(axis=0)
+    order = np.setdiff1d(np.flatnonzero((level > CHANCE * floor).any(axis=0)), lines.order)
+    return Lines(channel[order], order)
 
 
 def channel_groups(observation: Observation) -> Array:
@@ -173,7 +183,7 @@ def pulse_evidence(observation: Observation) -> Evidence:
 def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     """Return the scatter of the amplitudes of the lines in all acquisitions."""
     model = observation.model
-    cycles = lines.of(_cycles(observation))
+    cycles = lines.of(cycle_amplitudes(observation))
     shortest = cycles.shape[1]
     mean = cycles.mean(axis=1, keepdims=True)
     level = np.abs(mean).mean(axis=(0, 1))
@@ -226,7 +236,8 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     chosen = np.flatnonzero(doubtful_lines(fit, model))
     if not chosen.size:
         return None
-    apart = frequency[chosen, None] - observation.orders[lines.order] * model.fundamental_frequency
+    order = np.append(lines.order, hidden_lines(observation, lines).order)
+    apart = frequency[chosen, None] - observation.orders[order] * model.fundamental_frequency
     level = np.abs(amplitudes[:, :fit.declared]).max(axis=1)
     size = np.max(np.abs(amplitudes[:, chosen]) / level[:, None], axis=0)
     # beyond half a line of the average all are taken to leak as the sides of a sinc do
@@ -243,7 +254,7 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
                 len(amplitudes), 0.5 * observation.sample_rate * duration)
 
 
-def _cycles(observation: Observation) -> Array:
+def cycle_amplitudes(observation: Observation) -> Array:
     """Return corrected amplitudes (acquisition, cycle, channel, order), as many cycles of each."""
     shortest = min(len(item.cycles) for item in observation.acquisitions)
     return np.array([item.cycles[:shortest, :, :observation.orders.size]

@@ -16,6 +16,7 @@ change, and resonances that the speed crosses, turn lines each by itself, and ma
 follow the speed. No effect of the package does that.
 """
 
+from collections.abc import Iterator
 import math
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.gathering import cycle_amplitudes
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.prediction.influence import mean_period
@@ -59,7 +61,8 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     rises = _accelerations(observation)
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
-    return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise))
+    return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise),
+            *_beside_errors(observation, lines))
 
 
 def _periods(observation: Observation) -> Array:
@@ -76,13 +79,16 @@ def _accelerations(observation: Observation) -> Array:
 
 def _late(observation: Observation) -> Array:
     """Return by how much the pulses of each acquisition are late in the mean, in s."""
-    late, number, before = [], 0, -1
+    return np.array([float(np.nan_to_num(errors.mean())) for errors in _errors(observation)])
+
+
+def _errors(observation: Observation) -> Iterator[Array]:
+    """Yield the recovered errors of the pulses of each acquisition in s, their mean included."""
+    number, before = 0, -1
     for item in observation.acquisitions:
         number += item.first <= before
         before = item.first
-        errors = observation.recoveries[number].errors[item.first:item.first + item.times.size]
-        late.append(float(np.nan_to_num(errors.mean())))
-    return np.array(late)
+        yield observation.recoveries[number].errors[item.first:item.first + item.times.size]
 
 
 def _turns(ratio: Array, noise: Array, order: Array) -> Check:
@@ -117,3 +123,37 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
                   math.sqrt(float(explained[worst])),
                   f'the amplitudes follow the speed: {math.sqrt(float(explained[worst])):.2g} of '
                   'an amplitude RMS, as a resonance makes them'),)
+
+
+def _beside_errors(observation: Observation, lines: Lines) -> Iterator[Check]:
+    """
+    Test whether the amplitudes of an order follow the pulse errors, as a parabola over them.
+
+    Where one order shows the errors alone, what turns it looks like them; a resonance or a path
+    that changes its amplitude, too, is told by that. Two motions shifted far against each other
+    tell how much slow ones agree by chance.
+    """
+    cycles = np.abs(lines.of(cycle_amplitudes(observation)))
+    count = cycles.shape[1]
+    errors = np.concatenate([0.5 * (row[1:] + row[:-1])[:count] for row in _errors(observation)])
+    known = np.isfinite(errors)
+    errors = errors[known] / max(float(np.std(errors[known])), np.finfo(np.float64).tiny)
+    shape = np.linalg.qr(np.stack(
+        [np.ones(errors.size), errors, errors**2], axis=1))[0][:, 1:]
+    waves = np.fft.rfft(shape, axis=0)
+    size = (cycles / cycles.mean(axis=(0, 1))).reshape(known.size, -1)[known]
+    orders = np.unique(lines.order)
+    for order in orders:
+        values = size[:, lines.order == order].mean(axis=1)
+        values -= values.mean()
+        shared = np.fft.irfft(waves * np.fft.rfft(values).conj()[:, None], errors.size, axis=0)
+        explained = np.sum(shared**2, axis=1) / errors.size
+        share = explained / np.var(values)
+        apart = share[errors.size // 4:-(errors.size // 4)].mean()
+        if explained[0] > _TURN**2:
+            # the share of a parabola over independent values is 2 / (their number - 1) in the mean
+            yield Check(min(1.0, float((1.0 - share[0]) ** max(1.0 / apart - 1.0, 0.0))
+                            * orders.size), LINES, math.sqrt(float(explained[0])),
+                        f'the amplitude of order {observation.orders[order]:g} follows the pulse '
+                        f'errors: {math.sqrt(float(explained[0])):.2g} of it RMS, as a resonance '
+                        'or a path that changes make it')

@@ -58,7 +58,8 @@ class Bench:
     """
     Everything that scoring needs; `untold` maps effects that these data cannot show to the reason.
 
-    `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them.
+    `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them,
+    `hidden` that of declared orders that the vibration holds and that are not worth comparing.
     `moving` are effects that take as much from the amplitude with a reference keyphasor as from
     the raw one.
     """
@@ -76,6 +77,7 @@ class Bench:
     untold: Mapping[str, str] = field(default_factory=dict)
     memory: Memory = field(default_factory=Memory, repr=False)
     fewer: 'Bench | None' = None
+    hidden: 'Bench | None' = None
     moving: tuple[Effect, ...] = ()
 
     def with_moving_source(self, effects: Sequence[Effect]) -> 'Bench':
@@ -107,7 +109,8 @@ class Bench:
         Return the largest change of a line that an effect makes beside others.
 
         It is that of the mean attenuation, or of the standard deviation of one average, of the
-        acquisitions that fit parameters, or of the `chosen` ones.
+        acquisitions that fit parameters, or of the `chosen` ones. A line counts also if it is not
+        compared: what disturbs it is why.
         """
         without, with_it = (self.expect(known, self.fit if chosen is None else chosen)
                             for known in ([*others], [*others, effect]))
@@ -115,7 +118,8 @@ class Bench:
         for name in ('attenuation_variance', 'amplitude_variance'):
             changes.append(np.abs(np.sqrt(getattr(with_it, name).mean(axis=0))
                                   - np.sqrt(getattr(without, name).mean(axis=0))))
-        return float(np.max(changes))
+        of_hidden = self.hidden.change(others, effect, chosen) if self.hidden else 0.0
+        return max(float(np.max(changes)), of_hidden)
 
     def expect(self, effects: Sequence[Effect], chosen: Sequence[int], *,
                unsteadiness: float | Array = 0.0) -> Expectation:

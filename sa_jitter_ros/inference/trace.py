@@ -37,10 +37,11 @@ from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
-from sa_jitter_ros.inference.expectation import Expectation, Lines
+from sa_jitter_ros.inference.expectation import Expectation, Lines, Memory
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
-    channel_groups, choose_lines, gather_pulses, line_evidence, pulse_evidence)
+    channel_groups, choose_lines, gather_pulses, hidden_lines, line_evidence,
+    pulse_evidence)
 from sa_jitter_ros.inference.line_checks import check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
@@ -437,11 +438,15 @@ def make_bench(observation: Observation, observations: Sequence[Observation],
              for recording, item in zip(recordings, observations)]
     clock = _one_clock([found for found, _ in known])
     orders = observation.orders.size
-    corrected = np.abs(observation.stacked('corrected')[..., :orders])
-    level = lines.of(corrected[list(fit)].mean(axis=0))
-    return with_fewer_cycles(Bench(
-        observation, lines, level, [row for _, rows in known for row in rows], clock, group,
-        line_evidence(observation, lines), fit, held_out, tuple(declared))).with_moving_source(())
+    corrected = np.abs(observation.stacked('corrected')[list(fit), ..., :orders]).mean(axis=0)
+    hidden = hidden_lines(observation, lines)
+    bench = with_fewer_cycles(Bench(
+        observation, lines, lines.of(corrected), [row for _, rows in known for row in rows], clock,
+        group, line_evidence(observation, lines), fit, held_out, tuple(declared)))
+    if hidden.count:
+        bench = replace(bench, hidden=replace(
+            bench, lines=hidden, level=hidden.of(corrected), memory=Memory(), fewer=None))
+    return bench.with_moving_source(())
 
 
 def parted(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
