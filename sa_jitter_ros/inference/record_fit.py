@@ -36,6 +36,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.prediction.influence import trigger_periods
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
@@ -86,7 +87,8 @@ class RecordFit:
     """
     Pulse errors and lines of a stretch of a recording.
 
-    `errors` and `standard_errors` (pulse,) in s, measured minus true, their mean 0;
+    `errors` and `standard_errors` (pulse,) in s, measured minus true, less the turn of all lines
+    that leaves their mean 0;
     `roughness` (s) is the RMS of what their second differences are wrong by. `bends` (cycle, 2)
     are the factors of u (1 - u) and of u (1 - u) (2 u - 1) in the error inside a cycle (s),
     `bend_standard_errors` (2,) their standard errors, infinite where the vibration tells nothing
@@ -642,7 +644,9 @@ class _States:
         self.step(weak=_WEAK)
         self.step(weak=weak, move=False)
         errors = self.states[:, 0] + self.change
-        errors -= errors[self.measured].mean()
+        # an angle that all lines turn by takes longer where the shaft is slow
+        period = trigger_periods(self.times - errors)
+        errors -= period * (errors[self.measured].mean() / period[self.measured].mean())
         bends, bend_errors = self.states[:-1, 1:3].copy(), np.full(2, np.inf)
         for i in range(2):
             variance = float(np.median(self._variances(1 + i, _SAMPLED)))
