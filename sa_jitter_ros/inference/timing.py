@@ -354,7 +354,7 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     made = {name: fit.contribution(name)[:, 2, 2].real
             for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
     # of each frequency by itself: the rest are bends of a source that moves
-    share = made[SHAFT] / sum(made.values())
+    share = made[SHAFT] / (sum(made.values()) + fit.declared_motion[:, 2, 2].real)
     gain, density = np.sqrt(share), data.size * data.noise[:, 2, 2].real
     passed = float(share @ density / density.sum())
     parts, next_, count = [], [], 0

@@ -64,7 +64,8 @@ class TimingFit:
 
     `spectra` and `patterns` are the components in question by name; JITTER among the names lets
     the declared jitter have any size. `fixed` are directions and densities of declared random
-    errors, `known` (ordinate, 3) the declared patterns. `held` maps (name, number) to the value of
+    errors, `declared_motion` (bin, 3, 3) what those make that are none of the pulses; `known`
+    (ordinate, 3) are the declared patterns. `held` maps (name, number) to the value of
     a parameter that stays.
     """
 
@@ -85,9 +86,12 @@ class TimingFit:
         self.matrix = np.concatenate(stack, axis=-1) if stack else np.zeros(
             (*data.ordinates.shape, 0))
         self.ordinates = data.ordinates - known
-        self._fixed = data.noise * 0.0
+        self._fixed = self.declared_motion = data.noise * 0.0
         for direction, density in fixed:
-            self._fixed = self._fixed + self._of(direction, density(data.alias))
+            made = self._of(direction, density(data.alias))
+            self._fixed = self._fixed + made
+            if direction != PULSES:
+                self.declared_motion = self.declared_motion + made
         if not self.free_jitter:
             self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
         self._lay_out(start or {}, held or {})
