@@ -16,7 +16,8 @@ from typing import ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import (
-    absent, Array, DirectEffect, Effect, Finding, largest_power, parameter, weighed)
+    absent, Array, beyond_chance, DirectEffect, Effect, Finding, largest_power, ODDS, parameter,
+    weighed)
 from sa_jitter_ros.effects.evidence import Evidence, root
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -51,14 +52,14 @@ class AdditiveNoise(DirectEffect):
 
     @classmethod
     def _power(cls, evidence: Evidence) -> tuple[float, float, float]:
-        """Return the declared power of the noise, that beyond it, and its standard error."""
+        """Return the declared power of the noise, that around the lines, and its standard error."""
         known = evidence.model.noise_std**2 + sum(
             effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
         power = evidence.lines.noise_density**2
         count, width = power.shape
         if not width:
             return known, math.nan, math.nan
-        value = float(np.median(power.mean(axis=0))) - known
+        value = float(np.median(power.mean(axis=0)))
         # Of a median over lines of means over acquisitions; lines of other noise do not count.
         scatter = float(np.median(power.std(axis=0, ddof=1)))
         return known, value, scatter * math.sqrt(
@@ -70,21 +71,38 @@ class AdditiveNoise(DirectEffect):
         known, value, error = cls._power(evidence)
         if not 0.0 < error < math.inf:
             return None
-        power = largest_power(value, 2.0 * ((known + value) / error) ** 2, known, known**2, 1.0)
+        power = largest_power(value - known, 2.0 * (value / error) ** 2, known, known**2, 1.0)
         return None if math.isinf(power) else cls(math.sqrt(power))
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:
         """Fit the noise around the lines, beyond what was declared."""
         known, value, error = cls._power(evidence)
-        if not (value > 0.0 and error > 0.0):
+        if not (value > known and error > 0.0):
             return absent(cls.name, 'the noise around the lines is not above the declared one')
-        error = math.hypot(error, 2.0 * _LINES * (known + value))
-        # Lines of an average share its noise floor at worst: only acquisitions are independent.
-        freedom = len(evidence.lines.noise_density) - 1
-        likelihood = 0.5 * freedom * math.log1p((value / error) ** 2 / freedom)  # Student
-        std, std_error = root(value, error)
-        text = (f'the lines scatter as white noise of {np.sqrt(value + known):.3g} per sample '
+        error = math.hypot(error, 2.0 * _LINES * value)
+        std, std_error = root(value - known, error)
+        text = (f'the lines scatter as white noise of {np.sqrt(value):.3g} per sample '
                 f'would make them, noise_std is {np.sqrt(known):.3g}')
         return weighed(Finding(cls.name, cls(std), {'std': std_error}, 1.0, text),
-                       likelihood, 1, evidence)
+                       _likelihood((value - known) / error, evidence), 1, evidence)
+
+
+def less_noise(evidence: Evidence) -> tuple[float, float] | None:
+    """Return the noise per sample, and its error, where it is certainly less than declared."""
+    known, value, error = AdditiveNoise._power(evidence)
+    if not (known > value > 0.0 and error > 0.0):
+        return None
+    error = math.hypot(error, 2.0 * _LINES * value)
+    gain = beyond_chance(_likelihood((value - known) / error, evidence), 1, evidence.cycles)
+    return root(value, error) if gain > ODDS else None
+
+
+def _likelihood(apart: float, evidence: Evidence) -> float:
+    """
+    Return the gain in log likelihood by a power so many standard errors away (Student).
+
+    Lines of an average share its noise floor at worst: only acquisitions are independent.
+    """
+    freedom = len(evidence.lines.noise_density) - 1
+    return 0.5 * freedom * math.log1p(apart**2 / freedom)

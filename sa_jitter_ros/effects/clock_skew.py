@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
+from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -35,9 +36,30 @@ def _growing(setting: Setting) -> Array:
     return np.asarray(delay)[None] / setting.model.trigger_period
 
 
+def _growing_by_angle(setting: Setting) -> Array:
+    """Return the delay that grows with the angle, less that of the skew; none if steady."""
+    period = trigger_periods(setting.true_times)
+    if np.std(period) < STEADY * period.mean():
+        return np.zeros((0, period.size))
+    fitted = setting.fitted
+    number = setting.index[0] + np.arange(fitted.size) - np.searchsorted(fitted, setting.times[0])
+    middle = np.average(number[:-1] + 0.5, weights=np.diff(fitted))
+    delay = (setting.index - middle) * period
+    return np.asarray(delay / setting.model.trigger_period)[None] - _growing(setting)
+
+
+#: What a wrong ratio makes of the pulses beside a clock skew of its size, in sizes as that.
+WRONG_RATIO = Pattern(_growing_by_angle, show_in_times=False)
+
+
 @dataclass(frozen=True)
 class ClockSkew(Effect):
-    """Time t of the vibration is t (1 + skew) on the keyphasor's clock."""
+    """
+    Time t of the vibration is t (1 + skew) on the keyphasor's clock.
+
+    A wrong ratio makes the same at constant speed. Where the speed changes, its delay grows with
+    the angle: `by_angle` is the share of the skew that does, 1 for a ratio alone.
+    """
 
     name: ClassVar[str] = 'clock_skew'
     summary: ClassVar[str] = 'speed of the keyphasor clock relative to the vibration clock'
@@ -49,6 +71,19 @@ class ClockSkew(Effect):
             _USUAL * setting.model.trigger_period / setting.unit))
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
+    by_angle: float = 0.0
+
+    def ratio(self, model: DeclaredModel) -> float:
+        """Return the ratio that shows as much at constant speed."""
+        return model.ratio * (1.0 + self.skew)
+
+    def remark(self, model: DeclaredModel) -> str:
+        """Say which ratio shows as much."""
+        ratios = f'a ratio of {self.ratio(model):.8g} instead of {model.ratio:.8g}'
+        return (f' (as {ratios} makes it: it grows with the angle, not with the time)'
+                if self.by_angle == 1.0 else
+                f' ({ratios} makes the same at constant speed)' if self.by_angle == 0.0 else
+                f' (of which {self.by_angle:.2g} grows with the angle, as by a wrong ratio)')
 
     def scenarios(self, model: DeclaredModel) -> Array | None:
         """Return the delay that grows through an average."""
@@ -63,10 +98,16 @@ class ClockSkew(Effect):
 
         What has grown before counts, too, as far as the speed changes (see `PathDelay.pattern`).
         """
-        begin = int(np.argmax(np.isfinite(pulses.times)))
+        known = np.flatnonzero(np.isfinite(pulses.times))
+        begin, end = (known[0], known[-1]) if known.size else (0, 0)
         before = model.trigger_period * pulses.index[begin]
         delay = self.skew * (before + pulses.times - pulses.times[begin])
-        return np.asarray(delay * pulses.relative_speed - delay[begin])
+        by_time = delay * pulses.relative_speed - delay[begin]
+        if begin == end:
+            return np.asarray(by_time)
+        number = pulses.index - pulses.index[begin]
+        by_angle = (delay[end] - delay[begin]) * number / number[end]
+        return np.asarray(by_time + self.by_angle * (by_angle - by_time))
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting

@@ -93,6 +93,15 @@ class Bench:
         return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
                       self.with_declared(effects), self.scatter)
 
+    def with_noise(self, std: float) -> 'Bench':
+        """Return the bench of a model that declares this noise per sample."""
+        if std == self.observation.model.noise_std:
+            return self
+        model = replace(self.observation.model, noise_std=std)
+        return replace(self, observation=replace(self.observation, model=model), memory=Memory(),
+                       fewer=self.fewer and self.fewer.with_noise(std),
+                       hidden=self.hidden and self.hidden.with_noise(std))
+
     def without(self, name: str) -> 'Bench':
         """Return the bench of a model that does not declare an effect."""
         return replace(self, declared=tuple(

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
+from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
     beyond_chance, departs, Finding, ODDS, parameter_ranges)
 from sa_jitter_ros.effects.evidence import root
@@ -37,9 +38,9 @@ from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import APART, RecordFit
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
-    Choice, Chooser, DECIDED, NO_EFFECTS, RIPPLE)
+    Choice, Chooser, DECIDED, NO_EFFECTS, RATIO, RIPPLE)
 from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
-from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT
+from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -50,6 +51,7 @@ Array = NDArray[Any]
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
+_ALIKE = 3.0  # standard errors by which a skew and a ratio that make the same may differ
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
@@ -269,6 +271,8 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
         effect, errors = kind.of_timing(*fit.pattern(name), choice.setting)
     else:  # errors that are within the ticks of a clock
         effect, errors = kind.of_timing(np.ones(1), np.zeros((1, 1)), choice.setting)
+    if RATIO in fit.columns and isinstance(effect, ClockSkew):
+        effect = _by_angle(effect, fit)
     rivals = tuple(_EXCESS if other == JITTER else other for other in choice.rivals(name)
                    if other not in NO_EFFECTS)
     if RIPPLE in choice.rivals(name):
@@ -276,6 +280,16 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
     return Finding(name, effect, errors, _p_value(choice, name, chooser),
                    _text(choice, name, effect, errors), indistinguishable_from=rivals,
                    deciding_measurement=kind.deciding_measurement if rivals else '')
+
+
+def _by_angle(effect: ClockSkew, fit: TimingFit) -> ClockSkew:
+    """Return a skew that grows with the angle as a wrong ratio makes it, or a part of it that does."""
+    (skew,), (by_angle,) = (fit.pattern(name)[0] for name in (effect.name, RATIO))
+    place = [fit.columns[name].start for name in (effect.name, RATIO)]
+    variance = fit.size_covariance[np.ix_(place, place)]
+    error = math.sqrt(variance[0, 0] - 2.0 * variance[0, 1] + variance[1, 1])
+    return replace(effect, by_angle=1.0 if abs(by_angle - skew) < _ALIKE * error else (
+        by_angle / skew))
 
 
 def _text(choice: Choice, name: str, effect: Effect, errors: Mapping[str, Any]) -> str:

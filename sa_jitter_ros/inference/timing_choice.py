@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
@@ -40,7 +41,9 @@ Array = NDArray[Any]
 RIPPLE = 'ripple'
 #: Sidebands that turn all lines by one time: no effect, but a source that moves may look like it.
 SIDEBANDS = 'sidebands'
-NO_EFFECTS = RIPPLE, SIDEBANDS
+#: What a wrong ratio makes beside a clock skew of its size: no effect, but a wrong number.
+RATIO = 'ratio'
+NO_EFFECTS = RIPPLE, SIDEBANDS, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
 _STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
@@ -102,11 +105,12 @@ class Chooser:
         self.declared = {item.name: item for item in declared if item.timing is not None}
         self.patterns: dict[str, tuple[Pattern, Array]] = {}
         held = any(item.held for item in stretches)
-        for name, kind in EFFECTS.items():
-            if isinstance(kind.timing, Pattern) and (held or kind.timing.show_in_times):
-                columns = self._columns(kind.timing)
+        for name, timing in {**{name: kind.timing for name, kind in EFFECTS.items()},
+                             RATIO: WRONG_RATIO}.items():
+            if isinstance(timing, Pattern) and (held or timing.show_in_times):
+                columns = self._columns(timing)
                 if columns is not None:
-                    self.patterns[name] = kind.timing, columns
+                    self.patterns[name] = timing, columns
         marks = self._ripple()
         if marks is not None:
             self.patterns[RIPPLE] = Pattern(lambda setting: np.zeros((0, 0))), marks
@@ -230,7 +234,7 @@ class Chooser:
     def _known_errors(self, fit: TimingFit, stretch: Stretch) -> Array:
         """Return what declared patterns, and those of a fit, make of the pulses, in units."""
         total = np.zeros(stretch.errors.size)
-        for name in self.patterns.keys() & EFFECTS.keys():
+        for name in self.patterns.keys() - {RIPPLE}:
             columns = self.patterns[name][0].columns
             if name in fit.columns:
                 total += fit.pattern(name)[0] @ columns(stretch.setting)

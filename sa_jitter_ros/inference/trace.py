@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.additive_noise import less_noise
 from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
@@ -83,7 +84,9 @@ class Trace:
     (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
     `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
     unexplained scatter of the amplitudes relative to their level, part of the scale of both
-    residuals. `not_compared` says why there are no `lines`, '' where there are some.
+    residuals. `noise` is the noise per sample and its standard error where it is less than declared, which
+    `after` and `prediction_after` take for declared. `not_compared` says why there are no `lines`, '' where
+    there are some.
     """
 
     observation: Observation
@@ -112,6 +115,7 @@ class Trace:
     undecided: tuple[str, ...]
     probabilities: Mapping[str, float]
     not_compared: str = ''
+    noise: tuple[float, float] | None = None
 
 
 def trace(observations: Sequence[Observation], recordings: Sequence[Recording], *,
@@ -240,9 +244,12 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     observation, declared = bench.observation, bench.declared
     everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
-    own = bench.unsteadiness(())
-    first = bench.score((), unsteadiness=own)
+    first = bench.score((), unsteadiness=bench.unsteadiness(()))
     say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
+    as_declared, noise = observation.model.noise_std, _less_noise(bench)
+    if noise is not None:
+        say(f'found noise of {noise[0]:.3g}, less than declared')
+        bench = bench.with_noise(noise[0])
     chosen, present, timing = _of_timing(bench)
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
@@ -262,8 +269,9 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     evidence = bench.gather((), everything)
     effects = _effects(chosen)
     own = bench.unsteadiness(effects)
-    before = bench.score((), unsteadiness=own) if chosen else first
-    after = bench.score(effects, chosen, unsteadiness=own) if chosen else first
+    before = bench.with_noise(as_declared).score((), unsteadiness=own) if (
+        chosen or noise) else first
+    after = bench.score(effects, chosen, unsteadiness=own) if chosen or noise else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
     whole = _refitted(bench, timing)
     left = _unexplained(bench, whole, chosen)
@@ -276,7 +284,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         effects = _effects(chosen)
         bench = bench.with_moving_source(effects)
         own = bench.unsteadiness(effects)
-        before = bench.score((), unsteadiness=own)
+        before = bench.with_noise(as_declared).score((), unsteadiness=own)
         after = bench.score(effects, chosen, unsteadiness=own)
         moves = dependences(bench, effects, chosen)
     attenuation, _, amplitude = bench.observed(everything)
@@ -297,11 +305,22 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     return Trace(
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
-        moves, attenuation, amplitude, bench.expect((), everything, unsteadiness=own),
+        moves, attenuation, amplitude,
+        bench.with_noise(as_declared).expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
         rows, _undecided(partial(bench.change, chosen=_few(bench)), effects, rows),
-        _probabilities(timing, candidates))
+        _probabilities(timing, candidates), noise=noise)
+
+
+def _less_noise(bench: Bench) -> tuple[float, float] | None:
+    """Return the noise where it is less than declared, by so much that averages scatter less."""
+    found = less_noise(bench.gather((), bench.fit))
+    if found is None:
+        return None
+    declared, true = (np.sqrt(item.expect((), bench.fit).amplitude_variance.mean(axis=0))
+                      for item in (bench, bench.with_noise(found[0])))
+    return found if np.max(declared - true) >= ACCURACY else None
 
 
 def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from dataclasses import fields, MISSING
 from typing import Any
 
+from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.parameter_file import section_text
@@ -22,20 +23,20 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 _NODE = 'jitter_predictor'
 ONLY_SHAFT = 'shaft'  # the name of a shaft that was given none
 _OF_SHAFT = ('ratio', 'orders')
-_DIGITS = 6
+_DIGITS, _DIGITS_OF_RATIO = 6, 10
 
 
 def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
     """
-    Return the section of `jitter_predictor` with the effects that were found, '' without any.
+    Return the section of `jitter_predictor` with what was found, '' where nothing was.
 
     It declares the `models` of all shafts, by their names, as before, with the effects added; what
     is new has a remark.
     """
     found = {item.name: item.effect for item in trace.findings if item.effect is not None}
-    if not found:
-        return ''
     model, declared = trace.observation.model, {item.name: item for item in trace.declared}
+    if not found and trace.noise is None:
+        return ''
     named = set(models) != {ONLY_SHAFT}
     values: dict[str, Any] = {'shafts': list(models)} if named else {}
     for item in fields(model):
@@ -47,7 +48,18 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
             if item.default is MISSING or value != item.default:
                 values[place] = value
     remarks = {}
-    values['effects'] = {}
+    skew = found.get(ClockSkew.name)
+    if isinstance(skew, ClockSkew) and skew.by_angle == 1.0:
+        del found[ClockSkew.name]
+        for place in (f'{shaft}.ratio' if named else 'ratio' for shaft, each in models.items()
+                      if (each.ratio, each.orders) == (model.ratio, model.orders)):
+            values[place] = float(f'{skew.ratio(model):.{_DIGITS_OF_RATIO}g}')
+            remarks[place] = f'was {model.ratio:.{_DIGITS_OF_RATIO}g}'
+    if trace.noise is not None:
+        values['noise_std'] = _short(trace.noise[0])
+        remarks['noise_std'] = f'was {model.noise_std:g}'
+    if declared or found:
+        values['effects'] = {}
     for name, effect in {**declared, **found}.items():
         values['effects'][name] = {'enabled': True, **_rounded(effect)}
         for key in values['effects'][name]:
@@ -60,9 +72,11 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
 
 def _rounded(effect: Effect) -> Mapping[str, Any]:
     """Return the parameters of an effect without digits that mean nothing."""
-    def short(value: Any) -> Any:
-        if isinstance(value, (tuple, list)):
-            return [short(item) for item in value]
-        return float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value
+    return {name: _short(value) for name, value in effect.values.items()}
 
-    return {name: short(value) for name, value in effect.values.items()}
+
+def _short(value: Any) -> Any:
+    """Return a number, or each of a list, without digits that mean nothing."""
+    if isinstance(value, (tuple, list)):
+        return [_short(item) for item in value]
+    return float(f'{value:.{_DIGITS}g}') if isinstance(value, float) else value

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.effects import parameter_ranges
 from sa_jitter_ros.effects.additive_noise import AdditiveNoise
+from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.inference.candidates import Candidate
@@ -126,9 +127,10 @@ def summary(content: Mapping[str, Json]) -> str:
 
 
 def other_numbers(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
-    """Return the changes of declared effects, which are no missing ones."""
+    """Return the changes of declared numbers that no missing effect stands for."""
     declared = content['declared']['effects']
-    return [item for item in content['declared_changes'] if item['name'] in declared]
+    return [item for item in content['declared_changes'] if item['name'] in declared or (
+        item['parameter'] == 'noise_std' and item['value'] < item['declared'])]
 
 
 def change_text(item: Mapping[str, Json], unit: str) -> str:
@@ -168,6 +170,9 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
         if isinstance(effect, JitterScale):
             found.append(('jitter', 'jitter_std', jitter, jitter * effect.scale,
                           jitter * error['scale'], 's'))
+        elif isinstance(effect, ClockSkew) and effect.by_angle == 1.0:
+            found.append(('ratio', 'ratio', model.ratio, effect.ratio(model),
+                          model.ratio * error['skew'], '1'))
         elif item.name in declared:
             for name, limits in parameter_ranges(type(effect)).items():
                 found.append((item.name, name, declared[item.name].values[name],
@@ -176,6 +181,8 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
             total = math.hypot(model.noise_std, effect.std)
             found.append(('noise', 'noise_std', model.noise_std, total,
                           effect.std / total * error['std'], '1'))
+    if trace.noise is not None:
+        found.append(('noise', 'noise_std', model.noise_std, *trace.noise, '1'))
     keys = 'name', 'parameter', 'declared', 'value', 'standard_error', 'unit'
     return [dict(zip(keys, row)) for row in found]
 
