@@ -59,8 +59,7 @@ Progress = Callable[[str], None]
 Change = Callable[[Sequence[Effect], Effect], float]
 
 _SPEED = 'speed_fluctuation'
-# A tone turns a line by itself, and errors that grow turn it by more than its phase tells.
-_TURNING = {'interfering_tone', 'clock_skew'}
+_TONE = 'interfering_tone'  # turns a line by itself
 _UNDECIDED = 1e-2  # change of an average by what may be there
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
@@ -433,7 +432,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
     names = {finding.name for finding in chosen}
     of_timing = timing.checks if timing is not None else ()
-    of_lines = () if names & _TURNING else check_lines(bench.observation, bench.lines)
+    of_lines = () if _TONE in names else check_lines(bench.observation, bench.lines)
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
