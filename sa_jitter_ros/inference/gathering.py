@@ -187,7 +187,11 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     shortest = cycles.shape[1]
     mean = cycles.mean(axis=1, keepdims=True)
     level = np.abs(mean).mean(axis=(0, 1))
-    along = (cycles * np.exp(-1j * np.angle(mean))).real / level - 1.0
+    tone = _tone(observation, lines)
+    relative = cycles * np.exp(-1j * np.angle(mean)) / level - 1.0
+    if tone is not None:  # what it makes is no modulation
+        relative -= _beside(observation, lines, tone, relative)
+    along = relative.real
     noises = np.array([radial_noise(row) for row in cycles])
     noise = np.sqrt(np.mean(noises**2, axis=0))
     floor = lines.of(observation.stacked('noise_floor'))
@@ -204,7 +208,20 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
         order=order, channel=lines.channel, level=level, noise_density=density,
         radial=own + without_beat(
             (along - own).reshape(-1, order.size), beat).reshape(along.shape),
-        radial_noise=noise * np.sqrt(shortest) / level, tone=_tone(observation, lines), beat=beat)
+        radial_noise=noise * np.sqrt(shortest) / level, tone=tone, beat=beat)
+
+
+def _beside(observation: Observation, lines: Lines, tone: Tone, relative: Array) -> Array:
+    """Return what of `relative` amplitudes (acquisition, cycle, line), less 1, a tone makes."""
+    order = observation.orders[lines.order]
+    places = np.arange(relative.shape[1]) + 0.5  # middles of cycles
+    times = np.array([np.interp(places, item.number, item.times - np.nan_to_num(item.errors))
+                      for item in observation.acquisitions])
+    angle = observation.model.cycle_length * np.array(
+        [observation.pulses.number[item.first] + places for item in observation.acquisitions])
+    turns = tone.frequency * times[..., None] - angle[..., None] * order
+    wave = np.exp(2j * np.pi * turns)
+    return np.asarray(np.mean(relative * wave.conj(), axis=(0, 1)) * wave)
 
 
 def _sidebands(observation: Observation, count: int) -> Array:
