@@ -27,6 +27,7 @@ BoolArray = NDArray[np.bool_]
 
 #: Of the declared speed, relative.
 SPEED_TOLERANCE = 0.1
+_SPEEDS = 0.05  # share of the cycles that are faster than the speeds of a run-up, and slower
 _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
@@ -133,10 +134,11 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
     if found.times.size < _FEWEST or not np.any(found.missing == 0):
         raise RecordingError(f'{found.times.size} trigger pulses of {measured.size} keyphasor '
                              f'pulses: the loop needs {_FEWEST} in a row; record longer')
-    speed = model.trigger_revolutions / float(np.median(np.diff(found.times)[found.missing == 0]))
-    if abs(speed / model.trigger_speed - 1.0) > SPEED_TOLERANCE:
+    slow, middle, fast = model.trigger_revolutions / np.quantile(
+        np.diff(found.times)[found.missing == 0], (1.0 - _SPEEDS, 0.5, _SPEEDS))
+    if not slow * (1.0 - SPEED_TOLERANCE) <= model.trigger_speed <= fast * (1.0 + SPEED_TOLERANCE):
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
-                         f'shaft turns at {speed:.4g} Hz: declare the speed and '
+                         f'shaft turns at {middle:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
     reference = None
     if recording.reference_pulse_times is not None:
