@@ -51,7 +51,6 @@ Array = NDArray[Any]
 _EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
-_ALIKE = 3.0  # standard errors by which a skew and a ratio that make the same may differ
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
@@ -283,13 +282,13 @@ def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
 
 
 def _by_angle(effect: ClockSkew, fit: TimingFit) -> ClockSkew:
-    """Return a skew that grows with the angle as a wrong ratio makes it, or a part of it that does."""
-    (skew,), (by_angle,) = (fit.pattern(name)[0] for name in (effect.name, RATIO))
+    """Return a skew that grows with the angle as a ratio makes it, or of which a part does."""
     place = [fit.columns[name].start for name in (effect.name, RATIO)]
-    variance = fit.size_covariance[np.ix_(place, place)]
-    error = math.sqrt(variance[0, 0] - 2.0 * variance[0, 1] + variance[1, 1])
-    return replace(effect, by_angle=1.0 if abs(by_angle - skew) < _ALIKE * error else (
-        by_angle / skew))
+    skew, by_angle = fit.sizes[place]
+    known = fit.size_covariance[np.ix_(place, place)]
+    apart = (by_angle - skew) ** 2 / (known[0, 0] - 2.0 * known[0, 1] + known[1, 1])
+    both = beyond_chance(0.5 * apart, 1, fit.data.cycles) > ODDS
+    return replace(effect, by_angle=by_angle / skew if both else 1.0)
 
 
 def _text(choice: Choice, name: str, effect: Effect, errors: Mapping[str, Any]) -> str:
