@@ -12,8 +12,9 @@
 
 import numpy as np
 import pytest
+from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.inference.gathering import choose_lines
-from sa_jitter_ros.inference.line_checks import check_lines
+from sa_jitter_ros.inference.line_checks import check_gain, check_lines
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -43,3 +44,21 @@ def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn
         assert turned.size == pytest.approx(turn / np.sqrt(2.0), rel=0.3)
     else:
         assert turned.p_value > 0.01
+
+
+@pytest.mark.parametrize('event', ['none', 'step', 'loss'])
+def test_gain_of_single_events_is_no_modulation(rng, event):
+    """A band of noise is one; a step of the gain, or a signal that is lost for a while, is not."""
+    acquisitions, cycles = 30, 20
+    count = acquisitions * cycles
+    waves = np.fft.rfft(rng.standard_normal(count))
+    gain = np.fft.irfft(np.where(np.arange(waves.size) < 0.1 * count, waves, 0.0), count)
+    gain *= 0.1 / gain.std()
+    if event != 'none':
+        gain = np.where(np.arange(count) > 333, 0.3, 0.0) if event == 'step' else -0.9 * np.isin(
+            np.arange(count) // 4, [20, 75, 110])
+    radial = np.stack([gain, gain], axis=1) + 0.02 * rng.standard_normal((count, 2))
+    found = check_gain(LineEvidence(
+        np.array([20.0, 40.0]), np.zeros(2, int), np.ones(2), np.ones((acquisitions, 2)),
+        radial.reshape(acquisitions, cycles, 2), np.array([0.02, 0.02])))
+    assert (found.p_value < 1e-6) == (event != 'none')

@@ -30,7 +30,8 @@ from sa_jitter_ros.inference.timing_shape import EDGE, through
 
 Array = NDArray[Any]
 
-_DRAWS, _SEED = 400, 11
+#: Draws of what is there by chance, and their seed.
+DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
 _FEWEST = 40  # pulses whose distribution is looked at
@@ -84,13 +85,13 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
         gain = size * (ratio - 1.0 - np.log(np.maximum(ratio, 1e-300)))
         return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
 
-    draws = np.random.default_rng(_SEED).gamma(size, 1.0 / size, (_DRAWS, size.size))
+    draws = np.random.default_rng(SEED).gamma(size, 1.0 / size, (DRAWS, size.size))
     ratio = fit.excess(direction, inverse)
     gain = statistic(ratio)[0]
     top = int(np.argmax(gain))
     near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
     more = np.sum((size * np.abs(ratio - 1.0) * fit.floor(direction, inverse))[near]) / size.sum()
-    return Check(_chance(float(gain[top]), statistic(draws).max(axis=1)), direction,
+    return Check(chance(float(gain[top]), statistic(draws).max(axis=1)), direction,
                  data.unit * math.sqrt(more),
                  f'the power of the {direction} from {data.frequency[near][0]:.3g} to '
                  f'{data.frequency[near][-1]:.3g} cycles a trigger cycle is '
@@ -167,14 +168,14 @@ def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
     items = [item for item in data.stretches if item.errors.size >= _FEWEST]
     found = [_moments(_filtered(chooser.left(choice.fit, item), gain, data)) for item in items]
     for scaled in _kinds(choice) if items else ():
-        seen, null = np.zeros(2), np.zeros((2, _DRAWS))
+        seen, null = np.zeros(2), np.zeros((2, DRAWS))
         for item, moments in zip(items, found):
             draws = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
             middle = np.median(draws, axis=1)
             seen += item.errors.size * (moments - middle)
             null += item.errors.size * (draws - middle[:, None])
         p_values.append(min(1.0, len(seen) * min(
-            _chance(abs(value), np.abs(draws)) for value, draws in zip(seen, null))))
+            chance(abs(value), np.abs(draws)) for value, draws in zip(seen, null))))
     return max(p_values, default=1.0)
 
 
@@ -190,8 +191,8 @@ def _steadiness(chooser: Chooser, choice: Choice) -> Check:
     for scaled in _kinds(choice):
         null = np.log(np.array([power for item in items for power in _powers(
             chooser, choice, item, _drawn(choice, item, scaled))]))
-        each = (_chance(float(np.var(logs)), np.var(null, axis=0)),
-                _chance(float(abs(place @ logs)), np.abs(place @ null)))
+        each = (chance(float(np.var(logs)), np.var(null, axis=0)),
+                chance(float(abs(place @ logs)), np.abs(place @ null)))
         p_value = max(p_value, min(1.0, len(each) * min(each)))
     power = float(np.average(choice.fit.spectrum(choice.fit.parameters)[:, 1, 1].real,
                              weights=data.size))
@@ -220,8 +221,8 @@ def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None
 def _drawn(choice: Choice, item: Stretch, scaled: bool) -> Array:
     """Return drawn errors (draw, pulse) in units, as the recovery shows them."""
     fit, data = choice.fit, choice.fit.data
-    rng = np.random.default_rng([_SEED, int(item.setting.index[0])])  # others in each stretch
-    shape = _DRAWS, item.errors.size
+    rng = np.random.default_rng([SEED, int(item.setting.index[0])])  # others in each stretch
+    shape = DRAWS, item.errors.size
     power = math.exp(fit.starts[JITTER][0]) if JITTER in fit.starts else 1.0
     power = power if scaled else min(power, 1.0)  # normal errors make the rest
     declared = math.sqrt(power) / data.unit * np.asarray(
@@ -245,7 +246,7 @@ def _moments(values: Array) -> Array:
                      np.log((square * square).mean(axis=-1) / power**2)])
 
 
-def _chance(value: float, draws: Array) -> float:
+def chance(value: float, draws: Array) -> float:
     """Return the chance of draws as large as a value; their tail is taken as exponential."""
     high = float(np.quantile(draws, 1.0 - _TAIL))
     if value <= high:

@@ -43,7 +43,7 @@ from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, hidden_lines, line_evidence,
     pulse_evidence)
-from sa_jitter_ros.inference.line_checks import check_lines
+from sa_jitter_ros.inference.line_checks import check_gain, check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
 from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UNDEFINED
@@ -60,6 +60,7 @@ Change = Callable[[Sequence[Effect], Effect], float]
 
 _SPEED = 'speed_fluctuation'
 _TONE = 'interfering_tone'  # turns a line by itself
+_GAIN = 'amplitude_modulation'
 _UNDECIDED = 1e-2  # change of an average by what may be there
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
@@ -433,6 +434,8 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     names = {finding.name for finding in chosen}
     of_timing = timing.checks if timing is not None else ()
     of_lines = () if _TONE in names else check_lines(bench.observation, bench.lines)
+    if _GAIN in names:
+        of_lines = (*of_lines, check_gain(bench.scatter))
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
