@@ -38,7 +38,12 @@ CASES = (
     'clock_skew 1000', 'keyphasor_quantisation 1005', 'target_geometry 1002',
     'target_geometry 2003', 'correlated_jitter 1002', 'interpolation_loss 1005',
     'speed_fluctuation 1011', 'resonance 1010', 'resonance 2000', 'late_recovery 2012',
-    'amplitude_modulation 1006', 'excess_jitter 1007', 'excess_jitter 12103', 'phase_wander 1004')
+    'amplitude_modulation 1006', 'excess_jitter 1007', 'excess_jitter 12103', 'phase_wander 1004',
+    'missing_pulses 3000', 'correlated_jitter+additive_noise 3000', 'resonance 41009',
+    'phase_wander+interfering_tone 3000', 'keyphasor_quantisation+clock_skew 3000',
+    'missing_pulses+clock_skew 3001', 'following_level 3000', 'late_recovery 3001',
+    'interfering_tone 3001', 'additive_noise 3001', 'keyphasor_quantisation 3001',
+    'target_geometry 3001', 'excess_jitter+amplitude_modulation 3000')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}

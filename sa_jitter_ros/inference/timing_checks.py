@@ -57,8 +57,8 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     """Return all checks of the best fit; none where the ticks of a clock hide what is left."""
     if choice.ticked:
         return ()
-    # of a motion of the source nothing is known but its bandwidth
-    directions = [PULSES, *([] if any(
+    # of a motion of the source nothing is known but its bandwidth, and nothing by other pulses
+    directions = [PULSES, *([] if chooser.data.referenced or any(
         EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
     fit = choice.fit
     # where a smooth motion does not end, nothing is known: it may leave out any frequency

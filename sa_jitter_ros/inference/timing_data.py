@@ -102,14 +102,15 @@ class TimingData:
         self.steer = {}
         for name in (PULSES, SOURCE, MOTION):
             passed = np.stack([np.einsum('fij,fj->fi', self.passed, steering(
-                name, self.frequency, self.frequency + n, referenced=self._referenced))
+                name, self.frequency, self.frequency + n, referenced=self.referenced))
                 for n in ALIASES])
             self.steer[name] = outer(passed)
         self.steer[PULSES] = self.steer[PULSES][:1]
         self.ordinates = self.transform([self._series(item) for item in self.stretches])
 
     @property
-    def _referenced(self) -> bool:
+    def referenced(self) -> bool:
+        """Return whether the errors are those against a reference keyphasor."""
         return self.stretches[0].referenced
 
     def _series(self, item: Stretch) -> Array:
@@ -147,10 +148,13 @@ class TimingData:
         inverse = np.linalg.inv(information + prior)
         passed = np.zeros((self.frequency.size, 3, 4), complex)
         passed[:, 0, 0] = 1.0
-        passed[:, 1:, 1:] = (inverse @ information)[:, :2]
         corrected = _corrected(self.frequency)
         noise = np.zeros((self.frequency.size, 3, 3), complex)
-        noise[:, 1:, 1:] = (inverse @ information @ inverse)[:, :2, :2]
+        if self.referenced:  # pulses that are compared with others need no recovery
+            passed[:, 1, 1], noise[:, 1, 1] = 1.0, variance
+        else:
+            passed[:, 1:, 1:] = (inverse @ information)[:, :2]
+            noise[:, 1:, 1:] = (inverse @ information @ inverse)[:, :2, :2]
         return (np.asarray(corrected @ passed),
                 np.asarray(corrected @ noise @ corrected.conj().swapaxes(1, 2)))
 
@@ -174,7 +178,7 @@ class TimingData:
     def of_wave(self, direction: str, frequency: float) -> tuple[Array, Array]:
         """Return the ordinates of a unit cosine and sine of a frequency in a direction."""
         one = np.array([frequency])
-        turn = steering(direction, one % 1.0, one, referenced=self._referenced)[0][:3]
+        turn = steering(direction, one % 1.0, one, referenced=self.referenced)[0][:3]
         turn = _corrected(one)[0] @ turn
         waves = [np.exp(2j * np.pi * frequency * item.setting.index[:-2])[:, None] * turn
                  for item in self.stretches]

@@ -33,7 +33,7 @@ from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
-from sa_jitter_ros.effects.timing import Pattern, SOURCE
+from sa_jitter_ros.effects.timing import Pattern, SOURCE, Spectrum
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
@@ -399,10 +399,16 @@ def _few(bench: Bench) -> list[int]:
 
 def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
                ) -> tuple[str, ...]:
-    """Return the effects that, as large as their limits, would still change an average."""
+    """
+    Return the effects that, as large as their limits, would still change an average.
+
+    Random motions without a limit may be of any size.
+    """
     found = []
     for row in rows:
         if row.effect is None:
+            if row.lower is None and isinstance(EFFECTS[row.name].timing, Spectrum):
+                found.append(row.name)
             continue
         try:
             size = change(effects, row.effect)
