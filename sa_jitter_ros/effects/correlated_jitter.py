@@ -40,8 +40,9 @@ class CorrelatedJitter(Effect):
     timing: ClassVar[Spectrum] = Spectrum(
         PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5), (-1.5, 0.6)), (-9.0, -2.0), (9.0, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
-    correlation: float = parameter(0.5, 'correlation of neighbouring pulse errors', '1',
-                                   minimum=-0.999, maximum=0.999)
+    correlation: float = parameter(
+        0.5, 'correlation of the errors of neighbouring trigger pulses', '1', minimum=-0.999,
+        maximum=0.999)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the angle errors that first-order autoregressive pulse errors cause."""

@@ -47,8 +47,8 @@ class SpeedFluctuation(Effect):
     acceleration_std: float = parameter(
         0.0, 'standard deviation of the acceleration of the tach shaft', 'rad/s^2', minimum=0.0)
     bandwidth: float = parameter(
-        ACCELERATION_BAND[1], 'highest frequency of the acceleration, cycles a trigger cycle', '1',
-        minimum=NARROWEST, maximum=WIDEST)
+        ACCELERATION_BAND[1], 'highest frequency of the acceleration, cycles a trigger cycle; the '
+        'lowest is 0.05, or 0.4 of it', '1', minimum=NARROWEST, maximum=WIDEST)
 
     def processes(self, model: DeclaredModel) -> Sequence[AngleErrorProcess]:
         """Return the error of the angle law."""
