@@ -28,15 +28,15 @@ from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.gathering import cycle_amplitudes
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
+from sa_jitter_ros.inference.timing_data import TAPER, taper
 from sa_jitter_ros.prediction.influence import mean_period
 from scipy import special
-from scipy.signal.windows import tukey
 
 Array = NDArray[Any]
 
 LINES = 'lines'
 _TURN = 0.03  # rad, by which the lines of steady machines turn each by itself at most
-_NEAR, _ENDS = 1.5, 0.05  # ratio of frequencies whose power is alike; share of a series
+_NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 9.0  # kurtosis; a gain that swings by a third loses cycles, which makes half of it
 _FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
 
@@ -49,19 +49,15 @@ def check_gain(lines: LineEvidence) -> Check:
     """
     weight = lines.radial_noise**-2.0
     gain = (lines.radial @ (weight / weight.sum())).ravel()
-    waves = np.fft.rfft((gain - gain.mean()) * _taper(gain.size))
+    waves = np.fft.rfft((gain - gain.mean()) * taper(gain.size))
     drawn = np.random.default_rng(SEED).standard_normal((DRAWS, gain.size))
     like = np.fft.irfft(np.fft.rfft(drawn) * np.sqrt(_smooth(waves)), gain.size)
     found, null = (_tails(item, gain.size) for item in (
-        waves, np.fft.rfft(like * _taper(gain.size))))
+        waves, np.fft.rfft(like * taper(gain.size))))
     p_value = chance(float(found), null) if found > _EVENTS else 1.0
     return Check(p_value, LINES, float(np.std(gain)),
                  'the amplitudes grow and shrink together by single events, as steps or losses of '
                  f'signal make them: {float(np.std(gain)):.2g} RMS')
-
-
-def _taper(count: int) -> Array:
-    return tukey(count, 2.0 * _ENDS)
 
 
 def _smooth(waves: Array) -> Array:
@@ -76,7 +72,7 @@ def _smooth(waves: Array) -> Array:
 
 def _tails(waves: Array, count: int) -> Array:
     """Return the kurtosis of series (..., time), their power made alike at all frequencies."""
-    ends = math.ceil(_ENDS * count)
+    ends = math.ceil(TAPER * count)
     white = np.fft.irfft(waves / np.sqrt(_smooth(waves)), count)[..., ends:-ends]
     return np.asarray(np.mean(white**4, axis=-1) / np.mean(white**2, axis=-1) ** 2)
 

@@ -32,7 +32,8 @@ Array = NDArray[Any]
 
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
 ALIASES = np.array([0, 1, -1])
-_TAPER = 0.05  # of a stretch, at either end
+#: Share of a series, at either end, over which a `taper` rises or falls.
+TAPER = 0.05
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one
 #: Trigger cycles of a stretch from which it shows something.
 FEWEST = 12
@@ -162,7 +163,7 @@ class TimingData:
         """Return the ordinates (ordinate, 3) of a series (pulse - 2, 3) of every stretch."""
         rows = []
         for item in series:
-            window = _window(len(item))
+            window = taper(len(item))
             item = (item - np.average(item, axis=0, weights=window)) * window[:, None]
             item = item[:, :self.series]
             rows.append(np.fft.rfft(item, axis=0)[1:len(item) // 2 + 1] / np.sqrt(
@@ -226,15 +227,16 @@ def _frequencies(count: int) -> Array:
     return np.arange(1, count // 2 + 1) / count
 
 
-def _window(count: int) -> Array:
+def taper(count: int) -> Array:
+    """Return a window (count,) that rises and falls at either end."""
     place = np.arange(count) + 0.5
-    inside = np.minimum(place, count - place) / max(2.0, _TAPER * count)
+    inside = np.minimum(place, count - place) / max(2.0, TAPER * count)
     return np.asarray(np.sin(0.5 * np.pi * np.clip(inside, 0.0, 1.0)) ** 2)
 
 
 def _effective(count: int) -> float:
     """Return the share of the ordinates that count, which the taper correlates."""
-    window = _window(count)
+    window = taper(count)
     return float(np.sum(window**2) ** 2 / np.sum(window**4) / count)
 
 
