@@ -93,7 +93,8 @@ def test_wrong_ratio_grows_with_the_angle_where_the_speed_changes(recording):
 def test_wrong_ratio_at_one_speed_is_said_to_be_inseparable_from_a_skew():
     content = told(machine(swing=0.0), replace(MODEL, ratio=1.0002))
     assert (names(content), content['declared_changes']) == (['clock_skew'], [])
-    assert 'instead of 1.0002 makes the same at constant speed' in content['missing_effects'][0]['evidence']
+    evidence = content['missing_effects'][0]['evidence']
+    assert 'instead of 1.0002 makes the same at constant speed' in evidence
 
 
 def test_path_delay_does_not_depend_on_the_angle_that_all_lines_turn_by():

@@ -52,7 +52,7 @@ class AdditiveNoise(DirectEffect):
 
     @classmethod
     def _power(cls, evidence: Evidence) -> tuple[float, float, float]:
-        """Return the declared power of the noise, that around the lines, and its standard error."""
+        """Return the declared power of the noise, that around the lines, and its error."""
         known = evidence.model.noise_std**2 + sum(
             effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
         power = evidence.lines.noise_density**2

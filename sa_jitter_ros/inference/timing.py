@@ -368,13 +368,13 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
             for name in (SHAFT, *fit.spectra) if fit.moves(name) in (MOTION, SOURCE)}
     # of each frequency by itself: the rest are bends of a source that moves
     share = made[SHAFT] / (sum(made.values()) + fit.declared_motion[:, 2, 2].real)
-    gain, density = np.sqrt(share), data.size * data.noise[:, 2, 2].real
+    kept, density = np.sqrt(share), data.size * data.noise[:, 2, 2].real
     passed = float(share @ density / density.sum())
     parts, next_, count = [], [], 0
     for item in data.stretches:
         if not np.isfinite(item.bend_std):
             continue
-        bends = through(item.bends, gain, data) + gain[0] * item.bends.mean()
+        bends = through(item.bends, kept, data) + kept[0] * item.bends.mean()
         for part in np.array_split(bends, max(1, bends.size // _PART)):
             parts.append(np.mean(part**2) - passed * item.bend_std**2)
             next_.append(np.mean(part[1:] * part[:-1]))
