@@ -21,7 +21,7 @@ from sa_jitter_ros.effects.correlated_jitter import CorrelatedJitter
 from sa_jitter_ros.effects.effect import largest_power
 from sa_jitter_ros.effects.excess_jitter import ExcessJitter
 from sa_jitter_ros.effects.lattice import smooth_on_grid
-from sa_jitter_ros.effects.timing import MOTION
+from sa_jitter_ros.effects.timing import MOTION, SOURCE
 from sa_jitter_ros.inference import limits
 from sa_jitter_ros.inference.limits import largest
 from sa_jitter_ros.inference.timing import read_timing, refitted
@@ -228,6 +228,9 @@ def test_noise_that_hides_any_jitter_leaves_no_limit():
 
 
 def test_no_motion_of_the_source_shows_against_a_reference_keyphasor():
+    late = replace(machine(1, excess=2.0), referenced=True, bend_std=np.inf)
+    assert not np.any(TimingData([late]).steer[SOURCE])
+    assert names_of(read_timing([late])) == {'excess_jitter'}
     part = replace(machine(1), referenced=True, bend_std=np.inf)
     assert limit_of(part, 'phase_wander') == np.inf
     assert limit_of(part, 'excess_jitter') < UNIT
