@@ -40,7 +40,7 @@ CASES = (
     'speed_fluctuation 1011', 'resonance 1010', 'resonance 2000', 'late_recovery 2012',
     'amplitude_modulation 1006', 'excess_jitter 1007', 'excess_jitter 12103', 'phase_wander 1004',
     'missing_pulses 3000', 'correlated_jitter+additive_noise 3000', 'resonance 41009',
-    'phase_wander+interfering_tone 3000', 'keyphasor_quantisation+clock_skew 3000',
+    'phase_wander+interfering_tone 3000', 'keyphasor_quantisation+clock_skew 3003',
     'missing_pulses+clock_skew 3001', 'following_level 3000', 'late_recovery 3001',
     'interfering_tone 3001', 'additive_noise 3001', 'keyphasor_quantisation 3001',
     'target_geometry 3001', 'excess_jitter+amplitude_modulation 3000')

@@ -84,9 +84,9 @@ class Trace:
     (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
     `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
     unexplained scatter of the amplitudes relative to their level, part of the scale of both
-    residuals. `noise` is the noise per sample and its standard error where it is less than declared, which
-    `after` and `prediction_after` take for declared. `not_compared` says why there are no `lines`, '' where
-    there are some.
+    residuals. `noise` is the noise per sample and its standard error where it is less than
+    declared, which `after` and `prediction_after` take for declared. `not_compared` says why there
+    are no `lines`, '' where there are some.
     """
 
     observation: Observation
