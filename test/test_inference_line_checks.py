@@ -62,3 +62,23 @@ def test_gain_of_single_events_is_no_modulation(rng, event):
         np.array([20.0, 40.0]), np.zeros(2, int), np.ones(2), np.ones((acquisitions, 2)),
         radial.reshape(acquisitions, cycles, 2), np.array([0.02, 0.02])))
     assert (found.p_value < 1e-6) == (event != 'none')
+
+
+@pytest.mark.parametrize('noise', [1.0, 4.0])
+@pytest.mark.parametrize('seed', range(3))
+def test_amplitudes_that_share_the_noise_of_the_errors_follow_nothing(noise, seed):
+    """Weak lines show pulse errors of 4 ms as well as their noise: that is in both."""
+    rng, rate, speed = np.random.default_rng(seed), 600.0, 4.19
+    time = np.arange(int(92 / speed * rate)) / rate
+    vibration = sum(size * np.cos(2.0 * np.pi * order * speed * time + phase)
+                    for order, size, phase in ((1, 0.5, 1.0), (2, 1.0, 2.0), (3, 0.4, 0.3)))
+    vibration += noise * rng.standard_normal(time.size)
+    pulses = np.arange(0.5, speed * time[-1]) / speed
+    pulses += rng.uniform(-0.5, 0.5, pulses.size) / 1024.0
+    pulses += 4e-3 * rng.standard_normal(pulses.size)
+    model = DeclaredModel(keyphasor_rate=1024.0, trigger_speed=speed, trigger_cycles=10,
+                          orders=(1.0, 2.0, 3.0), sample_rate=rate)
+    observation = observe(Recording(ArraySource(vibration[None]), rate, pulse_times=pulses), model)
+    # of the first check, that of the turns, another test holds
+    for check in check_lines(observation, choose_lines(observation))[1:]:
+        assert check.p_value > 0.01

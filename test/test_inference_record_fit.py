@@ -79,15 +79,28 @@ def test_without_noise_nothing_is_made_up(rng):
     assert wrong[1:-1] == pytest.approx(wrong.mean(), abs=1e-8)  # half as much tells the ends
 
 
-@pytest.mark.parametrize('size', [0.2, 1.0, 5.0])
-def test_the_declared_size_hardly_matters(rng, size):
-    samples, times, errors = steady(rng)
+@pytest.mark.parametrize('noise', [0.02, 0.5, 1.0])
+@pytest.mark.parametrize('size', [0.2, 1.0, 5.0, 100.0])
+def test_the_declared_size_hardly_matters(rng, size, noise):
+    samples, times, errors = steady(rng, noise=noise)
     found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
                        cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size)
     wrong = found.errors - (errors - errors.mean())
     assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
         1.0, abs=4.0 / np.sqrt(2.0 * times.size))
-    assert found.jitter_std == pytest.approx(5e-5, rel=4.0 / np.sqrt(2.0 * times.size))
+    power = 1.0 + np.mean(found.standard_errors**2) / 5e-5**2  # of errors and their noise
+    assert found.jitter_std == pytest.approx(5e-5, rel=4.0 * power / np.sqrt(2.0 * times.size))
+
+
+@pytest.mark.parametrize('size', [1.0, 100.0])
+def test_errors_are_hardly_shrunk_however_little_shows_of_them(rng, size):
+    samples, times, errors = steady(rng, noise=4.0)
+    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size)
+    wrong = found.errors - (errors - errors.mean())
+    assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
+        1.0, abs=4.0 / np.sqrt(2.0 * times.size))
+    assert found.expected_std[0] > 2.0 * np.median(found.standard_errors)
 
 
 @pytest.mark.machines

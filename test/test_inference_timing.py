@@ -227,6 +227,25 @@ def test_noise_that_hides_any_jitter_leaves_no_limit():
     assert largest(read_timing([part], names=frozenset()), 'clock_skew') is None  # beyond a clock
 
 
+def test_errors_far_beyond_a_tiny_declared_jitter_have_a_limit():
+    """A grid of a third of a microsecond says little of what a worn sensor does."""
+    part = machine(5, excess=120.0, noise=40.0)
+    limit = largest(read_timing([part], names=frozenset()), 'excess_jitter')
+    # 400 pulses tell a power to 7 %, beside that of the noise
+    assert 120.0 * UNIT < limit.std < 120.0 * UNIT * (1.0 + 4.0 * 0.5 * 0.08)
+
+
+def test_what_no_machine_can_have_is_in_no_set():
+    """Pulses that come by minutes late were recovered wrongly: no delay makes that."""
+    part = machine(3, swing=2e-3)
+    speed = 0.02 / np.gradient(part.setting.true_times)
+    wrong = replace(part, errors=part.errors + 300.0 * (speed - speed.mean()))
+    timing = read_timing([wrong])
+    assert timing.choice.fit.value < -1e6  # of all sets: a pattern of minutes is the truth
+    assert all(abs(item.effect.delay) <= 1.0 for item in timing.findings
+               if item.name == 'path_delay')
+
+
 def test_no_motion_of_the_source_shows_against_a_reference_keyphasor():
     late = replace(machine(1, excess=2.0), referenced=True, bend_std=np.inf)
     assert not np.any(TimingData([late]).steer[SOURCE])

@@ -17,7 +17,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
-from sa_jitter_ros.effects.timing import autoregressive, PULSES, Setting, Spectrum
+from sa_jitter_ros.effects.timing import (
+    autoregressive, FAINT, LARGE, PULSES, Setting, Spectrum)
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -38,7 +39,8 @@ class CorrelatedJitter(Effect):
         'set the trigger level on the steepest part of the edge, and check the supply of '
         'the sensor')
     timing: ClassVar[Spectrum] = Spectrum(
-        PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5), (-1.5, 0.6)), (-9.0, -2.0), (9.0, 2.6))
+        PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5), (-1.5, 0.6)), (FAINT, -2.0),
+        (LARGE, 2.6))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(
         0.5, 'correlation of the errors of neighbouring trigger pulses', '1', minimum=-0.999,

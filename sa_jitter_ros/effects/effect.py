@@ -166,6 +166,15 @@ class Effect(Influence):
         return {name: getattr(self, name) for name in parameter_ranges(type(self))}
 
 
+def possible(effect: Effect, model: DeclaredModel) -> bool:
+    """Tell whether a machine can have an effect of that size: whether it can be predicted."""
+    try:
+        effect.processes(model)
+    except ModelError:
+        return False
+    return True
+
+
 class DirectEffect(Effect):
     """Base class of the effects whose size is read from the lines, or from the pulses missing."""
 

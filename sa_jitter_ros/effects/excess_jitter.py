@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
-from sa_jitter_ros.effects.timing import PULSES, Setting, Spectrum, white
+from sa_jitter_ros.effects.timing import FAINT, LARGE, PULSES, Setting, Spectrum, white
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -33,7 +33,7 @@ class ExcessJitter(Effect):
     remedy: ClassVar[str] = (
         'look for noise on the keyphasor: trigger level, cable, earth, distance and edge '
         'of the target')
-    timing: ClassVar[Spectrum] = Spectrum(PULSES, white, ((0.0,),), (-9.0,), (9.0,))
+    timing: ClassVar[Spectrum] = Spectrum(PULSES, white, ((0.0,),), (FAINT,), (LARGE,))
     std: float = parameter(0.0, 'standard deviation of additional normal pulse errors', 's',
                            minimum=0.0)
 

@@ -19,7 +19,7 @@ from sa_jitter_ros.effects.band import (
     fading, flat_band_correlation, NARROWEST, recovered_correlation, SLOW_BAND, slow_band,
     slow_memory, WIDEST)
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_below
-from sa_jitter_ros.effects.timing import low_passed, Setting, SOURCE, Spectrum
+from sa_jitter_ros.effects.timing import FAINT, LARGE, low_passed, Setting, SOURCE, Spectrum
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngleError
 from sa_jitter_ros.prediction.model import DeclaredModel
 
@@ -45,8 +45,8 @@ class PhaseWander(Effect):
     timing: ClassVar[Spectrum] = Spectrum(
         SOURCE, low_passed,
         tuple((0.0, float(np.log(width)), 0.7) for width in (_NARROW, 0.15, 0.4)),
-        (-9.0, None, 0.0), (14.0, float(np.log(WIDEST)), _STEEPEST),
-        limited=(-9.0, float(np.log(_NARROW)), 0.0))
+        (FAINT, None, 0.0), (LARGE, float(np.log(WIDEST)), _STEEPEST),
+        limited=(FAINT, float(np.log(_NARROW)), 0.0))
     std: float = parameter(0.0, 'standard deviation of the angle, shaft of interest', 'rad',
                            minimum=0.0)
     bandwidth: float = parameter(

@@ -30,6 +30,8 @@ from scipy import special
 Array = NDArray[Any]
 
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
+#: Logarithms of a power, in unit^2, below which there is as good as none, and that none exceeds.
+FAINT, LARGE = -12.0, 20.0
 
 
 @dataclass(frozen=True)

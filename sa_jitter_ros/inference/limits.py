@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
-    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, RARE, SEEN)
+    DirectEffect, largest_power, ONE_SIDED, parameter_ranges, possible, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import rounding
 from sa_jitter_ros.effects.jitter_scale import JitterScale
@@ -116,9 +116,10 @@ def largest(timing: Timing, name: str) -> Effect | None:
     else:
         return None
     try:
-        return kind.of_timing(found, errors, choice.setting)[0]
+        effect, _ = kind.of_timing(found, errors, choice.setting)
     except ParameterError:  # the data allow more than such an effect may be
         return None
+    return effect if possible(effect, choice.setting.model) else None
 
 
 def _bound(timing: Timing, name: str, far: float) -> Array | None:
@@ -126,15 +127,20 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
     Return the parameters of a component that has `far` standard errors more power than is seen.
 
     A negative number stands for less; None is returned where it is beyond all that is tried.
+    Far away, where the other parameters find no way back, the likelihood itself excludes a power.
     """
     chooser, choice = timing.chooser, timing.choice
     names, kurtosis = choice.best | {name}, chooser.shapes.kurtosis if chooser.shapes else 0.0
-    fit = chooser.fit(names, choice.fit.starts)
+    fit = start = chooser.fit(names, choice.fit.starts)
     at, low, high = float(fit.starts[name][0]), -math.inf, float(fit.upper[fit.place[name]][0])
-    top = high
+    top, best = high, fit.value
     last: tuple[float, float] | None = None
     for _ in range(_STEPS):
         fit = chooser.fit(names, fit.starts, held={(name, 0): at})
+        if fit.value < best - far**2 and math.isfinite(low if far > 0.0 else high):
+            low, high = (low, at) if far > 0.0 else (at, high)
+            fit, at = start, 0.5 * (low + high)
+            continue
         more, seen = fit.more_than_held(name, kurtosis)
         if not seen > 0.0:
             return None

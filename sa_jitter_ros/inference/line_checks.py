@@ -102,7 +102,7 @@ def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
     return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise),
-            *_beside_errors(observation, lines))
+            *_beside_errors(observation, lines, noise))
 
 
 def _periods(observation: Observation) -> Array:
@@ -165,19 +165,23 @@ def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check
                   'an amplitude RMS, as a resonance makes them'),)
 
 
-def _beside_errors(observation: Observation, lines: Lines) -> Iterator[Check]:
+def _beside_errors(observation: Observation, lines: Lines, noise: Array) -> Iterator[Check]:
     """
     Test whether the amplitudes of an order follow the pulse errors, as a parabola over them.
 
     Where one order shows the errors alone, what turns it looks like them; a resonance or a path
     that changes its amplitude, too, is told by that. Two motions shifted far against each other
-    tell how much slow ones agree by chance.
+    tell how much slow ones agree by chance. Of the `noise` (line,) of the averages the amplitudes
+    share with the errors at most what these have of noise.
     """
     cycles = np.abs(lines.of(cycle_amplitudes(observation)))
     count = cycles.shape[1]
     errors = np.concatenate([0.5 * (row[1:] + row[:-1])[:count] for row in _errors(observation)])
     known = np.isfinite(errors)
-    errors = errors[known] / max(float(np.std(errors[known])), np.finfo(np.float64).tiny)
+    spread = max(float(np.std(errors[known])), np.finfo(np.float64).tiny)
+    errors = errors[known] / spread
+    unsure = np.nanmean(observation.stacked('standard_errors') ** 2) / spread**2
+    shared_noise = cycles.shape[1] * min(float(unsure), 1.0) * noise**2
     shape = np.linalg.qr(np.stack(
         [np.ones(errors.size), errors, errors**2], axis=1))[0][:, 1:]
     waves = np.fft.rfft(shape, axis=0)
@@ -190,7 +194,7 @@ def _beside_errors(observation: Observation, lines: Lines) -> Iterator[Check]:
         explained = np.sum(shared**2, axis=1) / errors.size
         share = explained / np.var(values)
         apart = share[errors.size // 4:-(errors.size // 4)].mean()
-        if explained[0] > _TURN**2:
+        if explained[0] > _TURN**2 + shared_noise[lines.order == order].mean():
             # the share of a parabola over independent values is 2 / (their number - 1) in the mean
             yield Check(min(1.0, float((1.0 - share[0]) ** max(1.0 / apart - 1.0, 0.0))
                             * orders.size), LINES, math.sqrt(float(explained[0])),

@@ -164,6 +164,7 @@ class OpenRecord:
         states.add(*(known or ((), ())))
         states.fit_amplitudes()
         _search(states, known is None)
+        states.settled = True
         for _ in range(_LAST_STEPS):
             if states.step() < _CONVERGED * states.jitter_std:
                 break
@@ -238,7 +239,8 @@ class _States:
         self.width = len(self.shapes) - 1
         self.states = np.zeros((times.size, self.width))
         self.size = np.array([jitter_std, *[_FIXED * jitter_std] * (self.width - 2), _FIXED])
-        self.all_free = False
+        self.all_free = self.settled = False
+        self.told = np.zeros(self.width)
         self.slow: Array = np.zeros(times.size)  # straight line of the errors, which is not jitter
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self._read()
@@ -284,11 +286,11 @@ class _States:
         straight = (self.turn.conj().T @ self.turn) * (self.wave.conj() @ self.wave.T)
         mirrored = (self.turn.T @ self.turn) * (self.wave @ self.wave.T)
         if self.tones.size:
-            both = [self._sums(tone.real) + 1j * self._sums(tone.imag) for tone in self.in_time]
-            plus = np.array([item.sum(axis=0) for item in both])  # (tone, line)
-            minus = np.array([(self._sums(tone.real).conj() + 1j * self._sums(tone.imag).conj()
-                               ).sum(axis=0) for tone in self.in_time])
-            n = self.orders.size
+            n, flat = self.orders.size, self.in_time.reshape(self.tones.size, -1)
+            plus, minus = (np.hstack([  # (tone, line)
+                np.einsum('tkn,kn->tn', self.in_time @ wave.T, turn), flat @ other.T])
+                for wave, turn, other in ((self.wave, self.turn, flat),
+                                          (self.wave.conj(), self.turn.conj(), flat.conj())))
             straight = np.block([[straight, minus[:, :n].T], [minus.conj()]])
             mirrored = np.block([[mirrored, plus[:, :n].T], [plus]])
         cross = 0.5 * (mirrored.imag + straight.imag)
@@ -480,17 +482,29 @@ class _States:
         errors = self.states[:, 0]
         self.slow = np.asarray(np.polyval(
             np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
-        power = np.mean((errors - self.slow)[inner] ** 2) + np.median(self._variances(0, _SAMPLED))
-        self.size[0] = max(np.sqrt(power), _LEAST_JITTER * self.jitter_std)
+        # of the variance about their mean, which nothing tells
+        self._estimate_size(0, (errors - self.slow)[inner], _LEAST_JITTER * self.jitter_std,
+                            1.0 - 1.0 / np.count_nonzero(self.measured))
         if self.all_free:
-            least = [_LEAST_BEND * self.jitter_std] * (self.width - 2) + [_LEAST_GAIN]
-            for i, limit in enumerate(least, 1):
-                before, variance = self.size[i]**2, np.median(self._variances(i, _SAMPLED))
-                gained = np.mean(self.states[2:-2, i] ** 2) + variance - before
-                # EM grows from small sizes too slowly, by a factor of what the vibration tells;
-                # it shrinks as slowly, so that errors have room for lines that were not found
-                told = max(1.0 - variance / before, _LEAST_KEPT) if gained > 0.0 else 1.0
-                self.size[i] = max(np.sqrt(before + gained / told), limit)
+            for i in range(1, self.width):
+                self._estimate_size(i, self.states[2:-2, i], _LEAST_GAIN if i == self.width - 1
+                                    else _LEAST_BEND * self.jitter_std)
+
+    def _estimate_size(self, state: int, values: Array, least: float, share: float = 1.0) -> None:
+        """
+        Estimate how large a state is, at least some size, from some of its values.
+
+        EM grows from small sizes too slowly, by a factor of what the vibration tells, or its
+        square once all lines are there (scoring); it shrinks as slowly, so that errors have room
+        for lines that were not found. Variances are a `share` of those of the state.
+        """
+        before = self.size[state] ** 2
+        expected, variance = share * before, np.median(self._variances(state, _SAMPLED))
+        gained = np.mean(values**2) + variance - expected
+        self.told[state] = told = max(1.0 - variance / expected, _LEAST_KEPT)
+        if gained > 0.0:
+            gained /= told**2 if self.settled and not state else told
+        self.size[state] = max(np.sqrt(before + gained), least)
 
     def free_all(self) -> None:
         """Let bends and gains free."""
@@ -638,7 +652,7 @@ class _States:
         """Return the fit, pulse errors and bends as good as unshrunk."""
         size = float(self.size[0])
         variance = float(np.median(self._variances(0, _SAMPLED)))
-        kept = max(1.0 - variance / size**2, np.finfo(np.float64).eps)  # of an error
+        kept = self.told[0]  # of an error
         most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency) / size
         weak = _WEAK * max(1.0, min(float(np.sqrt(variance / kept)) / size, most))
         self.step(weak=_WEAK)
@@ -661,7 +675,7 @@ class _States:
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
             self.amplitudes[:, self.orders.size:],
             np.sqrt(variances), self._families(self._turning()),
-            float(self.size[0]), self.size[:3] * np.array([_WEAK, 1.0, 1.0]),
+            float(self.size[0]), self.size[:3] * np.array([weak, 1.0, 1.0]),
             bool(gammaincc(shown.size, 0.5 * shown.sum()) < _FALSE / self.slopes))
 
     def _roughness(self) -> float:

@@ -39,7 +39,8 @@ BoolArray = NDArray[np.bool_]
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
 _DEAD = 1e-9  # range of a channel, in its largest value, that is rounding
-_LEAST_JITTER = 1e-9  # s; smallest declared standard deviation for the fit
+#: Smallest standard deviation of declared errors that counts, in s.
+LEAST_JITTER = 1e-9
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
 _WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
@@ -195,7 +196,7 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     return OpenRecord(
         part, rate, start_time + first / rate, times,
         measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-        jitter_std=max(float(np.sqrt(model.distribution.variance)), _LEAST_JITTER), top=top)
+        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top)
 
 
 def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,

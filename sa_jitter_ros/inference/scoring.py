@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect
-from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.effect import Finding, possible
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
@@ -188,7 +188,7 @@ class Bench:
         return Comparison(
             attenuation - expected.attenuation, np.sqrt(expected.attenuation_variance + variance),
             tuple(self.expect(others, self.held_out).attenuation - expected.attenuation
-                  for others, scatters in _moved(effects, findings) if not scatters))
+                  for others, scatters in self._moved(effects, findings) if not scatters))
 
     def score(self, effects: Sequence[Effect], findings: Sequence[Finding] = (), *,
               unsteadiness: float) -> Residual:
@@ -203,7 +203,7 @@ class Bench:
         unsure = np.sqrt(level + unsteadiness**2)
         expected = self.expect(effects, self.held_out, unsteadiness=unsure)
         moved, doubt = [], 0.0
-        for others, scatters in _moved(effects, findings):
+        for others, scatters in self._moved(effects, findings):
             other = self.expect(others, self.held_out, unsteadiness=unsure)
             wider = other.amplitude_variance / expected.amplitude_variance - 1.0
             doubt += float(np.mean(wider)) ** 2
@@ -224,13 +224,13 @@ class Bench:
             expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
             level_variance=level, sensitivities=moved)
 
-
-def _moved(effects: Sequence[Effect], findings: Sequence[Finding]
-           ) -> Iterator[tuple[list[Effect], bool]]:
-    """Yield the effects with each number one standard error larger, and whether that scatters."""
-    for i, finding in enumerate(findings):
-        for shifted in _shifted(finding):
-            yield [*effects[:i], shifted, *effects[i + 1:]], shifted.scatters
+    def _moved(self, effects: Sequence[Effect], findings: Sequence[Finding]
+               ) -> Iterator[tuple[list[Effect], bool]]:
+        """Yield the effects with each number one standard error larger; whether that scatters."""
+        for i, finding in enumerate(findings):
+            for shifted in _shifted(finding):
+                if possible(shifted, self.observation.model):
+                    yield [*effects[:i], shifted, *effects[i + 1:]], shifted.scatters
 
 
 def _shifted(finding: Finding) -> list[Effect]:

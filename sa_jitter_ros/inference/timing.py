@@ -28,17 +28,18 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, ODDS, parameter_ranges)
+    beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
-from sa_jitter_ros.effects.timing import MOTION, Setting, SOURCE
+from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import APART, RecordFit
+from sa_jitter_ros.inference.record_recovery import LEAST_JITTER
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
-    Choice, Chooser, DECIDED, NO_EFFECTS, RATIO, RIPPLE)
+    Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE)
 from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
@@ -48,7 +49,7 @@ from scipy import special
 
 Array = NDArray[Any]
 
-_EXCESS, _SPEED, _CLOCK = 'excess_jitter', 'speed_fluctuation', 'keyphasor_quantisation'
+_SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
@@ -76,7 +77,7 @@ class Timing:
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
     """Return the unbroken stretches of pulses of some acquisitions; neighbours are in one."""
     model = observation.model
-    unit = max(float(np.sqrt(model.distribution.variance)), 1e-12)
+    unit = max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER)
     found = []
     if not observation.recoveries:  # averages from topics, each with a mean error of 0
         grid = _grid(observation.pulses.times, clock)
@@ -232,8 +233,8 @@ def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, 
     scaled = found.pop(JITTER, choice.probabilities.get(JITTER, 0.0))
     named = {finding.name for finding in findings}
     shared = any(JITTER in finding.indistinguishable_from for finding in findings)
-    excess = 0.5 if shared else float(_EXCESS in named)
-    found[JITTER], found[_EXCESS] = (1.0 - excess) * scaled, excess * scaled
+    excess = 0.5 if shared else float(EXCESS in named)
+    found[JITTER], found[EXCESS] = (1.0 - excess) * scaled, excess * scaled
     return found
 
 
@@ -251,8 +252,8 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> l
     for name in sorted(choice.best):
         if name == JITTER:
             found.append(_of_jitter(chooser, choice))
-        elif name not in NO_EFFECTS:
-            found.append(_of_effect(chooser, choice, name))
+        elif name not in NO_EFFECTS and (other := _of_effect(chooser, choice, name)):
+            found.append(other)
     if _CLOCK in choice.fit.columns and JITTER not in choice.best:
         beside = _beside_the_clock(chooser, choice)
         found += [beside] if beside else []
@@ -260,19 +261,15 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> l
     return [*found, speed] if speed else found
 
 
-def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding:
-    """Return a spectrum or pattern as effect."""
-    fit, kind = choice.fit, EFFECTS[name]
-    if name in fit.place:
-        effect, errors = kind.of_timing(fit.starts[name], fit.standard_errors(name),
-                                        choice.setting)
-    elif name in fit.columns:
-        effect, errors = kind.of_timing(*fit.pattern(name), choice.setting)
-    else:  # errors that are within the ticks of a clock
-        effect, errors = kind.of_timing(np.ones(1), np.zeros((1, 1)), choice.setting)
+def _of_effect(chooser: Chooser, choice: Choice, name: str) -> Finding | None:
+    """Return a spectrum or pattern as effect, None where it is out of range."""
+    fit, kind, found = choice.fit, EFFECTS[name], chooser.effect(name, choice.fit)
+    if found is None:
+        return None
+    effect, errors = found
     if RATIO in fit.columns and isinstance(effect, ClockSkew):
         effect = _by_angle(effect, fit)
-    rivals = tuple(_EXCESS if other == JITTER else other for other in choice.rivals(name)
+    rivals = tuple(EXCESS if other == JITTER else other for other in choice.rivals(name)
                    if other not in NO_EFFECTS)
     if RIPPLE in choice.rivals(name):
         rivals = (*rivals, _SPEED)
@@ -333,24 +330,24 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
                        deciding_measurement=JitterScale.deciding_measurement if rivals else '')
     more = math.log(math.expm1(max(log_power, 1e-9)))
     # d log(e^p - 1) = e^p / (e^p - 1) dp
-    effect, errors = EFFECTS[_EXCESS].of_timing(
+    effect, errors = EFFECTS[EXCESS].of_timing(
         np.array([more]), np.array([error / -math.expm1(-max(log_power, 1e-9))]), setting)
     if odds > -DECIDED:
         rivals = (JITTER, *rivals)
-    return Finding(_EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,
-                   deciding_measurement=EFFECTS[_EXCESS].deciding_measurement if rivals else '')
+    return Finding(EXCESS, effect, errors, p_value, text, indistinguishable_from=rivals,
+                   deciding_measurement=EFFECTS[EXCESS].deciding_measurement if rivals else '')
 
 
 def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
     """Return the jitter beside the errors of a clock's grid, None without."""
     fit = choice.fit
-    bare = chooser.fit(choice.best, fit.starts, held={(JITTER, 0): -12.0})
+    bare = chooser.fit(choice.best, fit.starts, held={(JITTER, 0): FAINT})
     gain = fit.value - bare.value
     if gain < 0.5 * math.log(fit.data.cycles) + DECIDED:
         return None
-    effect, errors = EFFECTS[_EXCESS].of_timing(
+    effect, errors = EFFECTS[EXCESS].of_timing(
         fit.starts[JITTER], fit.standard_errors(JITTER), choice.setting)
-    return Finding(_EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
+    return Finding(EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
 
 
@@ -392,6 +389,8 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     wrong = _mean(np.array(next_) - together * np.array(parts))[1] / power
     low, bandwidth, high = band_of_ripple(together + wrong * np.array([1.0, 0.0, -1.0])).tolist()
     effect = SpeedFluctuation.of_ripple(size, setting.model, bandwidth)
+    if not possible(effect, setting.model):
+        return None
     errors = {'acceleration_std': effect.acceleration_std * size_error / size}
     if low < high:  # not the widest band
         errors['bandwidth'] = 0.5 * (high - low)

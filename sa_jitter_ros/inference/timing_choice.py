@@ -28,9 +28,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
-from sa_jitter_ros.effects.effect import ODDS, RARE
+from sa_jitter_ros.effects.effect import ODDS, possible, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
-from sa_jitter_ros.effects.timing import MOTION, Pattern, Setting, SOURCE, Spectrum
+from sa_jitter_ros.effects.timing import (
+    FAINT, LARGE, MOTION, Pattern, Setting, SOURCE, Spectrum)
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import errors_left, Shapes
@@ -43,6 +45,8 @@ RIPPLE = 'ripple'
 SIDEBANDS = 'sidebands'
 #: What a wrong ratio makes beside a clock skew of its size: no effect, but a wrong number.
 RATIO = 'ratio'
+#: Independent errors beside the declared jitter, or that of another size.
+EXCESS = 'excess_jitter'
 NO_EFFECTS = RIPPLE, SIDEBANDS, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
@@ -119,8 +123,8 @@ class Chooser:
         lines = np.unique(np.concatenate([item.sidebands for item in stretches]))
         if lines.size:
             self.spectra[SIDEBANDS] = Spectrum(
-                SOURCE, self._near(lines), ((-1.0,) * lines.size,), (-12.0,) * lines.size,
-                (9.0,) * lines.size)
+                SOURCE, self._near(lines), ((-1.0,) * lines.size,), (FAINT,) * lines.size,
+                (LARGE,) * lines.size)
         self.fits: dict[frozenset[str], TimingFit] = {}
         model = self.setting.model
         # normal errors stay normal whatever is beside them
@@ -130,10 +134,10 @@ class Chooser:
     @property
     def pool(self) -> Sequence[str]:
         """Return the names of all that may be in a set."""
-        possible = self.patterns.keys() | self.spectra.keys()
-        if 'excess_jitter' not in self.declared:  # jitter of another size
-            possible -= {'excess_jitter'}
-        return [JITTER, *(name for name in (*EFFECTS, *NO_EFFECTS) if name in possible)]
+        names = self.patterns.keys() | self.spectra.keys()
+        if EXCESS not in self.declared:  # jitter of another size
+            names -= {EXCESS}
+        return [JITTER, *(name for name in (*EFFECTS, *NO_EFFECTS) if name in names)]
 
     def _columns(self, pattern: Pattern) -> Array | None:
         """Return the ordinates (ordinate, 3, column) of a pattern, None where it has none."""
@@ -196,10 +200,32 @@ class Chooser:
                 return -math.inf
             if pattern.usual is not None:
                 prior += 0.5 * float(size[0] / pattern.usual(self.setting)) ** 2
-        if not math.isfinite(fit.value):
+        if not (math.isfinite(fit.value) and all(
+                self.effect(name, fit, bare=True) for name in names & EFFECTS.keys())):
             return -math.inf
         shape = max(self.of_shape(fit, power) for power in self._powers(fit))
         return fit.value + shape - prior - self._gained_by_chance(fit) - ODDS * len(names)
+
+    def effect(self, name: str, fit: TimingFit, *, bare: bool = False
+               ) -> tuple[Effect, Mapping[str, Any]] | None:
+        """
+        Return an effect of a fit and its standard errors; None where no machine can have it.
+
+        Where it is `bare`, random effects have no standard errors, which take long.
+        """
+        if name in fit.place:
+            sizes = fit.starts[name]
+            errors = np.zeros(sizes.size) if bare else fit.standard_errors(name)
+        elif name in fit.columns:
+            sizes, errors = fit.pattern(name)
+        else:  # errors that are within the ticks of a clock
+            sizes, errors = np.ones(1), np.zeros((1, 1))
+        try:
+            found = EFFECTS[EXCESS if name == JITTER else name].of_timing(
+                sizes, errors, self.setting)
+        except ParameterError:
+            return None
+        return found if possible(found[0], self.setting.model) else None
 
     def _gained_by_chance(self, fit: TimingFit) -> float:
         """

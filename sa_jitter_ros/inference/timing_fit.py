@@ -24,7 +24,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.timing import MOTION, Pattern, PULSES, Spectrum, white
+from sa_jitter_ros.effects.timing import (
+    FAINT, LARGE, MOTION, Pattern, PULSES, Spectrum, white)
 from sa_jitter_ros.inference.record_fit import APART
 from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
@@ -41,7 +42,6 @@ _NOISE_KNOWN = 0.5  # logarithm of the noise power
 _SAME = 0.05  # gain in log likelihood that ends a search
 _STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
 _CURVED = float(np.sqrt(_STEP))  # by which a curvature is
-_FAR = 16.0  # logarithm of a power, in unit^2, beyond which there is none
 
 
 def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
@@ -109,11 +109,11 @@ class TimingFit:
         level = float(np.log(np.mean(np.abs(self.ordinates[:few, 0]) ** 2) + 1e-12))
         blocks: dict[str, tuple[Sequence[float], Sequence[float], Sequence[float]]] = {
             SHAFT: ((min(level, 3.0),) * (_KNOTS - 1) + (-3.0, _EDGE_SLOPE[0]),
-                    (-_FAR,) * _KNOTS + (0.7,), (_FAR,) * _KNOTS + (2.3,)),
+                    (-LARGE,) * _KNOTS + (0.7,), (LARGE,) * _KNOTS + (2.3,)),
             NOISE: ((0.0,), (-2.5,), (3.0,))}
         if self.free_jitter:
             replaced = any(item.replaces_jitter for item, _ in self.patterns.values())
-            blocks[JITTER] = ((-3.0 if replaced else 0.0,), (-12.0,), (9.0,))
+            blocks[JITTER] = ((-3.0 if replaced else 0.0,), (FAINT,), (LARGE,))
         for name, item in self.spectra.items():
             lower = tuple(np.log(1.0 / self.data.longest) if low is None else low
                           for low in item.lower)
@@ -178,7 +178,8 @@ class TimingFit:
         for name in self.place:
             if name != NOISE:
                 total = total + self._of(self.moves(name), self.density(name, parameters))
-        return np.asarray(total)
+        # of very large motion, rounding alone tells one series from the others
+        return np.asarray(total * (1.0 + _STEP**1.5 * np.eye(self.data.series)))
 
     def _prior(self, parameters: Array) -> tuple[float, Array]:
         """Return minus the logarithm of the prior, and its slope."""
