@@ -46,7 +46,8 @@ _STEPS, _STEP = 400, 1.1
 _CORRELATION, _BEAT, _OFF, _WANDER = 0.8, 0.2, 1.5, 0.2
 _HUM = 59.8  # Hz
 _HIT, _KEPT = 0.04, 0.75  # share of pulses at which a sensor drops out, and what stays of it
-_UNSURE = {'amplitude', 'bandwidth'}  # parameters whose errors are not looked at
+_UNSURE = {'bandwidth'}  # parameters whose errors are not looked at
+_IN_UNITS = {'additive_noise': {'std'}, 'interfering_tone': {'amplitude'}}  # of the vibration
 _WAVES, _POINTS = 300, 20  # of a slow process, and its points in a trigger cycle
 
 
@@ -405,8 +406,8 @@ def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: 
     except SaJitterError as error:
         return {**row, 'outcome': 'refused', 'error': str(error)}
     parameters = {} if name in UNKNOWN else dict(KNOWN[name][1](bench, size))
-    if name == 'additive_noise':  # reported in the unit of the vibration
-        parameters['std'] *= bench.level
+    for key in parameters.keys() & _IN_UNITS.get(name, set()):
+        parameters[key] *= bench.level
     return {**row, 'outcome': outcome(report, name, parameters), 'verdict': report['verdict'],
             'found': {item['name']: {key: (value['value'], value['standard_error'])
                                      for key, value in item['parameters'].items()}

@@ -163,3 +163,24 @@ def test_declared_lines_alone_tell_how_fast_the_angle_runs(rng):
                        times, measured=np.ones(count, bool), cycle_length=1.0,
                        orders=[13, 27], jitter_std=2e-5)
     assert np.polyfit(times, found.errors, 1)[0] == pytest.approx(skew, rel=0.005)
+
+
+@pytest.mark.parametrize('swing', [3e-6, 1e-5, 3e-4, 3e-3])
+def test_a_tone_near_an_order_is_one_tone_of_the_right_numbers(rng, swing):
+    """The steadier the speed, the more a tone looks like an order, or several beside each other."""
+    speed, rate, count, tone = 10.0, 2000.0, 300, 249.9
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    turns = speed * (time + swing * np.cos(2.0 * np.pi * time / time[-1]) * time[-1] / 2.0 / np.pi)
+    samples = sum(size * np.cos(2.0 * np.pi * order * turns + order)
+                  for order, size in ((20.0, 0.5), (21.0, 1.8), (25.0, 0.9), (42.0, 2.3)))
+    samples += 0.3 * np.cos(2.0 * np.pi * tone * time + 1.0)
+    samples += 0.05 * rng.standard_normal(time.size)
+    times = np.interp(np.arange(turns[0] + 0.5, turns[-1] - 0.5), turns, time)
+    times += rng.normal(0.0, 5e-5, times.size)
+    found = fit_record(samples[:, None], rate, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[20.0, 21.0, 25.0, 42.0], jitter_std=5e-5)
+    assert found.orders.size == 4
+    error, amplitude = found.amplitude_errors[0, 4], np.abs(found.tone_amplitudes[0])
+    unsure = np.sqrt(12.0) * error / amplitude / (2.0 * np.pi * np.ptp(times))
+    assert found.tones == pytest.approx([tone], abs=4.0 * unsure[0])
+    assert amplitude == pytest.approx([0.3], abs=4.0 * error)

@@ -68,6 +68,9 @@ _SHARPER = 1.3  # in power, over angle than over time or the reverse
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
 APART = 1.5
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
+# Steps that the frequency of a tone may take, each 0.6 of the one before where an order is near;
+# standard errors that the last one may have.
+_TONE_STEPS, _TONE_KNOWN = 20, 0.1
 _FINE = 0.3  # bins between frequencies that are tried
 _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
 _SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
@@ -193,9 +196,13 @@ def _search(states: '_States', look: bool) -> None:
                 states.prune(_PRUNED_EARLY)
                 states.fit_amplitudes()
     if look:
-        states.refine()
-        states.fit_amplitudes()
-        states.step()
+        states.let_stand()
+        for _ in range(_TONE_STEPS):
+            moved = states.refine()
+            states.fit_amplitudes()
+            states.step()
+            if moved < _TONE_KNOWN:
+                break
         states.prune(_PRUNED)
         states.fit_amplitudes()
 
@@ -594,11 +601,12 @@ class _States:
         self.orders = np.append(self.orders, orders)
         self.tones = np.append(self.tones, tones)
 
-    def refine(self) -> None:
+    def refine(self) -> float:
         """
         Move each undeclared line to where the residual has nothing left of it.
 
-        The declared lines alone tell how fast the angle runs; those that may move do not.
+        The declared lines alone tell how fast the angle runs; those that may move do not. What a
+        tone moves by at most is returned in standard errors.
         """
         self._make_tables()
         residual = self._residual()
@@ -630,6 +638,7 @@ class _States:
         pulses = np.arange(self.times.size) - 0.5 * (self.times.size - 1)
         self.states[:, 0] += stretch * pulses * float(np.diff(self.times).mean())
         self._read()
+        return float(np.max(np.abs(step) * np.sqrt(bottom[count:] * curves[1]), initial=0.0))
 
     def prune(self, least: float) -> None:
         """Take out undeclared lines whose amplitudes are noise."""
@@ -702,17 +711,38 @@ class _States:
 
     def _turning(self) -> BoolArray:
         """Tell which orders have more power over angle than any tone near them has over time."""
+        over_angle, over_time, _ = self._both_ways()
+        return np.append(np.ones(self.declared, np.bool_), over_angle > _SHARPER * over_time)
+
+    def let_stand(self) -> None:
+        """Make tones of the undeclared orders that show better over time than over angle."""
+        over_angle, over_time, tones = self._both_ways()
+        standing = over_time > over_angle
+        if not standing.any():
+            return
+        self.orders = self.orders[np.append(np.ones(self.declared, np.bool_), ~standing)]
+        apart = APART / float(np.ptp(self.place))
+        for i in np.flatnonzero(standing)[np.argsort(-over_time[standing])].tolist():
+            if np.all(np.abs(self.tones - tones[i]) > apart):  # else a part of the same
+                self.tones = np.append(self.tones, tones[i])
+        self.amplitudes = np.zeros((len(self.amplitudes), self.orders.size + self.tones.size),
+                                   np.complex128)
+        self.fit_amplitudes()
+        self.step()
+
+    def _both_ways(self) -> tuple[Array, Array, Array]:
+        """Return the power of undeclared orders, that of the best tones near them, and these."""
         self._make_tables()
         residual = self._residual()
         middle = self.place.mean(axis=1)
         angle = self.cycle_length * (np.arange(self.times.size - 1) + 0.5)
         reach = math.ceil(1.0 / _FINE)
         near = _FINE * np.arange(-reach, reach + 1) / float(np.ptp(middle))
-        found = np.zeros(self.orders.size, np.bool_)
-        found[:self.declared] = True
+        count = self.orders.size - self.declared
+        over_angle, over_time, tones = np.zeros((3, count))
         sums = [self._sums(item) for item in residual]
-        for i in range(self.declared, self.orders.size):
-            turned, timed = 0.0, np.zeros(near.size)
+        for k, i in enumerate(range(self.declared, self.orders.size)):
+            timed = np.zeros(near.size)
             wave, turn = self.wave[i], self.turn[:, i]
             tone = self.orders[i] * self.frequency + near
             beside = np.exp(2j * np.pi * (self.orders[i] * angle - tone[:, None] * middle))
@@ -720,10 +750,11 @@ class _States:
                 part = row[i] * turn
                 alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
                 each = (sums[c][:, i] + alone).conj()
-                turned += self.weight[c] * float(np.abs(each.sum()) ** 2)
+                over_angle[k] += self.weight[c] * float(np.abs(each.sum()) ** 2)
                 timed += self.weight[c] * np.abs(beside @ each) ** 2
-            found[i] = turned > _SHARPER * timed.max()
-        return found
+            best = int(np.argmax(timed))
+            over_time[k], tones[k] = timed[best], tone[best]
+        return over_angle, over_time, tones
 
 
 @dataclass(frozen=True)
