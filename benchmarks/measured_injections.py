@@ -354,7 +354,7 @@ def outcome(report: Mapping[str, Any], name: str, parameters: Mapping[str, Any])
     text = ''
     changes = {item['parameter']: item for item in report['declared_changes']
                if item['name'] == name and name not in found}
-    if changes:  # of what the machine has and was declared, to which the effect adds its power
+    if 'std' in changes:  # what the machine has and was declared, and the effect adds its power
         std = changes['std']
         off = abs(std['value'] - np.hypot(std['declared'], parameters['std']))
         text = f'F{off / std["standard_error"]:.1f}'

@@ -167,10 +167,11 @@ def test_declared_lines_alone_tell_how_fast_the_angle_runs(rng):
 
 @pytest.mark.parametrize('swing', [3e-6, 1e-5, 3e-4, 3e-3])
 def test_a_tone_near_an_order_is_one_tone_of_the_right_numbers(rng, swing):
-    """The steadier the speed, the more a tone looks like an order, or several beside each other."""
+    """The steadier the speed, the more a tone looks like an order, or several of them."""
     speed, rate, count, tone = 10.0, 2000.0, 300, 249.9
     time = np.arange(int((count + 2) / speed * rate)) / rate
-    turns = speed * (time + swing * np.cos(2.0 * np.pi * time / time[-1]) * time[-1] / 2.0 / np.pi)
+    slow = time[-1] / (2.0 * np.pi) * np.cos(2.0 * np.pi * time / time[-1])
+    turns = speed * (time + swing * slow)
     samples = sum(size * np.cos(2.0 * np.pi * order * turns + order)
                   for order, size in ((20.0, 0.5), (21.0, 1.8), (25.0, 0.9), (42.0, 2.3)))
     samples += 0.3 * np.cos(2.0 * np.pi * tone * time + 1.0)

@@ -24,7 +24,6 @@ from sa_jitter_ros.pulses.resampling import margin
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_WHOLE = 1e-9  # deviation from a whole number of cycles that is rounding
 #: Samples on either side of a cycle, for interpolation and corrected pulses.
 MARGIN = 40
 
@@ -68,4 +67,5 @@ class CycleReader:
 
 def kept_apart(cycle_length: float, orders: FloatArray) -> bool:
     """Whether all orders have whole cycles in a trigger cycle of this length."""
-    return bool(np.all(np.abs(cycle_length * orders - np.rint(cycle_length * orders)) < _WHOLE))
+    cycles = cycle_length * orders
+    return bool(np.allclose(cycles, np.rint(cycles), rtol=0.0))

@@ -248,6 +248,10 @@ class _States:
         self.size = np.array([jitter_std, *[_FIXED * jitter_std] * (self.width - 2), _FIXED])
         self.all_free = self.settled = False
         self.told = np.zeros(self.width)
+        # pulses do not err by more than they scatter; a source that moves may do more
+        even = self.whole[1:] & self.whole[:-1]
+        self.most_scatter = float(np.mean(np.diff(times, 2)[even] ** 2)) / 6.0 if even.any() else (
+            math.inf)
         self.slow: Array = np.zeros(times.size)  # straight line of the errors, which is not jitter
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self._read()
@@ -489,29 +493,32 @@ class _States:
         errors = self.states[:, 0]
         self.slow = np.asarray(np.polyval(
             np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
-        # of the variance about their mean, which nothing tells
-        self._estimate_size(0, (errors - self.slow)[inner], _LEAST_JITTER * self.jitter_std,
-                            1.0 - 1.0 / np.count_nonzero(self.measured))
+        power, more = self._estimated(0, (errors - self.slow)[inner],
+                                      1.0 - 1.0 / np.count_nonzero(self.measured))
+        power = max(power, min(more, self.most_scatter), (_LEAST_JITTER * self.jitter_std) ** 2)
+        self.size[0] = np.sqrt(power)
         if self.all_free:
             for i in range(1, self.width):
-                self._estimate_size(i, self.states[2:-2, i], _LEAST_GAIN if i == self.width - 1
-                                    else _LEAST_BEND * self.jitter_std)
+                least = _LEAST_GAIN if i == self.width - 1 else _LEAST_BEND * self.jitter_std
+                self.size[i] = np.sqrt(max(self._estimated(i, self.states[2:-2, i])[1], least**2))
 
-    def _estimate_size(self, state: int, values: Array, least: float, share: float = 1.0) -> None:
+    def _estimated(self, state: int, values: Array, share: float = 1.0) -> tuple[float, float]:
         """
-        Estimate how large a state is, at least some size, from some of its values.
+        Return the power of a state by some of its values: of an EM step, and of a longer one.
 
         EM grows from small sizes too slowly, by a factor of what the vibration tells, or its
         square once all lines are there (scoring); it shrinks as slowly, so that errors have room
-        for lines that were not found. Variances are a `share` of those of the state.
+        for lines that were not found. Variances are a `share` of those of the state: those about
+        a mean that nothing tells.
         """
         before = self.size[state] ** 2
-        expected, variance = share * before, np.median(self._variances(state, _SAMPLED))
-        gained = np.mean(values**2) + variance - expected
+        expected, variance = share * before, float(np.median(self._variances(state, _SAMPLED)))
+        power = float(np.mean(values**2)) + variance
         self.told[state] = told = max(1.0 - variance / expected, _LEAST_KEPT)
+        gained = power - expected
         if gained > 0.0:
             gained /= told**2 if self.settled and not state else told
-        self.size[state] = max(np.sqrt(before + gained), least)
+        return power, before + gained
 
     def free_all(self) -> None:
         """Let bends and gains free."""

@@ -246,10 +246,9 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     say = progress or (lambda text: None)
     first = bench.score((), unsteadiness=bench.unsteadiness(()))
     say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
-    as_declared, noise = observation.model.noise_std, _less_noise(bench)
+    as_declared, (bench, noise) = bench, _less_noise(bench)
     if noise is not None:
         say(f'found noise of {noise[0]:.3g}, less than declared')
-        bench = bench.with_noise(noise[0])
     chosen, present, timing = _of_timing(bench)
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
@@ -269,8 +268,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     evidence = bench.gather((), everything)
     effects = _effects(chosen)
     own = bench.unsteadiness(effects)
-    before = bench.with_noise(as_declared).score((), unsteadiness=own) if (
-        chosen or noise) else first
+    as_declared = as_declared.with_moving_source(_effects(chosen))
+    before = as_declared.score((), unsteadiness=own) if chosen or noise else first
     after = bench.score(effects, chosen, unsteadiness=own) if chosen or noise else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
     whole = _refitted(bench, timing)
@@ -283,8 +282,9 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         chosen, candidates = _beyond_doubt(chosen, candidates, of_timing, of_lines)
         effects = _effects(chosen)
         bench = bench.with_moving_source(effects)
+        as_declared = as_declared.with_moving_source(effects)
         own = bench.unsteadiness(effects)
-        before = bench.with_noise(as_declared).score((), unsteadiness=own)
+        before = as_declared.score((), unsteadiness=own)
         after = bench.score(effects, chosen, unsteadiness=own)
         moves = dependences(bench, effects, chosen)
     attenuation, _, amplitude = bench.observed(everything)
@@ -306,21 +306,22 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
         observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
         final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
         moves, attenuation, amplitude,
-        bench.with_noise(as_declared).expect((), everything, unsteadiness=own),
+        as_declared.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
         rows, _undecided(partial(bench.change, chosen=_few(bench)), effects, rows),
         _probabilities(timing, candidates), noise=noise)
 
 
-def _less_noise(bench: Bench) -> tuple[float, float] | None:
-    """Return the noise where it is less than declared, by so much that averages scatter less."""
+def _less_noise(bench: Bench) -> tuple[Bench, tuple[float, float] | None]:
+    """Return the bench, and the noise where averages scatter less than with the declared one."""
     found = less_noise(bench.gather((), bench.fit))
     if found is None:
-        return None
+        return bench, None
+    quiet = bench.with_noise(found[0])
     declared, true = (np.sqrt(item.expect((), bench.fit).amplitude_variance.mean(axis=0))
-                      for item in (bench, bench.with_noise(found[0])))
-    return found if np.max(declared - true) >= ACCURACY else None
+                      for item in (bench, quiet))
+    return (quiet, found) if np.max(declared - true) >= ACCURACY else (bench, None)
 
 
 def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:
