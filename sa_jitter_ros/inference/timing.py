@@ -28,7 +28,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
+    beyond_chance, departs, Finding, ODDS, ONE_SIDED, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
@@ -36,12 +36,12 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import APART, RecordFit
-from sa_jitter_ros.inference.record_recovery import LEAST_JITTER
+from sa_jitter_ros.inference.record_recovery import LEAST_JITTER, RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE)
 from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
-from sa_jitter_ros.inference.timing_fit import JITTER, SHAFT, TimingFit
+from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, NOISE_KNOWN, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -51,6 +51,7 @@ Array = NDArray[Any]
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
+_FAR = 2.0  # times the power of second differences of the pulses that shows none of them
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
@@ -72,6 +73,31 @@ class Timing:
     def checks(self) -> tuple[Check, ...]:
         """Return the tests of what is left."""
         return check_timing(self.chooser, self.choice)
+
+    @property
+    def hidden_by(self) -> float:
+        """
+        Return what single errors are wrong by (s) where they are little else, 0 where they are.
+
+        That is where they scatter by more than the noise of the vibration makes, in a way that
+        nothing but noise does, and that noise is far more than the pulses themselves scatter by:
+        lines that are not there, or come and go, were aligned.
+        """
+        fit, data = self.choice.fit, self.chooser.data
+        more = float(fit.starts[NOISE][0])
+        if more < ONE_SIDED * NOISE_KNOWN or self.choice.ticked or data.referenced:
+            return 0.0
+
+        def mean(values: Sequence[float]) -> float:
+            return float(np.average(values, weights=data.lengths))
+
+        stated = mean([item.error_std**2 for item in data.stretches])
+        scatter = mean([np.mean(np.diff(item.setting.times, 2) ** 2) for item in data.stretches])
+        left = data.unit**2 * mean([
+            np.var(self.chooser.left(fit, item)) for item in data.stretches])
+        noise = math.exp(more) * stated
+        size = max(self.choice.setting.model.distribution.variance, left - noise)
+        return math.sqrt(noise) if stated > _FAR * scatter and noise > RESOLVED**2 * size else 0.0
 
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:

@@ -168,11 +168,16 @@ def _unresolved(observation: Observation) -> str:
     known = observation.stacked('standard_errors')
     known = known[np.isfinite(known)]
     if known.size:
-        size = float(np.sqrt(np.mean(known**2)))
-        reason = (f'the vibration shows an error of a single pulse to {size:.2g} s only; smaller '
-                  'errors could not have been seen')
-    else:
-        reason = next(item.reason for item in observation.acquisitions if item.reason)
+        return _too_unsure(float(np.sqrt(np.mean(known**2))))
+    return _no_line(next(item.reason for item in observation.acquisitions if item.reason))
+
+
+def _too_unsure(size: float) -> str:
+    return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; smaller '
+                    'errors could not have been seen')
+
+
+def _no_line(reason: str) -> str:
     return (f'no line is compared: {reason}; declare stronger orders, use a quieter channel or '
             'give reference_pulse_times')
 
@@ -250,6 +255,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     if noise is not None:
         say(f'found noise of {noise[0]:.3g}, less than declared')
     chosen, present, timing = _of_timing(bench)
+    if timing is not None and timing.hidden_by and observation.recoveries:
+        return _nothing_compared(observation, declared, _too_unsure(timing.hidden_by))
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
     for finding in chosen:
