@@ -88,7 +88,7 @@ class Timing:
         if more < ONE_SIDED * NOISE_KNOWN or self.choice.ticked or data.referenced:
             return 0.0
 
-        def mean(values: Sequence[float]) -> float:
+        def mean(values: Sequence[Any]) -> float:
             return float(np.average(values, weights=data.lengths))
 
         stated = mean([item.error_std**2 for item in data.stretches])

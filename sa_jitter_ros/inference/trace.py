@@ -173,8 +173,8 @@ def _unresolved(observation: Observation) -> str:
 
 
 def _too_unsure(size: float) -> str:
-    return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; smaller '
-                    'errors could not have been seen')
+    return _no_line(f'the vibration shows an error of a single pulse to {size:.2g} s only; '
+                    'smaller errors could not have been seen')
 
 
 def _no_line(reason: str) -> str:
