@@ -350,7 +350,9 @@ def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
     An interpolator with the response H makes images of all lines, H(f + fs) and H(f - fs) over
     H(f) times as large, which the drift between two clocks puts beside the lines; a gain that
     varies makes sidebands of one size. In both cases one phase goes with all of them. What turns
-    the lines alike was taken for pulse errors, so that the sum of both sides is compared.
+    the lines alike was taken for pulse errors, so that the sum of both sides is compared. A shaft
+    that shows itself, by a line as far from 0 or as the shaft of the keyphasor, makes sidebands
+    of any phases, which look like one another by chance.
     """
     orders, near, offsets = _places(fit, model)
     amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
@@ -363,6 +365,9 @@ def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
     found = np.zeros(orders.size, np.bool_)
     level = np.abs(amplitudes[:, :fit.declared])
     for beside, distance in _sidebands(fit, model, near, offsets):
+        turns = np.append(orders[fit.declared:], max(1.0, round(distance)))
+        if np.any(np.abs(turns - distance) < least):
+            continue
         sides = np.zeros(level.shape, np.complex128)
         for i in beside:
             side = amplitudes[:, i] / amplitudes[:, near[i]]
