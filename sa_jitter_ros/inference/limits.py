@@ -131,16 +131,18 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
     """
     chooser, choice = timing.chooser, timing.choice
     names, kurtosis = choice.best | {name}, chooser.shapes.kurtosis if chooser.shapes else 0.0
-    fit = start = chooser.fit(names, choice.fit.starts)
+    fit = chooser.fit(names, choice.fit.starts)
     at, low, high = float(fit.starts[name][0]), -math.inf, float(fit.upper[fit.place[name]][0])
-    top, best = high, fit.value
+    top, best, first, begin = high, -math.inf, fit.starts, fit.starts
     last: tuple[float, float] | None = None
     for _ in range(_STEPS):
-        fit = chooser.fit(names, fit.starts, held={(name, 0): at})
-        if fit.value < best - far**2 and math.isfinite(low if far > 0.0 else high):
+        tried = chooser.fit(names, begin, held={(name, 0): at})
+        best = max(best, tried.value)
+        if tried.value < best - far**2:
             low, high = (low, at) if far > 0.0 else (at, high)
-            fit, at = start, 0.5 * (low + high)
+            begin, at = first, 0.5 * (low + high)
             continue
+        fit, begin = tried, tried.starts
         more, seen = fit.more_than_held(name, kurtosis)
         if not seen > 0.0:
             return None

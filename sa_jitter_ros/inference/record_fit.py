@@ -140,6 +140,11 @@ def fit_record(samples: Array, sample_rate: float, start_time: float, times: Arr
                       top=band_end(times, sample_rate, cycle_length, orders, wider)).fit(known)
 
 
+def independent_power(second: Array) -> float:
+    """Return the power of independent errors (s^2) that makes second differences of pulses (s)."""
+    return float(np.mean(second**2)) / 6.0
+
+
 def band_end(times: Array, sample_rate: float, cycle_length: float, orders: Sequence[float],
              wider: float) -> float:
     """Return the order at which the band of `fit_record` ends."""
@@ -250,8 +255,7 @@ class _States:
         self.told = np.zeros(self.width)
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[1:] & self.whole[:-1]
-        self.most_scatter = float(np.mean(np.diff(times, 2)[even] ** 2)) / 6.0 if even.any() else (
-            math.inf)
+        self.most_power = independent_power(np.diff(times, 2)[even]) if even.any() else math.inf
         self.slow: Array = np.zeros(times.size)  # straight line of the errors, which is not jitter
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self._read()
@@ -495,7 +499,7 @@ class _States:
             np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
         power, more = self._estimated(0, (errors - self.slow)[inner],
                                       1.0 - 1.0 / np.count_nonzero(self.measured))
-        power = max(power, min(more, self.most_scatter), (_LEAST_JITTER * self.jitter_std) ** 2)
+        power = max(power, min(more, self.most_power), (_LEAST_JITTER * self.jitter_std) ** 2)
         self.size[0] = np.sqrt(power)
         if self.all_free:
             for i in range(1, self.width):

@@ -35,7 +35,7 @@ from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
-from sa_jitter_ros.inference.record_fit import APART, RecordFit
+from sa_jitter_ros.inference.record_fit import APART, independent_power, RecordFit
 from sa_jitter_ros.inference.record_recovery import LEAST_JITTER, RESOLVED
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
@@ -51,7 +51,7 @@ Array = NDArray[Any]
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _PART = 20  # cycles whose mean power scatters by itself
-_FAR = 2.0  # times the power of second differences of the pulses that shows none of them
+_FAR = 12.0  # times the power of the errors that pulses can have, beyond which none of them shows
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
@@ -92,12 +92,14 @@ class Timing:
             return float(np.average(values, weights=data.lengths))
 
         stated = mean([item.error_std**2 for item in data.stretches])
-        scatter = mean([np.mean(np.diff(item.setting.times, 2) ** 2) for item in data.stretches])
+        possible_power = mean([
+            independent_power(np.diff(item.setting.times, 2)) for item in data.stretches])
         left = data.unit**2 * mean([
             np.var(self.chooser.left(fit, item)) for item in data.stretches])
         noise = math.exp(more) * stated
         size = max(self.choice.setting.model.distribution.variance, left - noise)
-        return math.sqrt(noise) if stated > _FAR * scatter and noise > RESOLVED**2 * size else 0.0
+        hidden = stated > _FAR * possible_power and noise > RESOLVED**2 * size
+        return math.sqrt(noise) if hidden else 0.0
 
 
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
@@ -371,8 +373,10 @@ def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
     gain = fit.value - bare.value
     if gain < 0.5 * math.log(fit.data.cycles) + DECIDED:
         return None
-    effect, errors = EFFECTS[EXCESS].of_timing(
-        fit.starts[JITTER], fit.standard_errors(JITTER), choice.setting)
+    found = chooser.effect(JITTER, fit)
+    if found is None:
+        return None
+    effect, errors = found
     return Finding(EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
 

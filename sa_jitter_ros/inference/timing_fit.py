@@ -95,6 +95,7 @@ class TimingFit:
                 self.declared_motion = self.declared_motion + made
         if not self.free_jitter:
             self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
+        self._apart = 1.0 + _STEP**1.5 * np.eye(data.series)
         self._lay_out(start or {}, held or {})
         self._maximise()
 
@@ -180,7 +181,7 @@ class TimingFit:
             if name != NOISE:
                 total = total + self._of(self.moves(name), self.density(name, parameters))
         # of very large motion, rounding alone tells one series from the others
-        return np.asarray(total * (1.0 + _STEP**1.5 * np.eye(self.data.series)))
+        return np.asarray(total * self._apart)
 
     def _prior(self, parameters: Array) -> tuple[float, Array]:
         """Return minus the logarithm of the prior, and its slope."""

@@ -255,8 +255,8 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     if noise is not None:
         say(f'found noise of {noise[0]:.3g}, less than declared')
     chosen, present, timing = _of_timing(bench)
-    if timing is not None and timing.hidden_by and observation.recoveries:
-        return _nothing_compared(observation, declared, _too_unsure(timing.hidden_by))
+    if timing is not None and observation.recoveries and (unsure := timing.hidden_by):
+        return _nothing_compared(observation, declared, _too_unsure(unsure))
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
     for finding in chosen:
@@ -275,7 +275,7 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     evidence = bench.gather((), everything)
     effects = _effects(chosen)
     own = bench.unsteadiness(effects)
-    as_declared = as_declared.with_moving_source(_effects(chosen))
+    as_declared = as_declared.with_moving_source(effects)
     before = as_declared.score((), unsteadiness=own) if chosen or noise else first
     after = bench.score(effects, chosen, unsteadiness=own) if chosen or noise else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
