@@ -249,14 +249,14 @@ def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
     observation, declared = bench.observation, bench.declared
     everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
-    first = bench.score((), unsteadiness=bench.unsteadiness(()))
-    say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
     as_declared, (bench, noise) = bench, _less_noise(bench)
-    if noise is not None:
-        say(f'found noise of {noise[0]:.3g}, less than declared')
     chosen, present, timing = _of_timing(bench)
     if timing is not None and observation.recoveries and (unsure := timing.hidden_by):
         return _nothing_compared(observation, declared, _too_unsure(unsure))
+    first = as_declared.score((), unsteadiness=as_declared.unsteadiness(()))
+    say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
+    if noise is not None:
+        say(f'found noise of {noise[0]:.3g}, less than declared')
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
     for finding in chosen:
