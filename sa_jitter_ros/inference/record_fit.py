@@ -253,6 +253,7 @@ class _States:
         self.size = np.array([jitter_std, *[_FIXED * jitter_std] * (self.width - 2), _FIXED])
         self.all_free = self.settled = False
         self.told = np.zeros(self.width)
+        self.around: Array | float = 1.0
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[1:] & self.whole[:-1]
         self.most_power = independent_power(np.diff(times, 2)[even]) if even.any() else math.inf
@@ -366,6 +367,8 @@ class _States:
             self.vibration - (1.0 + self.states[:-1, -1:]) * moving)
         points = self.whole.sum() * self.u.size
         self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
+        if self.settled:
+            self._weigh(residual)
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
         rate = self._signals(turns * self.amplitudes)
         rate *= self.slope[:, None]
@@ -383,6 +386,35 @@ class _States:
                 self._estimate_sizes()
             self._read()
         return size
+
+    def _weigh(self, residual: Array) -> None:
+        """
+        Weigh the channels by the noise that leaks into their orders, not by all noise.
+
+        Each order counts as much as it tells of the pulse errors. States that take up a part of
+        the noise leave less of it there. `around` (channel, line) is the noise near each line.
+        """
+        cycles = self.transformed
+        flat = residual[:, :cycles].reshape(len(residual), -1)
+        lines = rfft(flat * _hann(flat.shape[1]))
+        power = lines.real**2 + lines.imag**2
+        power /= power.mean(axis=1, keepdims=True)
+        reach, span = 0.5 * _BEYOND_LINES / self.cycle_length, self.cycle_length * cycles
+        places = np.append(self.orders, self.tones / self.frequency)
+        first, last = (np.clip(np.rint((places + side) * span).astype(int), side > 0.0,
+                               power.shape[1] - (side < 0.0)) for side in (-reach, reach))
+        summed = np.pad(np.cumsum(power, axis=1), ((0, 0), (1, 0)))
+        self.around = (summed[:, last] - summed[:, first]) / (last - first)
+        for c, told in enumerate((np.abs(self.amplitudes[:, :self.orders.size])
+                                  * self.orders) ** 2):
+            share = np.zeros(power.shape[1])
+            for i in np.argsort(told).tolist():  # of several orders nearby the strongest counts
+                share[first[i]:last[i]] = told[i]
+            share /= share.sum()
+            taken = cycles * float(self.told.sum()) * float(share @ share) / (2 * len(power))
+            colour = float(share @ power[c]) / (1.0 - min(taken, 0.5))
+            self.weight[c] /= colour
+            self.around[c] /= colour
 
     def _take_out_mean_bend(self) -> None:
         """
@@ -664,7 +696,8 @@ class _States:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
         schur = self.solved.schur
         variance = np.diag(cho_solve(schur, np.eye(len(schur[0]))))
-        return np.asarray(variance.reshape(len(self.amplitudes), 2, -1).mean(axis=1))
+        return np.asarray(variance.reshape(len(self.amplitudes), 2, -1).mean(axis=1)
+                          * self.around)
 
     # --- what comes out ---
 
