@@ -257,7 +257,9 @@ class _States:
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[1:] & self.whole[:-1]
         self.most_power = independent_power(np.diff(times, 2)[even]) if even.any() else math.inf
-        self.slow: Array = np.zeros(times.size)  # straight line of the errors, which is not jitter
+        # the straight line of the errors, which is no jitter, is `trend` times this
+        self.ramp = (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean())
+        self.trend = 0.0
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self._read()
 
@@ -372,14 +374,14 @@ class _States:
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
         rate = self._signals(turns * self.amplitudes)
         rate *= self.slope[:, None]
-        solution = self._solve(residual, (rate, moving), weak)
-        change, amplitudes = solution
+        change, amplitudes, trend = self._solve(residual, (rate, moving), weak)
         self.change = change[:, 0]
         size = float(np.sqrt(np.mean(self.change**2)))
         if move:
             most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency)
             part = min(1.0, most / max(size, 1e-300))
             self.states = self.states + part * change
+            self.trend += part * trend
             self._take_out_mean_bend()
             self.amplitudes = self.amplitudes + part * amplitudes
             if weak == 1.0:
@@ -426,8 +428,8 @@ class _States:
         bends -= bends[self.whole].mean(axis=0)
 
     def _solve(self, residual: Array, derivative: tuple[Array, Array], weak: float
-               ) -> tuple[Array, ComplexArray]:
-        """Return the changes of states (pulse, state) and amplitudes (channel, line)."""
+               ) -> tuple[Array, ComplexArray, float]:
+        """Return the changes of states (pulse, state), amplitudes (channel, line) and trend."""
         pulses, width = self.states.shape
         by = [*[0] * (width - 1), 1, 0]  # which derivative a state goes with
         cells, down = np.zeros((pulses, width + 1, width + 1)), np.zeros((pulses, width + 1))
@@ -446,12 +448,17 @@ class _States:
         size = self.size * np.append(weak, np.ones(width - 1))
         precision = np.tile(size**-2.0, (pulses, 1))
         expected = self.states.copy()
-        expected[:, 0] -= self.slow
+        expected[:, 0] -= self.trend * self.ramp
         total = precision + np.einsum('kii->ki', cells)[:, :-1]
         total[1:, 0] += cells[:-1, -1, -1]
         down[1:, 0] += down[:-1, -1]
         down = down[:, :-1] - precision * expected
         border, corner, below = self._border(residual, derivative, by)
+        # the trend that the errors are expected along stands after the amplitudes
+        along = precision[:, 0] * self.ramp
+        border[:, 0, -1] = -along
+        corner[-1, -1] = along @ self.ramp + _MOST_SLOPE**-2.0
+        below[-1] = along @ expected[:, 0] - self.trend * _MOST_SLOPE**-2.0
         scale = 1.0 / np.sqrt(total)  # seconds and gains together
         scales = np.hstack([scale, np.roll(scale[:, :1], -1)])
         cells *= scales[:, :, None] * scales[:, None, :]
@@ -461,15 +468,16 @@ class _States:
         amplitudes = cho_solve(solved.schur, below - border.reshape(
             down.size, -1).T @ solved.of_states(down).ravel())
         change = solved.of_states(down - border @ amplitudes) * scale
-        cos, sin = np.split(amplitudes.reshape(len(residual), -1), 2, axis=1)
-        return change, cos + 1j * sin
+        cos, sin = np.split(amplitudes[:-1].reshape(len(residual), -1), 2, axis=1)
+        return change, cos + 1j * sin, float(amplitudes[-1])
 
     def _border(self, residual: Array, derivative: tuple[Array, Array], by: Sequence[int]
                 ) -> tuple[Array, Array, Array]:
-        """Return border, corner and right-hand side of the amplitudes (cos, sin by channel)."""
+        """Return border, corner and right side of amplitudes (cos, sin by channel) and trend, 0."""
         pulses, width = self.states.shape
         channels, lines = self.amplitudes.shape
-        border = np.zeros((pulses, width, channels, 2, lines))
+        whole = np.zeros((pulses, width, 2 * channels * lines + 1))
+        border = whole[:, :, :-1].reshape(pulses, width, channels, 2, lines)
         corner = np.zeros((channels, 2 * lines, channels, 2 * lines))
         below = np.zeros((channels, 2 * lines))
         for c, weight in enumerate(self.weight):
@@ -484,9 +492,9 @@ class _States:
             total = weight * self._sums(residual[c]).sum(axis=0)
             below[c] = np.append(total.real, -total.imag)
             corner[c, :, c] = weight * self.normal
-        flat = corner.reshape(below.size, -1)
+        flat = np.pad(corner.reshape(below.size, -1), (0, 1))
         flat[np.diag_indices(len(flat))] *= 1.0 + _ROUNDING
-        return border.reshape(pulses, width, -1), flat, below.ravel()
+        return whole, flat, np.append(below, 0.0)
 
     def _sums_of(self, values: Array, which: int, channel: int, shapes: Array) -> ComplexArray:
         """Return `_sums` of a derivative (cycle, point) of a channel, from its lines if faster."""
@@ -506,13 +514,16 @@ class _States:
         """
         Return posterior variances of a state, of `most` cycles or all.
 
-        Those of pulse errors are about their mean, which nothing tells.
+        Those of pulse errors are about their mean, which nothing tells; of some, which stand for
+        the size of errors, about their trend, too.
         """
         solved, pulses = self.solved, self.times.size
         chosen = np.arange(pulses)
         if most:
             chosen = np.unique(np.linspace(2, pulses - 3, most).astype(int))
         local, inner = solved.of_state(state, chosen)
+        if most and not state:
+            inner[:, -1] += self.ramp[chosen] / solved.scale[chosen, 0]
         through = cho_solve(solved.schur, inner.T)
         variance = (local + np.sum(inner * through.T, axis=1)) * solved.scale[chosen, state] ** 2
         if state:
@@ -526,10 +537,8 @@ class _States:
         """Estimate how large the states are from their values and variances."""
         inner = np.arange(self.times.size)[2:-2]
         inner = inner[self.measured[2:-2]]
-        errors = self.states[:, 0]
-        self.slow = np.asarray(np.polyval(
-            np.polyfit(inner, errors[inner], 1), np.arange(errors.size)))
-        power, more = self._estimated(0, (errors - self.slow)[inner],
+        errors = (self.states[:, 0] - self.trend * self.ramp)[inner]
+        power, more = self._estimated(0, errors - errors.mean(),
                                       1.0 - 1.0 / np.count_nonzero(self.measured))
         power = max(power, min(more, self.most_power), (_LEAST_JITTER * self.jitter_std) ** 2)
         self.size[0] = np.sqrt(power)
@@ -588,9 +597,8 @@ class _States:
         if (score.max() - score[most] > _SLOPE_GAIN * self.declared
                 and abs(best) > 1.5 * step
                 and np.mean(chance < _FALSE / slope.size) > _SLOPE_LINES):
-            pulse = np.arange(self.times.size) - 0.5 * self.times.size
-            self.slow = np.asarray(best * pulse * np.diff(self.times).mean())
-            self.states[:, 0] = self.slow
+            self.trend = float(best)
+            self.states[:, 0] = best * self.ramp
             self._read()
 
     def new_lines(self) -> tuple[list[float], list[float]]:
@@ -678,8 +686,8 @@ class _States:
             lines = self.orders[self.declared:] if chosen.stop else self.tones
             lines += step
         self.orders[self.declared:] *= 1.0 - stretch
-        pulses = np.arange(self.times.size) - 0.5 * (self.times.size - 1)
-        self.states[:, 0] += stretch * pulses * float(np.diff(self.times).mean())
+        self.states[:, 0] += stretch * self.ramp
+        self.trend += stretch
         self._read()
         return float(np.max(np.abs(step) * np.sqrt(bottom[count:] * curves[1]), initial=0.0))
 
@@ -695,7 +703,7 @@ class _States:
     def _amplitude_variances(self) -> Array:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
         schur = self.solved.schur
-        variance = np.diag(cho_solve(schur, np.eye(len(schur[0]))))
+        variance = np.diag(cho_solve(schur, np.eye(len(schur[0]))))[:-1]
         return np.asarray(variance.reshape(len(self.amplitudes), 2, -1).mean(axis=1)
                           * self.around)
 
