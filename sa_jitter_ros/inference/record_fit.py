@@ -169,9 +169,8 @@ class OpenRecord:
         """Fit the stretch, as `fit_record`."""
         states = copy(self._begin)
         states.size = states.size.copy()
-        states.add(*(known or ((), ())))
         states.fit_amplitudes()
-        _search(states, known is None)
+        _search(states, known)
         states.settled = True
         for _ in range(_LAST_STEPS):
             if states.step() < _CONVERGED * states.jitter_std:
@@ -179,9 +178,20 @@ class OpenRecord:
         return states.result()
 
 
-def _search(states: '_States', look: bool) -> None:
-    """Fit states and lines by turns until no line is found any more."""
+def _search(states: '_States', known: tuple[Array, Array] | None) -> None:
+    """
+    Fit states and lines by turns until no line is found any more.
+
+    Lines that are `known` come after the first steps, too: high ones follow a trend that the
+    declared ones have shown.
+    """
     states.step()
+    look = known is None
+    if known is not None:
+        for _ in range(2):
+            states.step()
+        states.add(*known)
+        states.fit_amplitudes()
     while True:
         for _ in range(2):
             states.step()

@@ -28,7 +28,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.band import band_of_ripple
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, ODDS, ONE_SIDED, parameter_ranges, possible)
+    beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
@@ -37,11 +37,12 @@ from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import APART, independent_power, RecordFit
 from sa_jitter_ros.inference.record_recovery import LEAST_JITTER, RESOLVED
+from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE)
 from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
-from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, NOISE_KNOWN, SHAFT, TimingFit
+from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -79,13 +80,11 @@ class Timing:
         """
         Return what single errors are wrong by (s) where they are little else, 0 where they are.
 
-        That is where they scatter by more than the noise of the vibration makes, in a way that
-        nothing but noise does, and that noise is far more than the pulses themselves scatter by:
-        lines that are not there, or come and go, were aligned.
+        That is where the noise of the vibration is far more than the pulses themselves scatter by,
+        and aligning a line to it changes the line: one that is not there, or comes and goes.
         """
         fit, data = self.choice.fit, self.chooser.data
-        more = float(fit.starts[NOISE][0])
-        if more < ONE_SIDED * NOISE_KNOWN or self.choice.ticked or data.referenced:
+        if self.choice.ticked or data.referenced:
             return 0.0
 
         def mean(values: Sequence[Any]) -> float:
@@ -96,9 +95,12 @@ class Timing:
             independent_power(np.diff(item.setting.times, 2)) for item in data.stretches])
         left = data.unit**2 * mean([
             np.var(self.chooser.left(fit, item)) for item in data.stretches])
-        noise = math.exp(more) * stated
-        size = max(self.choice.setting.model.distribution.variance, left - noise)
-        hidden = stated > _FAR * possible_power and noise > RESOLVED**2 * size
+        noise = math.exp(float(fit.starts[NOISE][0])) * stated
+        model = self.choice.setting.model
+        size = max(model.distribution.variance, left - noise)
+        turn = 2.0 * math.pi * max(model.orders) * model.fundamental_frequency
+        hidden = (stated > _FAR * possible_power and noise > RESOLVED**2 * size
+                  and 0.5 * turn**2 * noise > ACCURACY)
         return math.sqrt(noise) if hidden else 0.0
 
 

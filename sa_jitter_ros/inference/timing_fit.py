@@ -39,7 +39,7 @@ _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 #: What the logarithm of the noise power is known to.
-NOISE_KNOWN = 0.5
+_NOISE_KNOWN = 0.5
 _SAME = 0.05  # gain in log likelihood that ends a search
 _STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
 _CURVED = float(np.sqrt(_STEP))  # by which a curvature is
@@ -192,8 +192,8 @@ class TimingFit:
         slope[place.start:place.start + _KNOTS] = bend @ bends
         steep = (parameters[place][_KNOTS] - _EDGE_SLOPE[0]) / _EDGE_SLOPE[1]
         slope[place.stop - 1] = steep / _EDGE_SLOPE[1]
-        noise = parameters[self.place[NOISE]][0] / NOISE_KNOWN
-        slope[self.place[NOISE].start] = noise / NOISE_KNOWN
+        noise = parameters[self.place[NOISE]][0] / _NOISE_KNOWN
+        slope[self.place[NOISE].start] = noise / _NOISE_KNOWN
         total = 0.5 * (bend @ bend + steep**2 + noise**2)
         return float(total), slope
 
