@@ -38,10 +38,13 @@ def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn
     model = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
                           orders=(28.0, 58.0, 59.0), sample_rate=RATE)
     observation = observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model)
-    turned = check_lines(observation, choose_lines(observation))[0]
+    turned = check_lines(observation, choose_lines(observation), np.zeros(3))[0]
     if turn:
         assert turned.p_value < 1e-6
         assert turned.size == pytest.approx(turn / np.sqrt(2.0), rel=0.3)
+        # a tone that turns it as much explains it
+        tone = np.array([0.0, 0.0, (0.4 * turn) ** 2])
+        assert check_lines(observation, choose_lines(observation), tone)[0].p_value > 0.01
     else:
         assert turned.p_value > 0.01
 
@@ -80,5 +83,5 @@ def test_amplitudes_that_share_the_noise_of_the_errors_follow_nothing(noise, see
                           orders=(1.0, 2.0, 3.0), sample_rate=rate)
     observation = observe(Recording(ArraySource(vibration[None]), rate, pulse_times=pulses), model)
     # of the first check, that of the turns, another test holds
-    for check in check_lines(observation, choose_lines(observation))[1:]:
+    for check in check_lines(observation, choose_lines(observation), np.zeros(3))[1:]:
         assert check.p_value > 0.01

@@ -77,13 +77,19 @@ def _tails(waves: Array, count: int) -> Array:
     return np.asarray(np.mean(white**4, axis=-1) / np.mean(white**2, axis=-1) ** 2)
 
 
-def check_lines(observation: Observation, lines: Lines) -> tuple[Check, ...]:
-    """Return the checks of the amplitudes of all acquisitions of a recording that has lines."""
+def check_lines(observation: Observation, lines: Lines, variance: Array) -> tuple[Check, ...]:
+    """
+    Return the checks of the amplitudes of all acquisitions of a recording that has lines.
+
+    Of the scatter of each order its `variance` (order,) is explained, half of it in phase.
+    """
     if not lines.count or not observation.recoveries:
         return ()
     orders = observation.orders.size
     amplitude = lines.of(observation.stacked('corrected')[..., :orders])
-    noise = np.sqrt(np.mean(lines.of(observation.stacked('noise')[..., :orders]) ** 2, axis=0))
+    noise = np.sqrt(np.maximum(
+        np.mean(lines.of(observation.stacked('noise')[..., :orders]) ** 2, axis=0),
+        0.5 * variance[lines.order]))
     order = observation.orders[lines.order]
     number = observation.pulses.number[[item.first for item in observation.acquisitions]]
     turned = amplitude * np.exp(

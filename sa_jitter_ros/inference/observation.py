@@ -145,6 +145,13 @@ class Observation:
         return tuple(a for a, item in enumerate(self.acquisitions)
                      if self.against_reference or item.recovered)
 
+    def uncorrected(self) -> 'Observation':
+        """Return the observation of one whose recovered errors tell nothing of the amplitudes."""
+        return replace(self, acquisitions=tuple(replace(
+            item, cycles=clean, noise=radial_noise(clean), recovered=False)
+            for item in self.acquisitions
+            for clean in [_clean(item.raw_cycles, self.model, self.sources)]))
+
     def stacked(self, field: str) -> NDArray[Any]:
         """Return one field of all acquisitions as an array."""
         return np.array([getattr(item, field) for item in self.acquisitions])
@@ -335,9 +342,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     corrected_ripple = ripple if corrects_ripple else None
     raw = reader.amplitudes(reader.cycles(pulses.times[used], law=law), model, sources, law)
     cycles = reader.cycles(corrected_pulses, law=corrected_law, ripple=corrected_ripple)
-    clean_cycles = without_leakage(
-        reader.amplitudes(cycles, model, sources, corrected_law), tuple(sources.tolist()),
-        model.cycle_length, model.cycle_length * np.arange(cycles.count))
+    clean_cycles = _clean(reader.amplitudes(cycles, model, sources, corrected_law), model, sources)
     floor = noise_floor(cycle_grid([cycles], method=reader.method, law=corrected_law,
                                    period=float(np.diff(bridged).max())),
                         model.cycle_length, sources[:len(model.orders)],
@@ -346,6 +351,12 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
         radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,
         reason)
+
+
+def _clean(cycles: ComplexArray, model: DeclaredModel, sources: FloatArray) -> ComplexArray:
+    """Return the amplitudes of cycles (cycle, channel, order) without what the orders leak."""
+    return without_leakage(cycles, tuple(sources.tolist()), model.cycle_length,
+                           model.cycle_length * np.arange(len(cycles)))
 
 
 def _unresolved(corrected: FloatArray, standard_errors: FloatArray, recovery: RecordRecovery,

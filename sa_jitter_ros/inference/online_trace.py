@@ -33,7 +33,8 @@ from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
-from sa_jitter_ros.inference.trace import require_acquisitions, Trace, trace_bench
+from sa_jitter_ros.inference.trace import (
+    require_acquisitions, timing_of, Trace, trace_bench)
 from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -81,10 +82,11 @@ def trace_averages(averages: Sequence[ReceivedAverage], model: DeclaredModel, *,
     fit, held_out = tuple(range(0, count, 2)), tuple(range(1, count, 2))
     clock, pulses = _pulses(observation)
     level = lines.of(np.abs(observation.stacked('corrected'))[list(fit)].mean(axis=0))
-    found = trace_bench(Bench(
+    bench = Bench(
         observation, lines, level, pulses, clock, np.ones(len(stretch[0].raw), int),
         _scatter(observation, lines, level), fit, held_out,
-        (*declared, _measured_noise(observation, lines)), ONLY_OFF_LINE), progress=progress)
+        (*declared, _measured_noise(observation, lines)), ONLY_OFF_LINE)
+    found = trace_bench(bench, timing_of(bench), progress=progress)
     return replace(found, declared=tuple(declared), findings=tuple(
         replace(item, deciding_measurement=_DECISIVE,
                 indistinguishable_from=(*item.indistinguishable_from, 'speed_fluctuation'))

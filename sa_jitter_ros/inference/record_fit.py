@@ -140,9 +140,13 @@ def fit_record(samples: Array, sample_rate: float, start_time: float, times: Arr
                       top=band_end(times, sample_rate, cycle_length, orders, wider)).fit(known)
 
 
-def independent_power(second: Array) -> float:
-    """Return the power of independent errors (s^2) that makes second differences of pulses (s)."""
-    return float(np.mean(second**2)) / 6.0
+def independent_power(third: Array) -> float:
+    """
+    Return the power of independent errors (s^2) that makes third differences of pulses (s).
+
+    A shaft that runs up makes second differences, too.
+    """
+    return float(np.mean(third**2)) / 20.0
 
 
 def band_end(times: Array, sample_rate: float, cycle_length: float, orders: Sequence[float],
@@ -185,22 +189,18 @@ def _search(states: '_States', known: tuple[Array, Array] | None) -> None:
     Lines that are `known` come after the first steps, too: high ones follow a trend that the
     declared ones have shown.
     """
+    look, lines = known is None, known or ((), ())
     states.step()
-    look = known is None
-    if known is not None:
-        for _ in range(2):
-            states.step()
-        states.add(*known)
-        states.fit_amplitudes()
     while True:
         for _ in range(2):
             states.step()
-        orders, tones = states.new_lines() if look else ([], [])
-        if orders or tones:
+        (orders, tones), lines = states.new_lines() if look else lines, ((), ())
+        if len(orders) or len(tones):
             states.add(orders, tones)
             states.fit_amplitudes()
-            states.refine()
-            states.fit_amplitudes()
+            if look:
+                states.refine()
+                states.fit_amplitudes()
         elif states.all_free:
             break
         else:
@@ -265,8 +265,8 @@ class _States:
         self.told = np.zeros(self.width)
         self.around: Array | float = 1.0
         # pulses do not err by more than they scatter; a source that moves may do more
-        even = self.whole[1:] & self.whole[:-1]
-        self.most_power = independent_power(np.diff(times, 2)[even]) if even.any() else math.inf
+        even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
+        self.most_power = independent_power(np.diff(times, 3)[even]) if even.any() else math.inf
         # the straight line of the errors, which is no jitter, is `trend` times this
         self.ramp = (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean())
         self.trend = 0.0
@@ -416,9 +416,9 @@ class _States:
         first, last = (np.clip(np.rint((places + side) * span).astype(int), side > 0.0,
                                power.shape[1] - (side < 0.0)) for side in (-reach, reach))
         summed = np.pad(np.cumsum(power, axis=1), ((0, 0), (1, 0)))
-        self.around = (summed[:, last] - summed[:, first]) / (last - first)
+        around = (summed[:, last] - summed[:, first]) / (last - first)
         for c, told in enumerate((np.abs(self.amplitudes[:, :self.orders.size])
-                                  * self.orders) ** 2):
+                                  * self.orders) ** 2 + np.finfo(np.float64).tiny):
             share = np.zeros(power.shape[1])
             for i in np.argsort(told).tolist():  # of several orders nearby the strongest counts
                 share[first[i]:last[i]] = told[i]
@@ -426,7 +426,8 @@ class _States:
             taken = cycles * float(self.told.sum()) * float(share @ share) / (2 * len(power))
             colour = float(share @ power[c]) / (1.0 - min(taken, 0.5))
             self.weight[c] /= colour
-            self.around[c] /= colour
+            around[c] /= colour
+        self.around = around
 
     def _take_out_mean_bend(self) -> None:
         """

@@ -92,7 +92,7 @@ class Timing:
 
         stated = mean([item.error_std**2 for item in data.stretches])
         possible_power = mean([
-            independent_power(np.diff(item.setting.times, 2)) for item in data.stretches])
+            independent_power(np.diff(item.setting.times, 3)) for item in data.stretches])
         left = data.unit**2 * mean([
             np.var(self.chooser.left(fit, item)) for item in data.stretches])
         noise = math.exp(float(fit.starts[NOISE][0])) * stated

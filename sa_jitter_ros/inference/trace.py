@@ -50,6 +50,7 @@ from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UN
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
+from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -59,7 +60,6 @@ Progress = Callable[[str], None]
 Change = Callable[[Sequence[Effect], Effect], float]
 
 _SPEED = 'speed_fluctuation'
-_TONE = 'interfering_tone'  # turns a line by itself
 _GAIN = 'amplitude_modulation'
 _UNDECIDED = 1e-2  # change of an average by what may be there
 _SCATTER = 'the scatter of the amplitudes'
@@ -150,8 +150,14 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
             'vibration holds'))
     if len(observations) == 1:
         declared = [_counted_anew(item, observation) for item in declared]
-    return trace_bench(make_bench(observation, observations, recordings, declared),
-                       progress=progress)
+    bench = make_bench(observation, observations, recordings, declared)
+    timing = timing_of(bench)
+    if timing is not None and (unsure := timing.hidden_by):
+        observations = [item.uncorrected() for item in observations]
+        whole = together(observations)
+        return _nothing_compared(whole, declared, _too_unsure(unsure),
+                                 make_bench(whole, observations, recordings, declared))
+    return trace_bench(bench, timing, progress=progress)
 
 
 def _counted_anew(effect: Effect, observation: Observation) -> Effect:
@@ -244,15 +250,19 @@ def require_acquisitions(observation: Observation) -> None:
                          'trigger_cycles or record longer')
 
 
-def trace_bench(bench: Bench, *, progress: Progress | None = None) -> Trace:
-    """Trace the residual of the observations of a bench."""
+def timing_of(bench: Bench) -> Timing | None:
+    """Return what the acquisitions of a bench that fit parameters show of the timing."""
+    return read_timing(stretches(bench.observation, bench.fit, bench.clock), bench.declared)
+
+
+def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | None = None
+                ) -> Trace:
+    """Trace the residual of the observations of a bench that have this `timing`."""
     observation, declared = bench.observation, bench.declared
     everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
     as_declared, (bench, noise) = bench, _less_noise(bench)
-    chosen, present, timing = _of_timing(bench)
-    if timing is not None and observation.recoveries and (unsure := timing.hidden_by):
-        return _nothing_compared(observation, declared, _too_unsure(unsure))
+    chosen, present = _of_timing(bench, timing)
     first = as_declared.score((), unsteadiness=as_declared.unsteadiness(()))
     say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
     if noise is not None:
@@ -331,9 +341,8 @@ def _less_noise(bench: Bench) -> tuple[Bench, tuple[float, float] | None]:
     return (quiet, found) if np.max(declared - true) >= ACCURACY else (bench, None)
 
 
-def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | None]:
+def _of_timing(bench: Bench, timing: Timing | None) -> tuple[list[Finding], list[Finding]]:
     """Return the effects that change an average, the most important first, and others."""
-    timing = read_timing(stretches(bench.observation, bench.fit, bench.clock), bench.declared)
     chosen: list[Finding] = []
     present: list[Finding] = []
     findings = timing.findings if timing is not None else ()
@@ -346,7 +355,7 @@ def _of_timing(bench: Bench) -> tuple[list[Finding], list[Finding], Timing | Non
         matters = finding.largest_change >= least_change(effect)
         (chosen if matters else present).append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
-    return chosen, [item for item in present if item.name != _SPEED], timing
+    return chosen, [item for item in present if item.name != _SPEED]
 
 
 def _refitted(bench: Bench, timing: Timing | None) -> Timing | None:
@@ -447,7 +456,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
     names = {finding.name for finding in chosen}
     of_timing = timing.checks if timing is not None else ()
-    of_lines = () if _TONE in names else check_lines(bench.observation, bench.lines)
+    of_lines = check_lines(bench.observation, bench.lines, line_variance(model, _effects(chosen)))
     if _GAIN in names:
         of_lines = (*of_lines, check_gain(bench.scatter))
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
