@@ -326,8 +326,11 @@ def test_turbine_whose_lines_come_and_go_has_no_limit_of_what_they_do_not_hold(
     content = report(trace([observe(recording, model)], [recording]))
     assert content['verdict'] in ('none', 'traced')
     assert {item['name'] for item in content['missing_effects']} <= {'interfering_tone'}
-    (limit,) = [item['upper_95'] for item in content['limits'] if item['name'] == 'clock_skew']
-    assert limit is None or limit > skew
+    upper = {item['name']: item['upper_95'] for item in content['limits']}
+    assert upper['clock_skew'] is None or upper['clock_skew'] > skew
+    if day == 20130405:
+        # what the lines scatter by shows all the same
+        assert upper['additive_noise'] > 0.0 and upper['amplitude_modulation'] > 0.0
 
 
 @pytest.mark.machines

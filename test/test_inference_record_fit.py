@@ -14,7 +14,7 @@ from independent_effects import draw_case
 import numpy as np
 import pytest
 from record_recovery import fitted
-from sa_jitter_ros.inference.record_fit import _States, fit_record
+from sa_jitter_ros.inference.record_fit import _States, fit_record, independent_power
 
 
 @pytest.mark.machines
@@ -101,6 +101,51 @@ def test_errors_are_hardly_shrunk_however_little_shows_of_them(rng, size):
     assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
         1.0, abs=4.0 / np.sqrt(2.0 * times.size))
     assert found.expected_std[0] > 2.0 * np.median(found.standard_errors)
+
+
+def coloured(noise, power):
+    """Return noise (sample, 1) whose power grows with a power of the frequency, as strong."""
+    waves = np.fft.rfft(noise, axis=0)
+    waves *= np.arange(len(waves))[:, None] ** (0.5 * power)
+    found = np.fft.irfft(waves, len(noise), axis=0)
+    return found * np.std(noise) / np.std(found)
+
+
+@pytest.mark.parametrize('power', [-1.0, 0.0, 2.0])
+@pytest.mark.parametrize('noise', [0.5, 4.0])
+def test_noise_counts_as_it_is_at_the_lines(rng, power, noise):
+    """Noise that grows with frequency is less there than in the band that is read, or more."""
+    samples, times, errors = steady(rng, count=300, noise=0.0)
+    samples = samples + noise * coloured(rng.standard_normal(samples.shape), power)
+    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    z = ((found.errors - (errors - errors.mean())) / found.standard_errors)[2:-2]
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size) + 0.1)
+
+
+@pytest.mark.parametrize('slope', [0.0, 3e-4, -9e-4])
+@pytest.mark.parametrize('noise', [2.0, 8.0])
+def test_a_trend_shows_where_no_single_error_does(rng, noise, slope):
+    """Errors of a few us that the vibration shows to 100 us and more: a clock is told from them."""
+    samples, times, _ = steady(rng, count=200, noise=noise)
+    times = times + slope * times
+    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=1e-6)
+    assert np.median(found.standard_errors) > 20e-6
+    # of a straight line through errors with independent noise
+    error = np.sqrt(12.0 / times.size) * np.median(found.standard_errors) / np.ptp(times)
+    fitted_slope = np.polyfit(times, found.errors, 1)[0]
+    assert fitted_slope == pytest.approx(slope, abs=4.0 * error)
+
+
+def test_a_shaft_that_runs_up_lets_pulses_err_no_more():
+    """A speed that doubles in 80 cycles makes second differences of 0.1 ms, and no errors."""
+    turns = np.arange(80.0)
+    times = 20.0 * (np.sqrt(1.0 + turns / 100.0) - 1.0)
+    assert np.sqrt(independent_power(np.diff(times, 3))) < 2e-6
+    jitter = np.random.default_rng(1).normal(0.0, 5e-5, 80)
+    power = independent_power(np.diff(times + jitter, 3))
+    assert np.sqrt(power) == pytest.approx(5e-5, rel=4.0 / np.sqrt(80.0))
 
 
 @pytest.mark.machines
