@@ -329,12 +329,17 @@ def _combined(known: Sequence[Array]) -> Array:
 def _affordable(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array
                 ) -> Array:
     """Return as many scenarios as take about a second, at least one; raise ModelError for none."""
-    pairs = 2 * _SCENARIO_NODES * (correlation_length(processes) + 1)
-    each = len(model.orders) * _SCENARIO_NODES * (25 + pairs)
-    if each * model.trigger_cycles > _WORK:
+    cycles = scenario_cycles(model, processes)
+    if cycles < model.trigger_cycles:
         raise ModelError(
             f'trigger_cycles is {model.trigger_cycles} with {len(model.orders)} orders: with '
-            f'known pulse errors at most {_WORK // each} cycles are worth their time; predict '
+            f'known pulse errors at most {cycles} cycles are worth their time; predict '
             'fewer cycles or fewer orders')
-    kept = min(len(errors), max(1, _WORK // (each * model.trigger_cycles)))
+    kept = min(len(errors), cycles // model.trigger_cycles)
     return errors[np.arange(kept) * len(errors) // kept]
+
+
+def scenario_cycles(model: DeclaredModel, processes: Sequence[AngleErrorProcess] = ()) -> int:
+    """Return how many cycles, of all scenarios of a model together, take about a second."""
+    pairs = 2 * _SCENARIO_NODES * (correlation_length(processes) + 1)
+    return _WORK // (len(model.orders) * _SCENARIO_NODES * (25 + pairs))
