@@ -52,7 +52,8 @@ CASES = (
     'none 1009 other_ratio', 'none 1009 strays', 'none 1009 no_shaft', 'none 1009 two_pulses',
     'none 1009 louder', 'none 1009 short_reference', 'none 1009 late_reference',
     'none 1009 poor_reference', 'additive_noise 1007 fast_at_times', 'clock_skew 1000 short',
-    'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock')
+    'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock',
+    'none 1009 swaying')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}
@@ -105,9 +106,15 @@ def _of_no_shaft(times: NDArray[np.float64], made: Measurement) -> NDArray[np.fl
     return made.rng.uniform(times[0], times[-1], times.size)
 
 
+def _swaying(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times that come early and late eleven times in a recording, as no effect is."""
+    size = 1.5 * float(np.std(times - made.true))
+    return times + size * np.sin(2.0 * np.pi * 11.3 * (times - times[0]) / np.ptp(times))
+
+
 def _coarse_clock(made: Measurement) -> None:
-    """Let a clock of 24 ticks an interval time the pulses, and declare it."""
-    rate = 24.0 / made.interval
+    """Let a clock of 17.5 ticks an interval time the pulses, and declare it."""
+    rate = 17.5 / made.interval
     made.fields['pulse_times'] = np.ceil(rate * made.true) / rate
     made.declare('keyphasor_rate', lambda _: rate)
 
@@ -152,6 +159,7 @@ DAMAGES: Mapping[str, Callable[[Measurement], None]] = {
     'strays': _replace_pulses(_with_strays),
     'no_shaft': _replace_pulses(_of_no_shaft),
     'two_pulses': _replace_pulses(lambda times, made: times[[0, -1]]),
+    'swaying': _replace_pulses(_swaying),
     'coarse_clock': _coarse_clock,
     'late_reference': _reference(0.1, 1.0),
     'short_reference': _reference(0.0, 0.3),
