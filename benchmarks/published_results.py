@@ -53,7 +53,7 @@ CASES = (
     'none 1009 louder', 'none 1009 short_reference', 'none 1009 late_reference',
     'none 1009 poor_reference', 'additive_noise 1007 fast_at_times', 'clock_skew 1000 short',
     'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock',
-    'none 1009 swaying')
+    'none 52619 two_clocks', 'none 1009 swaying')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}
@@ -112,11 +112,18 @@ def _swaying(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float6
     return times + size * np.sin(2.0 * np.pi * 11.3 * (times - times[0]) / np.ptp(times))
 
 
-def _coarse_clock(made: Measurement) -> None:
-    """Let a clock of 17.5 ticks an interval time the pulses, and declare it."""
+def _coarse_clock(made: Measurement) -> float:
+    """Let a clock of 17.5 ticks an interval time the pulses, and declare it; return its rate."""
     rate = 17.5 / made.interval
     made.fields['pulse_times'] = np.ceil(rate * made.true) / rate
     made.declare('keyphasor_rate', lambda _: rate)
+    return rate
+
+
+def _two_clocks(made: Measurement) -> None:
+    """Let a clock that is faster by 3 % time the pulses of a second recording."""
+    rate = 1.03 * _coarse_clock(made)
+    made.more = {'pulse_times': np.ceil(rate * made.true) / rate}
 
 
 def _reference(begin: float, end: float) -> Callable[[Measurement], None]:
@@ -150,7 +157,7 @@ def _other_ratio(made: Measurement) -> None:
 
 
 #: What is done to a recording or its declaration, by the third word of a case.
-DAMAGES: Mapping[str, Callable[[Measurement], None]] = {
+DAMAGES: Mapping[str, Callable[[Measurement], Any]] = {
     'faster': _declare('trigger_speed', 1.12),
     'fast_at_times': _declare('trigger_speed', 1.103),
     'other_ratio': _other_ratio,
@@ -161,6 +168,7 @@ DAMAGES: Mapping[str, Callable[[Measurement], None]] = {
     'two_pulses': _replace_pulses(lambda times, made: times[[0, -1]]),
     'swaying': _replace_pulses(_swaying),
     'coarse_clock': _coarse_clock,
+    'two_clocks': _two_clocks,
     'late_reference': _reference(0.1, 1.0),
     'short_reference': _reference(0.0, 0.3),
     'poor_reference': _poor_reference,

@@ -27,6 +27,7 @@ ERRORS = {
     'faster': 'trigger_speed is declared as', 'other_ratio': 'ratio is declared as',
     'strays': 'pulses are spurious', 'no_shaft': 'no interval that a shaft could have',
     'two_pulses': '2 keyphasor pulses', 'louder': 'different machines or loads',
+    'two_clocks': 'one declared model holds for one clock',
     'short_reference': 'reference_pulse_times cover 30% of the pulses'}
 REMARKS = {
     'poor_reference': 'they give less amplitude than pulse_times',

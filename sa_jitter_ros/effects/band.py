@@ -14,6 +14,7 @@ Slow random motions whose spectrum is flat in a band, and what recovered pulse e
 Frequencies are in units of the trigger rate, times in trigger cycles.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ NARROWEST, WIDEST = 1e-4, 0.5
 
 # Of the highest frequency, and cycles, over which a correlation is followed at most.
 _PERIODS, _LONGEST = 40.0, 2000
-_RULE = unit_nodes(256)  # enough for the turns of some hundred lags
+_RULE = unit_nodes(math.ceil(math.tau * _PERIODS))  # twice as many as so many turns take
 #: Nodes and weights inside a cycle, enough for what turns once in it.
 INSIDE = unit_nodes(20)
 
