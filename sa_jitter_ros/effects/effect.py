@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.amplitudes import scenario_cycles
+from sa_jitter_ros.prediction.amplitudes import scenario_cycles, SCENARIOS
 from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
@@ -39,7 +39,6 @@ ONE_SIDED = -float(special.ndtri(RARE))
 SEEN = 0.25
 #: Logarithm of the odds against an effect before any data: one in 150.
 ODDS = 5.0
-_SCENARIOS = 128  # of an effect
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def largest_power(value: float, count: float, noise: float, square: float, memor
     return max((middle + beyond) / left, SEEN * math.sqrt(2.0 * square / count))
 
 
-def most_scenarios(model: DeclaredModel, wanted: int = _SCENARIOS) -> int:
+def most_scenarios(model: DeclaredModel, wanted: int = SCENARIOS) -> int:
     """Return how many scenarios of a model's averages to list: fewer where averages are long."""
     return min(wanted, max(1, scenario_cycles(model) // model.trigger_cycles))
 

@@ -49,7 +49,9 @@ _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
 _FEW_CYCLES_OF_SCENARIOS = 20
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
-_SCENARIOS, _SEED = 256, 11  # scenarios of several influences together; of which combinations
+#: Scenarios of an influence, and of several together.
+SCENARIOS = 256
+_SEED = 11  # of which combinations
 _DRAWS, _FEWEST = 8192, 64  # evenly spread values in all scenarios, in one
 _SCENARIO_NODES = 32  # as `scenario_moments` takes at most
 _WORK = 20_000_000_000  # multiplications of phasors, about a second
@@ -320,8 +322,8 @@ def _combined(known: Sequence[Array]) -> Array:
     total = known[0]
     for more in known[1:]:
         total = (total[:, None, :] + more[None, :, :]).reshape(-1, total.shape[1])
-        if len(total) > _SCENARIOS:
-            rows = np.random.default_rng(_SEED).permutation(len(total))[:_SCENARIOS]
+        if len(total) > SCENARIOS:
+            rows = np.random.default_rng(_SEED).permutation(len(total))[:SCENARIOS]
             total = total[np.sort(rows)]
     return total
 
