@@ -13,11 +13,13 @@ Results of the loop on a few drawn machines, as `published_results.json` beside 
 
 `python benchmarks/published_results.py` closes the loop on each machine and prints what differs
 from the file; `--write` makes the file anew, after a change that is meant to change results. The
-truth of each machine is in its name: all of them are right.
+truth of each machine is in its name: all of them are right. A third word in a name damages the
+recording or its declaration (`DAMAGES`); a result may then be an error.
 """
 
 import argparse
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 import json
 import math
 from pathlib import Path
@@ -26,9 +28,11 @@ import sys
 import tempfile
 from typing import Any
 
-from independent_effects import draw_case
-from independent_machines import declared, record
+from independent_effects import Case, draw_case
+from independent_machines import declared, pulses, record
 import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.loop import close_loop
 
 RESULTS = Path(__file__).with_suffix('.json')
@@ -43,23 +47,162 @@ CASES = (
     'phase_wander+interfering_tone 3000', 'keyphasor_quantisation+clock_skew 3003',
     'missing_pulses+clock_skew 3001', 'following_level 3000', 'late_recovery 3001',
     'interfering_tone 3001', 'additive_noise 3001', 'keyphasor_quantisation 3001',
-    'target_geometry 3001', 'excess_jitter+amplitude_modulation 3000', 'none 52619')
+    'target_geometry 3001', 'excess_jitter+amplitude_modulation 3000', 'none 52619',
+    'keyphasor_quantisation 5307', 'keyphasor_quantisation 5339', 'none 1009 faster',
+    'none 1009 other_ratio', 'none 1009 strays', 'none 1009 no_shaft', 'none 1009 two_pulses',
+    'none 1009 louder', 'none 1009 short_reference', 'none 1009 late_reference',
+    'none 1009 poor_reference', 'additive_noise 1007 fast_at_times', 'clock_skew 1000 short',
+    'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock',
+    'none 52619 two_clocks', 'none 1009 swaying')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}
 _PROBABILITIES = {'probabilities', 'p_value', 'coverage_95', 'ks', 'mean'}
 
 
+@dataclass
+class Measurement:
+    """
+    Fields of a recording, those `more` that a second one has otherwise, and the declared text.
+
+    `true` (pulse,) are the true times of the pulses in s, lost ones included.
+    """
+
+    fields: dict[str, Any]
+    text: str
+    true: NDArray[np.float64]
+    rng: np.random.Generator
+    more: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def interval(self) -> float:
+        """Return the mean time between pulses in s."""
+        return float(np.diff(self.true).mean())
+
+    def declare(self, name: str, change: Callable[[float], Any]) -> None:
+        """Change a declared number."""
+        self.text = re.sub(rf'(?<= {name}: ).*', lambda found: str(change(float(found[0]))),
+                           self.text)
+
+
+def _replace_pulses(change: Callable[[NDArray[np.float64], Measurement], NDArray[np.float64]]
+                    ) -> Callable[[Measurement], None]:
+    def damage(made: Measurement) -> None:
+        made.fields['pulse_times'] = np.sort(change(made.fields['pulse_times'], made))
+    return damage
+
+
+def _declare(name: str, factor: float) -> Callable[[Measurement], None]:
+    return lambda made: made.declare(name, lambda value: factor * value)
+
+
+def _with_strays(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times with one stray behind every twelfth of them on average."""
+    chosen = times[made.rng.uniform(size=times.size) < 1.0 / 12.0]
+    return np.append(times, chosen + made.interval * made.rng.uniform(0.2, 0.8, chosen.size))
+
+
+def _of_no_shaft(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    return made.rng.uniform(times[0], times[-1], times.size)
+
+
+def _swaying(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times that come early and late eleven times in a recording, as no effect is."""
+    size = 1.5 * float(np.std(times - made.true))
+    return times + size * np.sin(2.0 * np.pi * 11.3 * (times - times[0]) / np.ptp(times))
+
+
+def _coarse_clock(made: Measurement) -> float:
+    """Let a clock of 17.5 ticks an interval time the pulses, and declare it; return its rate."""
+    rate = 17.5 / made.interval
+    made.fields['pulse_times'] = np.ceil(rate * made.true) / rate
+    made.declare('keyphasor_rate', lambda _: rate)
+    return rate
+
+
+def _two_clocks(made: Measurement) -> None:
+    """Let a clock that is faster by 3 % time the pulses of a second recording."""
+    rate = 1.03 * _coarse_clock(made)
+    made.more = {'pulse_times': np.ceil(rate * made.true) / rate}
+
+
+def _reference(begin: float, end: float) -> Callable[[Measurement], None]:
+    """Add a reference keyphasor for a part of the recording, from `begin` to `end`."""
+    def damage(made: Measurement) -> None:
+        count = made.true.size
+        made.fields['reference_pulse_times'] = made.true[int(begin * count):int(end * count)]
+    return damage
+
+
+def _short(made: Measurement) -> None:
+    """Leave the first eighth of a recording."""
+    for name in ('pulse_times', 'vibration'):
+        made.fields[name] = made.fields[name][..., :made.fields[name].shape[-1] // 8]
+
+
+def _poor_reference(made: Measurement) -> None:
+    """Add a reference keyphasor with a third more jitter than the pulses have."""
+    error = np.sqrt(np.mean((made.fields['pulse_times'] - made.true) ** 2))
+    made.fields['reference_pulse_times'] = made.true + 4.0 / 3.0 * error * (
+        made.rng.standard_normal(made.true.size))
+
+
+def _louder(made: Measurement) -> None:
+    """Add a second recording at another load."""
+    made.more = {'vibration': 8.0 * made.fields['vibration']}
+
+
+def _other_ratio(made: Measurement) -> None:
+    made.fields['ratio'] *= 1.0 + 5e-5
+
+
+#: What is done to a recording or its declaration, by the third word of a case.
+DAMAGES: Mapping[str, Callable[[Measurement], Any]] = {
+    'faster': _declare('trigger_speed', 1.12),
+    'fast_at_times': _declare('trigger_speed', 1.103),
+    'other_ratio': _other_ratio,
+    'much_jitter': _declare('keyphasor_rate', 0.1),
+    'little_jitter': _declare('keyphasor_rate', 10.0),
+    'strays': _replace_pulses(_with_strays),
+    'no_shaft': _replace_pulses(_of_no_shaft),
+    'two_pulses': _replace_pulses(lambda times, made: times[[0, -1]]),
+    'swaying': _replace_pulses(_swaying),
+    'coarse_clock': _coarse_clock,
+    'two_clocks': _two_clocks,
+    'late_reference': _reference(0.1, 1.0),
+    'short_reference': _reference(0.0, 0.3),
+    'poor_reference': _poor_reference,
+    'short': _short,
+    'louder': _louder}
+
+
+def truth(name: str) -> tuple[Case, int, str]:
+    """Return what a case draws, its seed, and the damage, '' for none."""
+    effects, seed, damage = [*name.split(' '), ''][:3]
+    return draw_case(tuple(item for item in effects.split('+') if item != 'none'), int(seed)
+                     ), int(seed), damage
+
+
 def result(name: str) -> Mapping[str, Any]:
-    """Close the loop on a case; return its report without what is new every time."""
-    effects, seed = name.split(' ')
-    case = draw_case(tuple(item for item in effects.split('+') if item != 'none'), int(seed))
-    fields = record(case.machine, case.what, np.random.default_rng([int(seed), 1]))
+    """Close the loop on a case; return its report without what is new every time, or the error."""
+    case, seed, damage = truth(name)
+    machine = case.machine
+    made = Measurement(
+        record(machine, case.what, np.random.default_rng([seed, 1])), declared(machine),
+        pulses(machine, case.what, np.random.default_rng([seed, 1]))[1],
+        np.random.default_rng([seed, 2]))
+    if damage:
+        DAMAGES[damage](made)
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        np.savez(folder / 'machine.npz', **fields)
-        (folder / 'model.yaml').write_text(declared(case.machine))
-        report = close_loop(folder / 'machine.npz', folder / 'model.yaml').report
+        files = [folder / 'machine.npz', folder / 'again.npz'][:1 + bool(made.more)]
+        for file, more in zip(files, ({}, made.more)):
+            np.savez(file, **{**made.fields, **more})
+        (folder / 'model.yaml').write_text(made.text)
+        try:
+            report = close_loop(files, folder / 'model.yaml').report
+        except SaJitterError as error:
+            return {'error': str(error).replace(f'{folder}/', '')}
     return {key: value for key, value in report.items() if key not in _UNLIKE}
 
 

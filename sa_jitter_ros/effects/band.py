@@ -14,6 +14,7 @@ Slow random motions whose spectrum is flat in a band, and what recovered pulse e
 Frequencies are in units of the trigger rate, times in trigger cycles.
 """
 
+import math
 from typing import Any
 
 import numpy as np
@@ -31,9 +32,9 @@ ACCELERATION_BAND = (0.05, 0.2)
 #: Widths of a slow motion's band, over the trigger rate; so low that no average changes in it.
 NARROWEST, WIDEST = 1e-4, 0.5
 
-# Cycles over which a correlation is followed: enough for ten periods of the highest frequency.
-_MEMORY, _LONGEST, _PERIODS = 200, 2000, 10.0
-_RULE = unit_nodes(256)  # enough for the turns of some hundred lags
+# Of the highest frequency, and cycles, over which a correlation is followed at most.
+_PERIODS, _LONGEST = 40.0, 2000
+_RULE = unit_nodes(math.ceil(math.tau * _PERIODS))  # twice as many as so many turns take
 #: Nodes and weights inside a cycle, enough for what turns once in it.
 INSIDE = unit_nodes(20)
 
@@ -61,7 +62,7 @@ def fading(lag: ArrayLike, trigger_cycles: int, band: tuple[float, float]) -> Ar
 
     1 where an average is no longer than the memory, so that they are exact. To cut them off would
     leave power at frequency 0, which no length of an average takes out; to fade them blurs the
-    spectrum by 1/300 of the trigger rate, and less the slower the motion is, down to 1/3000.
+    spectrum by 1/60 of its highest frequency, and by 1/3000 of the trigger rate at least.
     """
     reach = _reach(band)
     if trigger_cycles <= reach:
@@ -70,7 +71,7 @@ def fading(lag: ArrayLike, trigger_cycles: int, band: tuple[float, float]) -> Ar
 
 
 def _reach(band: tuple[float, float]) -> int:
-    return int(np.clip(_PERIODS / band[1], _MEMORY, _LONGEST))
+    return int(min(_PERIODS / band[1], _LONGEST))
 
 
 def flat_band_correlation(lag: ArrayLike, band: tuple[float, float]) -> Array:

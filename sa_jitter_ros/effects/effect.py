@@ -20,11 +20,11 @@ from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any, ClassVar
 
-import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
+from sa_jitter_ros.prediction.amplitudes import scenario_cycles, SCENARIOS
 from sa_jitter_ros.prediction.influence import Influence
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
@@ -39,7 +39,6 @@ ONE_SIDED = -float(special.ndtri(RARE))
 SEEN = 0.25
 #: Logarithm of the odds against an effect before any data: one in 150.
 ODDS = 5.0
-_SCENARIOS, _MOST_ERRORS = 128, 4_000_000  # of an effect; of pulses in all of them
 
 
 @dataclass(frozen=True)
@@ -90,9 +89,9 @@ def largest_power(value: float, count: float, noise: float, square: float, memor
     return max((middle + beyond) / left, SEEN * math.sqrt(2.0 * square / count))
 
 
-def most_scenarios(model: DeclaredModel, wanted: int = _SCENARIOS) -> int:
+def most_scenarios(model: DeclaredModel, wanted: int = SCENARIOS) -> int:
     """Return how many scenarios of a model's averages to list: fewer where averages are long."""
-    return int(np.clip(_MOST_ERRORS // model.trigger_cycles, 1, wanted))
+    return min(wanted, max(1, scenario_cycles(model) // model.trigger_cycles))
 
 
 def require_below(name: str, value: float, limit: float, unit: str, why: str) -> None:

@@ -21,14 +21,11 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 
 Array = NDArray[Any]
 
-#: A clock this much faster than the declared one has no visible effect.
-FINE = 50.0
 #: Relative difference of rates below which two clocks count as one.
 SAME_RATE = 0.01
 #: Of a tick: what errors that a clock makes may be wrong by, and what none is seen below.
 ROOM = 0.02
 _STEPS = 3000
-_FEWEST = 8
 # Ticks that an interval holds at least: with fewer, pulses are no time measurement.
 _COARSEST = 4.0
 
@@ -39,6 +36,10 @@ class Clock:
 
     rate: float
     standard_error: float
+
+    def visible(self, declared: float) -> bool:
+        """Return whether there is one whose tick is not lost in one of the `declared` rate."""
+        return 0.0 < ROOM * self.rate < declared
 
 
 def find_clock(times: Array) -> Clock:
@@ -51,11 +52,9 @@ def find_clock(times: Array) -> Clock:
     none = Clock(0.0, 0.0)
     intervals = np.sort(np.diff(times))
     intervals = intervals[intervals < 1.5 * np.median(intervals)]
-    if intervals.size < _FEWEST:
-        return none
     resolution = rounding(times)
     gaps = np.diff(intervals)
-    steps = gaps[gaps > max(resolution, 1e-3 * float(np.max(gaps)), 1e-12)]
+    steps = gaps[gaps > max(resolution, 1e-3 * float(np.max(gaps, initial=0.0)), 1e-12)]
     if steps.size == 0:
         return none
     tick = float(np.min(steps))

@@ -24,8 +24,6 @@ from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianAngl
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import Covariance, PulseWeights
 
-_MOST_KEPT = 500  # covariances at the same places
-
 
 @dataclass(frozen=True)
 class SpeedFluctuation(Effect):
@@ -98,8 +96,6 @@ def _unit_covariance(weights: PulseWeights, cycles: int, band: tuple[float, floa
     def covariance(u: Array, v: Array, lag: int) -> Array:
         key = u.shape, u.tobytes(), v.shape, v.tobytes(), lag
         if key not in known:
-            if len(known) >= _MOST_KEPT:
-                known.clear()
             later = missed(v) * np.exp(turn * lag) * weight
             known[key] = np.einsum('...f,...f', missed(u).conj(), later).real * fading(
                 lag + v - u, cycles, band)

@@ -24,15 +24,13 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.evidence import SAME_SPEED
-from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
+from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE, FALSE_ALARM
 from sa_jitter_ros.inference.scoring import Bench, Comparison
 from sa_jitter_ros.prediction.influence import mean_period
 from scipy import special
 
 Array = NDArray[Any]
 
-#: A change of the residual with a smaller p value is significant; up to four are tested.
-CERTAIN = 1e-3
 _FREEDOM = 3
 
 
@@ -62,9 +60,9 @@ class Dependence:
 
 
 def moving(found: Sequence[Dependence]) -> Dependence | None:
-    """Return the most significant change, None if none is significant."""
-    certain = [item for item in found if item.p_value < CERTAIN]
-    return min(certain, key=lambda item: item.p_value) if certain else None
+    """Return the most significant of all that are tested, None if none is significant."""
+    most = min(found, key=lambda item: item.p_value, default=None)
+    return most if most and len(found) * most.p_value < FALSE_ALARM else None
 
 
 def dependences(bench: Bench, effects: Sequence[Effect], findings: Sequence[Finding]

@@ -49,8 +49,7 @@ Distribution = AmplitudeDistribution | SampledDistribution
 RESOLUTION = 5e-4
 _NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
-_CALM = 10.0  # rad by which errors turn a wave within a cycle; more than that takes all nodes
-_MOST_KEPT, _MOST_DRAWN = 20_000, 30_000_000  # acquisitions of a few kB each, draws of 8 bytes
+_MOST_KEPT = 40_000_000  # values of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES, _FEWEST_DRAWS = 1_000_000, 1024
 # Speeds closer than this are the same: no amplitude changes by more than 1e-3.
@@ -111,18 +110,24 @@ class Memory:
     def __init__(self) -> None:
         """Begin with nothing."""
         self.shown: dict[tuple[tuple[Influence, ...], int], list[_Shown]] = {}
-        self._drawn = 0
+        self._kept = 0
 
     def make_room(self) -> None:
         """Drop all predictions if there are too many."""
-        if len(self.shown) > _MOST_KEPT or self._drawn > _MOST_DRAWN:
+        if self._kept > _MOST_KEPT:
             self.shown.clear()
-            self._drawn = 0
+            self._kept = 0
+
+    def keep(self, key: tuple[tuple[Influence, ...], int], shown: list[_Shown]) -> None:
+        """Keep what an acquisition shows."""
+        self.shown[key] = shown
+        self._kept += sum(value.size for item in shown for value in vars(item).values()
+                          if isinstance(value, np.ndarray))
 
     def count(self, amplitudes: Amplitudes) -> None:
         """Count the draws that are kept with these amplitudes."""
         if amplitudes.draws is not None:
-            self._drawn += amplitudes.draws.size
+            self._kept += amplitudes.draws.size
 
 
 @dataclass(frozen=True)
@@ -220,9 +225,9 @@ def expect(observation: Observation, lines: Lines, level: Array, effects: Sequen
         setting = _setting(observation, speed, effects)
         found = iter(setting.shown([item for a in some for item in pulses[a]]))
         for a in some:
-            memory.shown[key, a] = [
+            memory.keep((key, a), [
                 _of_lines(observation.acquisitions[a], lines, next(found), group == i, setting)
-                for i, _ in enumerate(pulses[a])]
+                for i, _ in enumerate(pulses[a])])
         for amplitudes in setting.made:
             memory.count(amplitudes)
     shown = _together([[replace(item, index=item.index + n * lines.count)
@@ -396,8 +401,8 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
     path = model.weights.path(e, np.linspace(0.0, 1.0, _PLACES), count)  # (acquisition, cycle, u)
     most = 2.0 * np.pi * sources.max() * np.abs(path - path[..., :1]).max(axis=2)
-    calm = most < _CALM
-    places, gathered = _few_places(u, degree, float(most[calm].max(initial=0.0)))
+    calm = 2 * _few(degree, most) < u.size  # else all nodes take less time
+    places, gathered = _few_places(u, int(_few(degree, most[calm].max(initial=0.0))))
     turn = 2j * np.pi * r
     first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
     first = first * np.exp(turn * sources[:, None] * u)
@@ -416,16 +421,13 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     return table / count
 
 
-def _few_places(u: Array, degree: int, turn: float) -> tuple[Array, Array]:
-    """
-    Return places in a cycle, and the matrix (place, u) of the polynomial through values there.
+def _few(degree: int, turn: Array) -> NDArray[np.int64]:
+    """Return where the Legendre series of waves ends that a polynomial turns by up to `turn`."""
+    return np.asarray(np.ceil(degree * (_PLACES + 2.0 * turn)), np.int64)
 
-    It is exact for waves that a polynomial of some `degree` turns by up to `turn` rad: their
-    Legendre series ends there.
-    """
-    count = math.ceil(degree * (_PLACES + 2.0 * turn))
-    if count >= u.size:
-        return u, np.eye(u.size)
+
+def _few_places(u: Array, count: int) -> tuple[Array, Array]:
+    """Return `count` places in a cycle, and the matrix (place, u) of the polynomial there."""
     places, weights = unit_nodes(count)
     series = legvander(2.0 * places - 1.0, count - 1) * weights[:, None]
     series *= 2.0 * np.arange(count) + 1.0

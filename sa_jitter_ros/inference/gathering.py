@@ -21,11 +21,12 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, FINE, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.record_recovery import doubtful_lines
+from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.prediction.influence import known_errors, Pulses, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
@@ -35,10 +36,7 @@ Array = NDArray[Any]
 #: Of its order's strongest channel, from which on a line is worth comparing.
 STRONG = 0.2
 _COHERENT = 0.9
-_PRECISE = 0.25
-_CERTAIN = 1e-4
 _GROUPS = 3
-_LEAKS = 0.5  # lines of the average between which everything leaks
 
 
 @dataclass(frozen=True)
@@ -100,13 +98,14 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     Return the clock and the known errors of the pulses.
 
     On the grid of a clock, the errors are those of the smoothest motion that it allows; if other
-    channels recover the motion better than to a quarter of a tick, those of the recovered motion.
+    channels recover the motion better than a tick tells it, those of the recovered motion.
     Pulses beside an acquisition that its angle law uses are included.
     """
     model, pulses = observation.model, observation.pulses
     found = find_clock(pulses.times)
     clock = found.rate
-    usable = 0.0 < clock < FINE * model.keyphasor_rate
+    usable = found.visible(model.keyphasor_rate)
+    of_tick = 1.0 / math.sqrt(12.0) / clock if usable else 0.0
     grid = _Grid(clock, smooth_on_grid(pulses.times, clock)) if usable else None
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
     if usable and group.max() > 0:
@@ -128,7 +127,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
         rows = []
         for motion, uncertain in zip(again, error_std):
             errors, std, unknown = smooth, 0.0, missed
-            precise = item.recovered and item.standard_errors.mean() * clock < _PRECISE
+            precise = item.recovered and item.standard_errors.mean() < of_tick
             if smooth is not None and motion is not None and precise and np.all(
                     np.isfinite(motion[a])):
                 errors, std, unknown = smooth.copy(), uncertain, (0.0, 0.0)
@@ -257,8 +256,8 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     apart = frequency[chosen, None] - observation.orders[order] * model.fundamental_frequency
     level = np.abs(amplitudes[:, :fit.declared]).max(axis=1)
     size = np.max(np.abs(amplitudes[:, chosen]) / level[:, None], axis=0)
-    # beyond half a line of the average all are taken to leak as the sides of a sinc do
-    leak = 1.0 / np.maximum(np.abs(apart) * model.duration, _LEAKS).min(axis=1)
+    # all, unless they stand on it, are taken to leak as the sides of a sinc do
+    leak = 1.0 / np.maximum(np.pi * np.abs(apart) * model.duration, 1.0).min(axis=1)
     best = int(chosen[np.argmax(size * leak)])
     channel = int(np.argmax(np.abs(amplitudes[:, best]) / fit.amplitude_errors[:, best]))
     amplitude = float(np.abs(amplitudes[channel, best]))
@@ -360,7 +359,7 @@ def _unskewed(items: Sequence[Acquisition], motion: Array, grid: _Grid) -> Array
     if slopes.size < 4:
         return motion
     certainty = abs(slopes.mean()) / (slopes.std(ddof=1) / np.sqrt(slopes.size))
-    if 2.0 * special.stdtr(slopes.size - 1, -certainty) > _CERTAIN:
+    if 2.0 * special.stdtr(slopes.size - 1, -certainty) > FALSE_ALARM:
         return motion
     runs, slope = _runs(items, motion), _slope(_runs(items, left))
     longest = max(float(np.ptp(time)) for time, _ in runs)

@@ -50,9 +50,7 @@ _MOST_SAMPLES = 200_000_000
 #: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
 CHANCE = 4
 _OTHER_MACHINE = 5.0
-# Acquisitions that test a reference keyphasor, largest noise over amplitude of the lines for it,
-# and largest loss of amplitude.
-_TRIED, _CLEAR, _LOSS = 4, 0.02, 0.03
+_LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
 _FULL_BAND = 0.45  # of the sample rate
 # A ripple with more than this many times the power of its noise is corrected.
 _RIPPLE = 3.0
@@ -193,15 +191,19 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             + ''.join(f' ({remark})' for remark in pulses.remarks))
     recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses, model)
     orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
-    if pulses.reference is not None and (reason := _fails_as_reference(
-            reader, pulses, recovery, model, starts, np.array(once))):
-        pulses = replace(pulses, reference=None, remarks=(
-            *pulses.remarks, f'reference_pulse_times are not used: {reason}'))
-    found = []
+    bare = replace(pulses, reference=None)
+    found, referenced = [], []
     for count, first in enumerate(starts):
-        found.append(_acquire(reader, pulses, recovery, model, first, orders))
+        found.append(_acquire(reader, bare, recovery, model, first, orders))
+        if pulses.reference is not None:
+            referenced.append(_acquire(reader, pulses, recovery, model, first, orders))
         if progress is not None:
             progress((count + 1) / len(starts))
+    if referenced:
+        reason = _fails_as_reference(referenced, found, len(once))
+        pulses = replace(bare, remarks=(
+            *bare.remarks, f'reference_pulse_times are not used: {reason}')) if reason else pulses
+        found = found if reason else referenced
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, declared_speed,
@@ -287,21 +289,23 @@ def _starts(pulses: RecordPulses, cycles: int, reader: CycleReader, law: AngleLa
     return found
 
 
-def _fails_as_reference(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery,
-                        model: DeclaredModel, starts: Sequence[int], orders: FloatArray) -> str:
-    """Return why amplitudes with the reference keyphasor are too small, '' where they are not."""
-    bare = replace(pulses, reference=None)
+def _fails_as_reference(referenced: Sequence[Acquisition], bare: Sequence[Acquisition],
+                        orders: int) -> str:
+    """
+    Return why amplitudes with the reference keyphasor are too small, '' where they are not.
+
+    The acquisitions are those with the reference keyphasor and without it, of which so many
+    declared `orders` are compared.
+    """
     kept, gained = [], []
-    for first in starts[::max(1, len(starts) // _TRIED)][:_TRIED]:
-        item = _acquire(reader, pulses, recovery, model, first, orders)
-        other = _acquire(reader, bare, recovery, model, first, orders)
+    for item, other in zip(referenced, bare):
         with np.errstate(divide='ignore', invalid='ignore'):
             best = other if other.recovered else item
-            clear = best.noise < _CLEAR * np.abs(best.corrected)
-            gained.append(np.where(clear, item.attenuation, np.nan))
+            clear = (best.noise < _LOSS * np.abs(best.corrected))[:, :orders]
+            gained.append(np.where(clear, item.attenuation[:, :orders], np.nan))
             if other.recovered:
-                kept.append(np.where(clear, np.abs(item.corrected) / np.abs(other.corrected),
-                                     np.nan))
+                kept.append(np.where(clear, (np.abs(item.corrected) / np.abs(other.corrected)
+                                             )[:, :orders], np.nan))
     gain = np.median(gained, axis=0)
     if np.any(gain > 1.0 + _LOSS):
         return ('they give less amplitude than pulse_times (raw over reference amplitude '

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, FINE, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, Observation
@@ -153,7 +153,7 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
     times = observation.pulses.times
     items = observation.acquisitions
     clock = find_clock(times)
-    if not 0.0 < clock.rate < FINE * observation.model.keyphasor_rate:
+    if not clock.visible(observation.model.keyphasor_rate):
         return Clock(0.0, 0.0), [
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     smooth = smooth_on_grid(times, clock.rate)

@@ -32,9 +32,8 @@ _MOST_SPURIOUS = 0.05  # fraction of the pulses
 _MOST_DROPPED = 0.5  # pulses of which most are dropped are those of no shaft
 _FEWEST = 3  # pulses
 _SAME_RATIO = 1e-5  # relative; users give six digits
-# Pulses used to align two keyphasors, and the fraction of the pulses that the reference must have.
-_ALIGNED, _COVERED = 15, 0.5
-_LONGEST_GAP = 1_000_000  # pulses
+_USUAL = 15  # pulses before a gap that tell how many it hides
+_COVERED = 0.5  # of the pulses, by those of a reference keyphasor
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise RecordingError(f'{measured.size} keyphasor pulses, at least {_FEWEST} are needed: '
                              'check that the tach waveform crosses its threshold')
     pulses, counts = _validated(
-        measured, model.pulses_per_revolution, recording.missing_teeth)
+        measured, model.pulses_per_revolution, recording.duration, recording.missing_teeth)
     spurious = counts.doubles + counts.early
     if spurious > _MOST_SPURIOUS * measured.size:
         raise RecordingError(f'{spurious} of {measured.size} pulses are spurious, more than '
@@ -142,7 +141,7 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
                          'pulses_per_revolution of this recording')
     reference = None
     if recording.reference_pulse_times is not None:
-        better, _ = _validated(recording.reference_pulse_times, 1)
+        better, _ = _validated(recording.reference_pulse_times, 1, recording.duration)
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
         reference = _matched(found, better.every(1), step if longer**2 < step else 1)
@@ -175,9 +174,13 @@ class _Accepted:
             np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1])
 
 
-def _validated(times: FloatArray, marks: int, missing_teeth: int = 0
+def _validated(times: FloatArray, marks: int, longest: float, missing_teeth: int = 0
                ) -> tuple[_Accepted, PulseCounts]:
-    """Return the accepted pulses of a target of so many marks, and the counts of all pulses."""
+    """
+    Return the accepted pulses of a target of so many marks, and the counts of all pulses.
+
+    A gap that is `longest` (s) has no vibration behind it, so that pulses need no number there.
+    """
     # Every pulse is a trigger here, so that pulses are counted also where a run is interrupted.
     validator = PulseValidator(
         pulses_per_revolution=marks, pulses_per_trigger=1, missing_teeth=missing_teeth,
@@ -185,9 +188,9 @@ def _validated(times: FloatArray, marks: int, missing_teeth: int = 0
     found = TriggerPulses.joined([validator.update(times), validator.flush()])
     number = found.count.copy()
     for begin in np.flatnonzero(np.diff(number) <= 0) + 1:  # after a gap of unknown length
-        usual = float(np.median(np.diff(found.times[max(begin - _ALIGNED, 0):begin])))
+        usual = float(np.median(np.diff(found.times[max(begin - _USUAL, 0):begin])))
         gap = float(found.times[begin] - found.times[begin - 1])
-        number[begin:] += number[begin - 1] + int(np.clip(round(gap / usual), 1, _LONGEST_GAP)
+        number[begin:] += number[begin - 1] + max(round(min(gap, longest) / usual), 1
                                                   ) - number[begin]
     # Of a double and the pulse before it, either may be the true one. One of the last two pulses
     # before an interruption may be its cause.
@@ -199,9 +202,11 @@ def _validated(times: FloatArray, marks: int, missing_teeth: int = 0
 
 def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArray:
     """Return the reference time of every trigger pulse (m,), NaN where there is none."""
-    some = pulses.times[:_ALIGNED]
-    nearest = np.argmin(np.abs(better.times[:, None] - some), axis=0)
-    shift = int(np.median(better.number[nearest] - step * pulses.number[:some.size]))
+    middle = 0.5 * (better.times[1:] + better.times[:-1])
+    nearest = np.searchsorted(middle, pulses.times)
+    ahead = better.number[nearest] - step * pulses.number
+    beside = (pulses.times >= better.times[0]) & (pulses.times <= better.times[-1])
+    shift = int(np.median(ahead[beside])) if beside.any() else 0
     wanted = shift + step * np.arange(pulses.bridged.size)
     known = better.bridged.copy()
     known[better.number[better.doubtful]] = np.nan

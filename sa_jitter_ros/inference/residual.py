@@ -32,7 +32,9 @@ ACCURACY = 3e-3
 ACCURACY_OF_CHANGE = 1e-3
 #: Chance of one kind of false alarm: that something is left where the model is right.
 FALSE_ALARM = 0.005
-_DRAWS, _SEED = 4000, 17
+#: Draws that stand for a distribution: 20 of them are beyond what `FALSE_ALARM` lets pass.
+DRAWS = 4000
+_SEED = 17
 _NAN = float('nan')
 
 
@@ -189,17 +191,17 @@ def _mean_p_value(z: Array, scale: Array, sensitivities: Sequence[Array]) -> flo
     size = np.sqrt(np.sum(centred**2, axis=0) / max(count - 1, 1))
     centred = centred / np.where(size > 0.0, size, 1.0)
     rng = np.random.default_rng(_SEED)
-    draws = rng.standard_normal((_DRAWS, count)) @ centred / np.sqrt(max(count - 1, 1)) / np.sqrt(
+    draws = rng.standard_normal((DRAWS, count)) @ centred / np.sqrt(max(count - 1, 1)) / np.sqrt(
         count)
     for item in bias:
-        draws = draws + rng.standard_normal((_DRAWS, 1)) * item
+        draws = draws + rng.standard_normal((DRAWS, 1)) * item
     null = np.mean((draws / total) ** 2, axis=1)
     below = float(np.mean(null >= statistic))
-    if below > 20.0 / _DRAWS:
+    if below > 20.0 / DRAWS:
         return below
     # The tail beyond the draws is that of a scaled chi-squared variable of the same moments.
     freedom = 2.0 * null.mean() ** 2 / null.var()
-    return float(min(max(below, 1.0 / _DRAWS),
+    return float(min(max(below, 1.0 / DRAWS),
                      special.chdtrc(freedom, statistic * freedom / null.mean())))
 
 

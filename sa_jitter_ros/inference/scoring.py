@@ -28,15 +28,15 @@ from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
 from sa_jitter_ros.inference.gathering import gather
 from sa_jitter_ros.inference.observation import Observation
-from sa_jitter_ros.inference.residual import Residual, residual, Sensitivity
+from sa_jitter_ros.inference.residual import FALSE_ALARM, Residual, residual, Sensitivity
 from sa_jitter_ros.prediction.influence import Pulses
+from scipy import special
 
 Array = NDArray[Any]
 
 #: Relative scatter of an amplitude from average to average that steady machines were measured to
 #: have and that no effect describes (docs/measured_cases.md).
 STEADY = 0.02
-_CHANCE = 3.0
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
@@ -163,8 +163,8 @@ class Bench:
         amplitude = np.abs(self.observation.stacked('corrected')[..., :orders])
         power = np.mean((self.lines.of(amplitude) / self.level - 1.0) ** 2, axis=0)
         known = self._corrected_variance(effects)
-        chance = _CHANCE * np.sqrt(2.0 / len(amplitude))
-        if np.mean(power / known) < 1.0 + chance:
+        count = len(amplitude)
+        if special.chdtrc(count, count * np.mean(power / known)) > FALSE_ALARM:
             return 0.0
         beyond = np.average(np.minimum(power - known, STEADY**2),
                             weights=(known + STEADY**2) ** -2.0)

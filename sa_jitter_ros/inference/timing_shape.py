@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.inference.residual import DRAWS
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
@@ -33,7 +34,7 @@ Array = NDArray[Any]
 EDGE = 3  # pulses at either end of a stretch that filters do not reach
 _CLEAR = 0.2  # of the declared jitter: noise of the recovery that leaves a distribution to see
 _STRAY = 0.02  # share of errors that may be anything
-_DRAWN, _SEED, _PARTS = 4000, 11, 50
+_SEED, _PARTS = 11, 50
 
 
 def through(values: Array, gain: Array, data: TimingData) -> Array:
@@ -61,7 +62,7 @@ class Shapes:
     """
 
     def __init__(self, distribution: PulseErrorDistribution) -> None:
-        draws = np.asarray(distribution.draw(np.random.default_rng(_SEED), (_DRAWN,)))
+        draws = np.asarray(distribution.draw(np.random.default_rng(_SEED), (DRAWS,)))
         draws = (draws - draws.mean()) / draws.std()
         self.kurtosis = float(np.mean(draws**4)) - 3.0
         self.edges = np.quantile(draws, np.linspace(0.0, 1.0, _PARTS + 1))

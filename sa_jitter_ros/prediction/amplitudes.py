@@ -49,7 +49,9 @@ _FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
 _FEW_CYCLES_OF_SCENARIOS = 20
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
-_SCENARIOS, _SEED = 256, 11  # scenarios of several influences together; of which combinations
+#: Scenarios of an influence, and of several together.
+SCENARIOS = 256
+_SEED = 11  # of which combinations
 _DRAWS, _FEWEST = 8192, 64  # evenly spread values in all scenarios, in one
 _SCENARIO_NODES = 32  # as `scenario_moments` takes at most
 _WORK = 20_000_000_000  # multiplications of phasors, about a second
@@ -320,8 +322,8 @@ def _combined(known: Sequence[Array]) -> Array:
     total = known[0]
     for more in known[1:]:
         total = (total[:, None, :] + more[None, :, :]).reshape(-1, total.shape[1])
-        if len(total) > _SCENARIOS:
-            rows = np.random.default_rng(_SEED).permutation(len(total))[:_SCENARIOS]
+        if len(total) > SCENARIOS:
+            rows = np.random.default_rng(_SEED).permutation(len(total))[:SCENARIOS]
             total = total[np.sort(rows)]
     return total
 
@@ -329,12 +331,17 @@ def _combined(known: Sequence[Array]) -> Array:
 def _affordable(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array
                 ) -> Array:
     """Return as many scenarios as take about a second, at least one; raise ModelError for none."""
-    pairs = 2 * _SCENARIO_NODES * (correlation_length(processes) + 1)
-    each = len(model.orders) * _SCENARIO_NODES * (25 + pairs)
-    if each * model.trigger_cycles > _WORK:
+    cycles = scenario_cycles(model, processes)
+    if cycles < model.trigger_cycles:
         raise ModelError(
             f'trigger_cycles is {model.trigger_cycles} with {len(model.orders)} orders: with '
-            f'known pulse errors at most {_WORK // each} cycles are worth their time; predict '
+            f'known pulse errors at most {cycles} cycles are worth their time; predict '
             'fewer cycles or fewer orders')
-    kept = min(len(errors), max(1, _WORK // (each * model.trigger_cycles)))
+    kept = min(len(errors), cycles // model.trigger_cycles)
     return errors[np.arange(kept) * len(errors) // kept]
+
+
+def scenario_cycles(model: DeclaredModel, processes: Sequence[AngleErrorProcess] = ()) -> int:
+    """Return how many cycles, of all scenarios of a model together, take about a second."""
+    pairs = 2 * _SCENARIO_NODES * (correlation_length(processes) + 1)
+    return _WORK // (len(model.orders) * _SCENARIO_NODES * (25 + pairs))
