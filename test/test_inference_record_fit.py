@@ -106,7 +106,7 @@ def test_errors_are_hardly_shrunk_however_little_shows_of_them(rng, size):
 def coloured(noise, power):
     """Return noise (sample, 1) whose power grows with a power of the frequency, as strong."""
     waves = np.fft.rfft(noise, axis=0)
-    waves *= np.arange(len(waves))[:, None] ** (0.5 * power)
+    waves *= np.maximum(np.arange(len(waves)), 1.0)[:, None] ** (0.5 * power)
     found = np.fft.irfft(waves, len(noise), axis=0)
     return found * np.std(noise) / np.std(found)
 

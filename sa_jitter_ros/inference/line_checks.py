@@ -91,7 +91,7 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
         np.mean(lines.of(observation.stacked('noise')[..., :orders]) ** 2, axis=0),
         0.5 * variance[lines.order]))
     order = observation.orders[lines.order]
-    number = observation.pulses.number[[item.first for item in observation.acquisitions]]
+    run, number = _runs(observation)
     turned = amplitude * np.exp(
         -2j * np.pi * observation.model.cycle_length * np.outer(number, order))
     # late pulses are ahead by an angle that follows the speed of their acquisition
@@ -99,16 +99,37 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
                                             * observation.model.cycle_length, order))
     weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
     # all lines of an acquisition may be late by one time
-    late = np.angle(turned / turned.mean(axis=0)) / order @ (weight / weight.sum())
+    late = np.angle(turned / (run @ turned)) / order @ (weight / weight.sum())
     turned = turned * np.exp(-1j * np.outer(late, order))
-    mean = turned.mean(axis=0)
-    ratio, noise = turned / mean, noise / np.abs(mean)
+    mean = run @ turned
+    size = np.abs(mean).mean(axis=0)
+    ratio, noise = turned * np.abs(mean) / mean / size, noise / size
     # the angle of a speed that rises bends, which makes orders leak into those beside them
     rises = _accelerations(observation)
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
-    return (_turns(ratio, noise, order), *_follows(observation, np.abs(ratio), noise),
+    return (_turns(ratio, noise, order, len(run) - round(float(np.trace(run)))), *_follows(observation, np.abs(ratio), noise),
             *_beside_errors(observation, lines, noise))
+
+
+def _runs(observation: Observation) -> tuple[Array, Array]:
+    """
+    Return what takes the mean over the run of each acquisition (acquisition, acquisition).
+
+    A run is an unbroken stretch of a recording: how many cycles lie between two is not known. The
+    first trigger pulse of each acquisition has a number (acquisition,).
+    """
+    runs, numbers, recording, before = [], [], 0, -1
+    for item in observation.acquisitions:
+        recording += item.first <= before
+        before = item.first
+        recovery = observation.recoveries[recording]
+        number = int(recovery.number[item.first])
+        runs.append((recording, next((part.start for part in recovery.stretches
+                                      if part.start <= number < part.stop), -1)))
+        numbers.append(number)
+    same = np.array([[one == other for other in runs] for one in runs], float)
+    return same / same.sum(axis=1, keepdims=True), np.array(numbers)
 
 
 def _periods(observation: Observation) -> Array:
@@ -137,9 +158,9 @@ def _errors(observation: Observation) -> Iterator[Array]:
         yield observation.recoveries[number].errors[item.first:item.first + item.times.size]
 
 
-def _turns(ratio: Array, noise: Array, order: Array) -> Check:
-    """Test whether a line turns by itself."""
-    freedom = len(ratio) - 2  # of mean and acceleration
+def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
+    """Test whether a line turns by itself, by `freedom` acquisitions beyond the means of runs."""
+    freedom = max(freedom - 1, 1)  # of the acceleration
     power = np.sum(ratio.imag**2, axis=0) / freedom
     own = np.sqrt(np.maximum(power - noise**2, 0.0))
     chance = special.chdtrc(freedom, freedom * power / (noise**2 + _TURN**2))

@@ -101,7 +101,7 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
 def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid in a direction stands out; `inverse` is as in `_power`."""
     data = fit.data
-    frequency = np.sort(np.concatenate([np.arange(1, n // 2 + 1) / n for n in data.lengths]))
+    frequency = data.each
     tried = frequency > _SLOWEST / data.longest
     inverse = inverse[data.bin]
     wave = np.einsum('fij,fj->fi', data.passed, steering(direction, data.frequency, data.frequency)

@@ -19,7 +19,7 @@ bins of frequency, are what the likelihood is made of; a taper at both ends of e
 the motion of the shaft from leaking.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,8 +73,8 @@ class TimingData:
     `frequency` (bin,) are the middles of bins of `size` ordinates; `alias` (alias, bin) the
     frequencies that fall on them; `steer` the cross-spectra (alias, bin, 3, 3) of unit errors in
     each direction; `passed` (bin, 3, 4) is what the recovery makes of them, `noise` (bin, 3, 3)
-    what it adds. `ordinates` (ordinate, 3) are the
-    transforms.
+    what it adds. `ordinates` (ordinate, 3) are the transforms at the frequencies `each`, and what
+    sets stretches apart between which some cycles are left out.
     """
 
     def __init__(self, stretches: Sequence[Stretch]) -> None:
@@ -84,12 +84,14 @@ class TimingData:
         self.longest = max(self.lengths)
         self.cycles = sum(self.lengths)
         self.measured = float(np.mean(np.concatenate([item.measured for item in self.stretches])))
-        frequency = np.concatenate([_frequencies(n) for n in self.lengths])
+        self._apart = _apart(self.stretches)
+        frequency = np.concatenate([list(self._apart.values()), *map(_frequencies, self.lengths)])
         self._sorted = np.argsort(frequency, kind='stable')
-        frequency = frequency[self._sorted]
-        weight = np.concatenate([np.where(_frequencies(n) == 0.5, 0.5, 1.0) * _effective(n)
-                                 for n in self.lengths])[self._sorted]
-        edges = _edges(frequency.size, len(self.lengths))
+        self.each = frequency = frequency[self._sorted]
+        weight = np.concatenate([[0.5] * len(self._apart), *(
+            np.where(_frequencies(n) == 0.5, 0.5, 1.0) * _effective(n)
+            for n in self.lengths)])[self._sorted]
+        edges = _edges(frequency.size, len(self.lengths), len(self._apart))
         self.edges, self.weight = edges, weight
         self.size = np.add.reduceat(weight, edges[:-1])
         self.frequency = np.add.reduceat(weight * frequency, edges[:-1]) / self.size
@@ -161,14 +163,18 @@ class TimingData:
 
     def transform(self, series: Sequence[Array]) -> Array:
         """Return the ordinates (ordinate, 3) of a series (pulse - 2, 3) of every stretch."""
-        rows = []
+        rows, means = [], []
         for item in series:
             window = taper(len(item))
-            item = (item - np.average(item, axis=0, weights=window)) * window[:, None]
-            item = item[:, :self.series]
+            means.append(np.average(item[:, :self.series], axis=0, weights=window))
+            item = (item[:, :self.series] - means[-1]) * window[:, None]
             rows.append(np.fft.rfft(item, axis=0)[1:len(item) // 2 + 1] / np.sqrt(
                 np.sum(window**2)))
-        return np.asarray(np.concatenate(rows)[self._sorted])
+        spread = [np.sum(taper(n)**2) / np.sum(taper(n))**2 for n in self.lengths]
+        apart = [(means[i + 1] - means[i]) / np.sqrt(spread[i] + spread[i + 1])
+                 for i in self._apart]
+        return np.asarray(np.concatenate([np.reshape(apart, (-1, self.series)), *rows]
+                                         )[self._sorted])
 
     def of_errors(self, errors: Sequence[Array], *, in_times: bool = True) -> Array:
         """Return the ordinates that errors (pulse,) of the pulses, in units, make."""
@@ -240,9 +246,27 @@ def _effective(count: int) -> float:
     return float(np.sum(window**2) ** 2 / np.sum(window**4) / count)
 
 
-def _edges(count: int, stretches: int) -> Array:
-    """Return the edges of bins of ordinates: single frequencies first, then wider ones."""
-    edges = [0]
+def _apart(stretches: Sequence[Stretch]) -> Mapping[int, float]:
+    """
+    Return which stretches go on behind a gap, and the frequency of what sets the two apart.
+
+    Vibration that was fitted as a whole shows by how much more the pulses err behind the gap.
+    """
+    found = {}
+    for i, (one, other) in enumerate(zip(stretches[:-1], stretches[1:])):
+        same = one.setting.fitted.size and np.array_equal(one.setting.fitted, other.setting.fitted)
+        if same and one.held and not one.referenced:
+            found[i] = 0.5 / float(other.setting.index.mean() - one.setting.index.mean())
+    return found
+
+
+def _edges(count: int, stretches: int, apart: int) -> Array:
+    """
+    Return the edges of bins of ordinates: single frequencies first, then wider ones.
+
+    Those between stretches that are set `apart` have the first bin.
+    """
+    edges = [0, apart] if apart else [0]
     while edges[-1] < count:
         width = min(edges[-1] // _SHARP, count // _BINS) // stretches
         edges.append(min(edges[-1] + max(1, width) * stretches, count))
