@@ -162,7 +162,7 @@ def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
     return Evidence(
         model=model, pulses=tuple(own), errors=np.array(errors),
         standard_errors=standard_errors, ripple=np.array([item.ripple for item in items]),
-        record_times=observation.pulses.times, record_missing=observation.pulses.missing,
+        record_times=observation.pulses.times, record_missing=observation.pulses.lost,
         clock=clock, explained=tuple(effects),
         lines=replace(scatter, radial=scatter.radial[list(usable)],
                       noise_density=scatter.noise_density[list(usable)]))
@@ -175,7 +175,7 @@ def pulse_evidence(observation: Observation) -> Evidence:
     return Evidence(
         model=observation.model, pulses=(), errors=nothing, standard_errors=nothing,
         ripple=nothing, record_times=observation.pulses.times,
-        record_missing=observation.pulses.missing, clock=Clock(0.0, 0.0),
+        record_missing=observation.pulses.lost, clock=Clock(0.0, 0.0),
         lines=LineEvidence(none, none, none, nothing, no_cycles, none))
 
 

@@ -101,8 +101,9 @@ class RecordFit:
     imaginary parts. `turning` (order,) tells which orders certainly turn with the shaft: the speed
     varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s)
     is the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
-    bends that the fit expected, towards 0. Declared lines that stand out of the noise have `held`
-    the angle to the pulses: others go along with any drift.
+    bends that the fit expected, towards 0, the errors towards a line that grows by `trend` s in a
+    second. Declared lines that stand out of the noise have `held` the angle to the pulses: others
+    go along with any drift.
     """
 
     errors: Array
@@ -119,6 +120,7 @@ class RecordFit:
     turning: BoolArray
     jitter_std: float
     expected_std: Array
+    trend: float
     held: bool
 
 
@@ -161,13 +163,17 @@ class OpenRecord:
 
     def __init__(self, samples: Array, sample_rate: float, start_time: float, times: Array, *,
                  measured: BoolArray, cycle_length: float, orders: Sequence[float],
-                 jitter_std: float, top: float) -> None:
-        """Read the band that ends at order `top`; the others are those of `fit_record`."""
+                 jitter_std: float, top: float, trend: float = 0.0) -> None:
+        """
+        Read the band that ends at order `top`; the others are those of `fit_record`.
+
+        The errors are expected to grow by `trend` s in a second, as elsewhere in the recording.
+        """
         band, rate = _low_passed(
             samples, sample_rate, top * cycle_length / float(np.diff(times).mean()))
         self._begin = _States(band, rate, start_time, times, measured, cycle_length,
                               np.array(orders), top, jitter_std)
-        self._begin.follow_trend()
+        self._begin.follow_trend(trend)
 
     def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
         """Fit the stretch, as `fit_record`."""
@@ -583,11 +589,12 @@ class _States:
 
     # --- lines ---
 
-    def follow_trend(self) -> None:
+    def follow_trend(self, expected: float) -> None:
         """
         Start from the slope of the errors that keeps the declared lines together.
 
-        A clock that is fast or slow, or a wrong ratio, makes it.
+        A clock that is fast or slow, or a wrong ratio, makes it. It is the `expected` one where
+        no other is clearly better.
         """
         span = self.cycle_length * self.transformed
         flat = self.vibration[:, :self.transformed].reshape(len(self.vibration), -1)
@@ -601,16 +608,17 @@ class _States:
             g * (1.0 + slope) * span, np.arange(power.size), power)) for g in self.orders],
             axis=0)
         best = slope[np.argmax(score)]
+        before = score[np.argmin(np.abs(slope - expected))]
         ratio = sum(item * np.log(2.0) / _medians(item, max(int(span / 2), _SKIRT))
                     for item in spectrum.T)
         places = np.rint(self.orders * (1.0 + best) * span).astype(int)
         chance = gammaincc(spectrum.shape[1], ratio[places])
-        if (score.max() - score[most] > _SLOPE_GAIN * self.declared
-                and abs(best) > 1.5 * step
-                and np.mean(chance < _FALSE / slope.size) > _SLOPE_LINES):
-            self.trend = float(best)
-            self.states[:, 0] = best * self.ramp
-            self._read()
+        clear = (score.max() - before > _SLOPE_GAIN * self.declared
+                 and abs(best - expected) > 1.5 * step
+                 and np.mean(chance < _FALSE / slope.size) > _SLOPE_LINES)
+        self.trend = float(best) if clear else expected
+        self.states[:, 0] = self.trend * self.ramp
+        self._read()
 
     def new_lines(self) -> tuple[list[float], list[float]]:
         """Return orders, and tones in Hz, that stand out of the residual; some if too many do."""
@@ -747,7 +755,7 @@ class _States:
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
             self.amplitudes[:, self.orders.size:],
             np.sqrt(variances), self._families(self._turning()),
-            float(self.size[0]), self.size[:3] * np.array([weak, 1.0, 1.0]),
+            float(self.size[0]), self.size[:3] * np.array([weak, 1.0, 1.0]), self.trend,
             bool(gammaincc(shown.size, 0.5 * shown.sum()) < _FALSE / self.slopes))
 
     def _roughness(self) -> float:

@@ -68,6 +68,11 @@ class RecordPulses:
         """Return the number of trigger cycles from the first pulse to each pulse (n,)."""
         return numbered(self.missing)
 
+    @property
+    def lost(self) -> IntArray:
+        """Return the number of missing pulses in each interval that does not end a run."""
+        return self.missing[~self.starts_run[1:]]
+
     def broken_at(self, gaps: BoolArray, start_time: float, rate: float, reach: int
                   ) -> 'RecordPulses':
         """

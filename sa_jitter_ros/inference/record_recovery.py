@@ -128,20 +128,22 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     nothing, standard errors are as large as the errors expected, or NaN.
     """
     @lru_cache(maxsize=1)
-    def opened(i: int, top: float) -> OpenRecord | None:
-        return _opened(samples, start_time, rate, pulses, stretches[i], model, top)
+    def opened(i: int, top: float, trend: float) -> OpenRecord | None:
+        return _opened(samples, start_time, rate, pulses, stretches[i], model, top, trend)
 
     def ends(wider: float) -> list[float]:
         return [band_end(pulses.bridged[item], rate, model.cycle_length, model.orders, wider)
                 for item in stretches]
 
     def fits(lines: tuple[FloatArray, FloatArray] | None, wider: float) -> list[RecordFit | None]:
-        top = ends(wider)
+        top, trend = ends(wider), 0.0
         found: list[RecordFit | None] = [None] * len(stretches)
         for i in sorted(range(len(stretches)), key=lambda i: stretches[i].start
                         - stretches[i].stop):
             found[i] = fit = _fitted(
-                opened(i, top[i]), pulses.bridged[stretches[i]], model, lines)
+                opened(i, top[i], trend), pulses.bridged[stretches[i]], model, lines)
+            if fit is not None and fit.held:
+                trend = trend or fit.trend
             if lines is None and fit is not None:
                 lines = fit.orders[len(model.orders):], fit.tones
         return found
@@ -181,8 +183,12 @@ def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> l
 
 
 def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordPulses,
-            stretch: slice, model: DeclaredModel, top: float) -> OpenRecord | None:
-    """Return a stretch of the live channels up to order `top`; None where none is alive."""
+            stretch: slice, model: DeclaredModel, top: float, trend: float) -> OpenRecord | None:
+    """
+    Return a stretch of the live channels up to order `top`; None where none is alive.
+
+    Its errors are expected to grow by `trend` s in a second.
+    """
     times = pulses.bridged[stretch]
     measured = np.zeros(pulses.bridged.size, np.bool_)
     measured[pulses.number[~pulses.doubtful]] = True
@@ -196,7 +202,7 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     return OpenRecord(
         part, rate, start_time + first / rate, times,
         measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top)
+        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top, trend=trend)
 
 
 def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,
