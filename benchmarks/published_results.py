@@ -53,7 +53,8 @@ CASES = (
     'none 1009 louder', 'none 1009 short_reference', 'none 1009 late_reference',
     'none 1009 poor_reference', 'additive_noise 1007 fast_at_times', 'clock_skew 1000 short',
     'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock',
-    'none 52619 two_clocks', 'none 1009 swaying')
+    'none 52619 two_clocks', 'none 1009 swaying', 'none 1009 interrupted',
+    'clock_skew 1000 interrupted', 'none 1009 slow_clock', 'two_paths 56002')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}
@@ -112,6 +113,16 @@ def _swaying(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float6
     return times + size * np.sin(2.0 * np.pi * 11.3 * (times - times[0]) / np.ptp(times))
 
 
+def _interrupted(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times without a sixth of them in a row."""
+    return np.delete(times, slice(times.size // 3, times.size // 2))
+
+
+def _slow_clock(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times of a clock that is slow by 2e-5, too little to change an average."""
+    return times + 2e-5 * (times - times[0])
+
+
 def _coarse_clock(made: Measurement) -> float:
     """Let a clock of 17.5 ticks an interval time the pulses, and declare it; return its rate."""
     rate = 17.5 / made.interval
@@ -167,6 +178,8 @@ DAMAGES: Mapping[str, Callable[[Measurement], Any]] = {
     'no_shaft': _replace_pulses(_of_no_shaft),
     'two_pulses': _replace_pulses(lambda times, made: times[[0, -1]]),
     'swaying': _replace_pulses(_swaying),
+    'interrupted': _replace_pulses(_interrupted),
+    'slow_clock': _replace_pulses(_slow_clock),
     'coarse_clock': _coarse_clock,
     'two_clocks': _two_clocks,
     'late_reference': _reference(0.1, 1.0),
