@@ -330,7 +330,8 @@ def test_turbine_whose_lines_come_and_go_has_no_limit_of_what_they_do_not_hold(
     assert upper['clock_skew'] is None or upper['clock_skew'] > skew
     if day == 20130405:
         # what the lines scatter by shows all the same
-        assert upper['additive_noise'] > 0.0 and upper['amplitude_modulation'] > 0.0
+        assert upper['additive_noise'] > 0.0
+        assert upper['amplitude_modulation'] > 0.0
 
 
 @pytest.mark.machines

@@ -126,7 +126,7 @@ def test_noise_counts_as_it_is_at_the_lines(rng, power, noise):
 @pytest.mark.parametrize('slope', [0.0, 3e-4, -9e-4])
 @pytest.mark.parametrize('noise', [2.0, 8.0])
 def test_a_trend_shows_where_no_single_error_does(rng, noise, slope):
-    """Errors of a few us that the vibration shows to 100 us and more: a clock is told from them."""
+    """A clock is told from errors of 1 us of which the vibration shows each to 20 us or more."""
     samples, times, _ = steady(rng, count=200, noise=noise)
     times = times + slope * times
     found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),

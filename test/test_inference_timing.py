@@ -12,6 +12,8 @@
 
 from dataclasses import replace
 
+from dataclasses import replace
+
 from limit_coverage import limit_of, lines, machine, MODEL, recovered_source, UNIT
 import numpy as np
 import pytest
@@ -73,6 +75,53 @@ def test_parameters_that_fit_more_pulses_are_surer():
     value, error = value_of(again, 'clock_skew', 'skew')
     assert error == pytest.approx(value_of(timing, 'clock_skew', 'skew')[1] / np.sqrt(2.0), rel=.1)
     assert abs(value - 2e-5) < 4.0 * error
+
+
+def without_the_middle(stretch):
+    """Return what is left of a stretch whose middle third is held out."""
+    third = stretch.errors.size // 3
+    setting = stretch.setting
+    return [replace(stretch, setting=replace(
+        setting, index=setting.index[part], times=setting.times[part],
+        true_times=setting.true_times[part]), measured=stretch.measured[part],
+        errors=stretch.errors[part], bends=stretch.bends[part][:third - 1])
+        for part in (slice(0, third), slice(2 * third, 3 * third))]
+
+
+@pytest.mark.parametrize(('sizes', 'name'), [
+    ({}, ''), ({'swing': 2e-3}, ''), ({'excess': 1.0, 'rho': 0.7}, 'correlated_jitter'),
+    ({'wander': 2.0, 'band': (0.0, 0.2)}, 'phase_wander')])
+def test_what_sets_stretches_apart_has_the_power_of_its_frequency(sizes, name):
+    count, ratios = 60, []
+    for seed in range(count):
+        parts = without_the_middle(machine([61, seed], **sizes))
+        fit = Chooser(parts, []).fit(frozenset([name] if name else []))
+        assert fit.data.each[0] < fit.data.each[1] == 1.0 / fit.data.longest
+        power = np.linalg.inv(fit.spectrum(fit.parameters))[0]
+        apart = fit.data.ordinates[0]
+        ratios.append(float((apart.conj() @ power @ apart).real) / fit.data.series)
+    # of squares of three normal variables
+    assert np.mean(ratios) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 3.0 / count) + 0.1)
+
+
+def test_a_skew_shows_on_either_side_of_what_is_held_out():
+    parts = without_the_middle(machine(7, skew=3e-6))
+    timing = read_timing(parts)
+    assert names_of(timing) == {'clock_skew'}
+    alone = [replace(part, setting=replace(part.setting, fitted=part.setting.times))
+             for part in parts]  # two recordings, whose errors may differ by any constant
+    assert names_of(read_timing(alone)) == set()
+    value, error = value_of(timing, 'clock_skew', 'skew')
+    assert abs(value - 3e-6) < 4.0 * error
+    whole = read_timing([machine(7, skew=3e-6)])
+    assert error < 1.3 * value_of(whole, 'clock_skew', 'skew')[1]
+
+
+@pytest.mark.parametrize('noise', [0.02, 0.3])
+def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
+    found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))
+             for seed in range(16)]
+    assert sum(bool(names) for names in found) <= 1
 
 
 def test_uneven_marks_are_found_mark_by_mark():

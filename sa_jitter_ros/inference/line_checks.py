@@ -108,7 +108,9 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     rises = _accelerations(observation)
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
-    return (_turns(ratio, noise, order, len(run) - round(float(np.trace(run)))), *_follows(observation, np.abs(ratio), noise),
+    beyond_means = len(run) - round(float(np.trace(run)))
+    return (_turns(ratio, noise, order, beyond_means),
+            *_follows(observation, np.abs(ratio), noise),
             *_beside_errors(observation, lines, noise))
 
 

@@ -490,7 +490,7 @@ class _States:
 
     def _border(self, residual: Array, derivative: tuple[Array, Array], by: Sequence[int]
                 ) -> tuple[Array, Array, Array]:
-        """Return border, corner and right side of amplitudes (cos, sin by channel) and trend, 0."""
+        """Return border, corner and right side of amplitudes (cos, sin by channel) and a trend."""
         pulses, width = self.states.shape
         channels, lines = self.amplitudes.shape
         whole = np.zeros((pulses, width, 2 * channels * lines + 1))

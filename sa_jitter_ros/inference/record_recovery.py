@@ -202,7 +202,8 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     return OpenRecord(
         part, rate, start_time + first / rate, times,
         measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top, trend=trend)
+        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top,
+        trend=trend)
 
 
 def _fitted(record: OpenRecord | None, times: FloatArray, model: DeclaredModel,

@@ -21,6 +21,7 @@ the motion of the shaft from leaking.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -253,7 +254,7 @@ def _apart(stretches: Sequence[Stretch]) -> Mapping[int, float]:
     Vibration that was fitted as a whole shows by how much more the pulses err behind the gap.
     """
     found = {}
-    for i, (one, other) in enumerate(zip(stretches[:-1], stretches[1:])):
+    for i, (one, other) in enumerate(pairwise(stretches)):
         same = one.setting.fitted.size and np.array_equal(one.setting.fitted, other.setting.fitted)
         if same and one.held and not one.referenced:
             found[i] = 0.5 / float(other.setting.index.mean() - one.setting.index.mean())
