@@ -17,7 +17,7 @@ After a change that is meant to change results: `python benchmarks/published_res
 import json
 
 from independent_effects import UNKNOWN
-from published_results import CASES, DAMAGES, differences, result, RESULTS, truth
+from published_results import CASES, DAMAGES, differences, EDGES, result, RESULTS, truth
 import pytest
 
 pytestmark = pytest.mark.machines
@@ -41,7 +41,8 @@ AGAINST = {'late_reference': 'reference keyphasor', 'poor_reference': 'vibration
 @pytest.mark.parametrize('case', CASES)
 def test_result_is_the_published_one(case):
     published = json.loads(RESULTS.read_text())[case]
-    assert list(differences(json.loads(json.dumps(result(case))), published)) == []
+    found = json.loads(json.dumps(result(case)))
+    assert list(differences(found, published, EDGES.get(case, ()))) == []
 
 
 @pytest.mark.parametrize('case', CASES)
