@@ -12,8 +12,6 @@
 
 from dataclasses import replace
 
-from dataclasses import replace
-
 from limit_coverage import limit_of, lines, machine, MODEL, recovered_source, UNIT
 import numpy as np
 import pytest
