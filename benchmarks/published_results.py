@@ -41,7 +41,7 @@ CASES = (
     'none 1009', 'interfering_tone 1005', 'two_paths 1001', 'additive_noise 1007',
     'clock_skew 1000', 'keyphasor_quantisation 1005', 'target_geometry 1002',
     'target_geometry 2003', 'correlated_jitter 1002', 'interpolation_loss 1005',
-    'speed_fluctuation 1011', 'resonance 1010', 'resonance 2000', 'late_recovery 2012',
+    'speed_fluctuation 1011', 'resonance 1010', 'late_recovery 2012',
     'amplitude_modulation 1006', 'excess_jitter 1007', 'excess_jitter 12103', 'phase_wander 1004',
     'missing_pulses 3000', 'correlated_jitter+additive_noise 3000', 'resonance 41009',
     'phase_wander+interfering_tone 3000', 'keyphasor_quantisation+clock_skew 3003',
