@@ -60,6 +60,7 @@ _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 #: What rounding decides: limits of an even likelihood, and changes near the bound of `undecided`.
 EDGES: Mapping[str, tuple[str, ...]] = {
     'keyphasor_quantisation+clock_skew 3003': ('.undecided',),
+    'missing_pulses+clock_skew 3001': ('.limits[2]', '.undecided'),
     'none 52619': ('.limits[6]',), 'none 1009 slow_clock': ('.limits[2]',)}
 _UNLIKE = {'recordings', 'created', 'version', 'parameter_file', 'declared'}
 _PROBABILITIES = {'probabilities', 'p_value', 'coverage_95', 'ks', 'mean'}
