@@ -233,7 +233,10 @@ def together(observations: Sequence[Observation]) -> Observation:
                              'different machines or loads; run the loop on each alone')
     pulses = RecordPulses(
         **{name: np.concatenate([getattr(item.pulses, name) for item in observations])
-           for name in ('times', 'missing', 'starts_run', 'doubtful', 'bridged')},
+           for name in ('times', 'missing', 'doubtful', 'bridged')},
+        # no interval ends where a recording begins
+        starts_run=np.concatenate([first.pulses.starts_run, *(
+            item.pulses.starts_run[1:] for item in observations[1:])]),
         remarks=tuple(f'{item.name or "a recording"}: {remark}' for item in observations
                       for remark in item.pulses.remarks))
     if len(observations) == 1:
