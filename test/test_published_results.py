@@ -85,7 +85,6 @@ def test_sizes_that_were_declared_wrong_are_measured():
 
 
 def test_a_skew_too_small_to_matter_is_present():
-    """Half of what it makes of the errors is between the averages on either side of a gap."""
     effect, = json.loads(RESULTS.read_text())['none 1009 slow_clock']['present']
     skew = effect['parameters']['skew']
     assert abs(skew['value'] - 2e-5) < 3.0 * skew['standard_error'] < 1e-5

@@ -26,7 +26,6 @@ from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.effects.evidence import SAME_SPEED
 from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE, FALSE_ALARM
 from sa_jitter_ros.inference.scoring import Bench, Comparison
-from sa_jitter_ros.prediction.influence import mean_period
 from scipy import special
 
 Array = NDArray[Any]
@@ -72,8 +71,7 @@ def dependences(bench: Bench, effects: Sequence[Effect], findings: Sequence[Find
     weights = 1.0 / (np.mean(whole.scale**2, axis=0) + ACCURACY**2)
     orders = bench.observation.orders[bench.lines.order]
     items = [bench.observation.acquisitions[a] for a in bench.held_out]
-    speeds = bench.observation.model.cycle_length / np.array([
-        mean_period(item.times, item.missing) for item in items])
+    speeds = bench.observation.model.cycle_length / np.array([item.period for item in items])
     found = []
     if np.ptp(orders) > 0.0:
         found.append(_over_lines(whole, weights, orders))

@@ -36,7 +36,7 @@ from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import (
-    Influence, known_errors, mean_period, Pulses, random_processes, without_gaps)
+    Influence, known_errors, Pulses, random_processes, without_gaps)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
@@ -356,7 +356,7 @@ def _speed(item: Acquisition, model: DeclaredModel) -> float:
     It is exact if pulses are missing: a gap turns the average by whole trigger cycles, which
     multiplies an error of the speed.
     """
-    ratio = model.trigger_period / mean_period(item.times, item.missing)
+    ratio = model.trigger_period / item.period
     if item.missing.any():
         return float(model.trigger_speed * ratio)
     return float(model.trigger_speed * (1.0 + _SPEED_STEP * np.rint((ratio - 1.0) / _SPEED_STEP)))

@@ -29,7 +29,6 @@ from sa_jitter_ros.inference.gathering import cycle_amplitudes
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
-from sa_jitter_ros.prediction.influence import mean_period
 from scipy import special
 
 Array = NDArray[Any]
@@ -95,48 +94,45 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     turned = amplitude * np.exp(
         -2j * np.pi * observation.model.cycle_length * np.outer(number, order))
     # late pulses are ahead by an angle that follows the speed of their acquisition
-    turned *= np.exp(-2j * np.pi * np.outer(_late(observation) / _periods(observation)
+    turned *= np.exp(-2j * np.pi * np.outer(_late(observation) / observation.periods
                                             * observation.model.cycle_length, order))
     weight = order**2 * np.mean(np.abs(amplitude), axis=0) ** 2 / noise**2
     # all lines of an acquisition may be late by one time
-    late = np.angle(turned / (run @ turned)) / order @ (weight / weight.sum())
+    late = np.angle(turned / _means(run, turned)) / order @ (weight / weight.sum())
     turned = turned * np.exp(-1j * np.outer(late, order))
-    mean = run @ turned
+    mean = _means(run, turned)
     size = np.abs(mean).mean(axis=0)
     ratio, noise = turned * np.abs(mean) / mean / size, noise / size
     # the angle of a speed that rises bends, which makes orders leak into those beside them
     rises = _accelerations(observation)
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
-    beyond_means = len(run) - round(float(np.trace(run)))
-    return (_turns(ratio, noise, order, beyond_means),
+    return (_turns(ratio, noise, order, run.size - int(run.max()) - 1),
             *_follows(observation, np.abs(ratio), noise),
             *_beside_errors(observation, lines, noise))
 
 
 def _runs(observation: Observation) -> tuple[Array, Array]:
     """
-    Return what takes the mean over the run of each acquisition (acquisition, acquisition).
+    Return the run of each acquisition, and the number of its first trigger pulse (acquisition,).
 
-    A run is an unbroken stretch of a recording: how many cycles lie between two is not known. The
-    first trigger pulse of each acquisition has a number (acquisition,).
+    A run is an unbroken stretch of a recording: how many cycles lie between two is not known.
     """
-    runs, numbers, recording, before = [], [], 0, -1
-    for item in observation.acquisitions:
-        recording += item.first <= before
-        before = item.first
+    runs, numbers = [], []
+    for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
         recovery = observation.recoveries[recording]
         number = int(recovery.number[item.first])
         runs.append((recording, next((part.start for part in recovery.stretches
                                       if part.start <= number < part.stop), -1)))
         numbers.append(number)
-    same = np.array([[one == other for other in runs] for one in runs], float)
-    return same / same.sum(axis=1, keepdims=True), np.array(numbers)
+    return np.unique(runs, axis=0, return_inverse=True)[1].ravel(), np.array(numbers)
 
 
-def _periods(observation: Observation) -> Array:
-    """Return the mean trigger period (acquisition,) in s."""
-    return np.array([mean_period(item.times, item.missing) for item in observation.acquisitions])
+def _means(run: Array, values: Array) -> Array:
+    """Return the mean of values (acquisition, line) over the run of each acquisition."""
+    total = np.zeros((int(run.max()) + 1, values.shape[1]), values.dtype)
+    np.add.at(total, run, values)
+    return np.asarray((total / np.bincount(run)[:, None])[run])
 
 
 def _accelerations(observation: Observation) -> Array:
@@ -153,11 +149,8 @@ def _late(observation: Observation) -> Array:
 
 def _errors(observation: Observation) -> Iterator[Array]:
     """Yield the recovered errors of the pulses of each acquisition in s, their mean included."""
-    number, before = 0, -1
-    for item in observation.acquisitions:
-        number += item.first <= before
-        before = item.first
-        yield observation.recoveries[number].errors[item.first:item.first + item.times.size]
+    for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
+        yield observation.recoveries[recording].errors[item.first:item.first + item.times.size]
 
 
 def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
@@ -174,7 +167,7 @@ def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
 
 def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check, ...]:
     """Test whether the amplitudes follow the speed."""
-    speed = 1.0 / _periods(observation)
+    speed = 1.0 / observation.periods
     speed = speed / speed.mean() - 1.0
     spread = float(np.std(speed))
     freedom = speed.size - 4  # of the parabola and the acceleration

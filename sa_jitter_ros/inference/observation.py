@@ -92,6 +92,11 @@ class Acquisition:
         """Return the indices of the measured pulses in `bridged`."""
         return numbered(self.missing)
 
+    @property
+    def period(self) -> float:
+        """Return the mean trigger period in s."""
+        return mean_period(self.times, self.missing)
+
     @cached_property
     def raw(self) -> ComplexArray:
         """Return the raw complex peak amplitudes (channel, order)."""
@@ -142,6 +147,17 @@ class Observation:
         """Return the acquisitions whose attenuation is known."""
         return tuple(a for a, item in enumerate(self.acquisitions)
                      if self.against_reference or item.recovered)
+
+    @property
+    def periods(self) -> FloatArray:
+        """Return the mean trigger period (acquisition,) in s."""
+        return np.array([item.period for item in self.acquisitions])
+
+    @property
+    def recording(self) -> NDArray[np.int64]:
+        """Return the number (acquisition,) of the recording of each acquisition."""
+        first = np.array([item.first for item in self.acquisitions])
+        return np.cumsum(np.diff(first, prepend=first[:1] - 1) <= 0)
 
     def uncorrected(self) -> 'Observation':
         """Return the observation of one whose recovered errors tell nothing of the amplitudes."""

@@ -51,6 +51,7 @@ BoolArray = NDArray[np.bool_]
 _BEYOND, _BEYOND_LINES = 6.0, 3.0
 _EDGE = 1.15  # of the band, where the low pass ends
 _FULL_BAND = 0.4  # of the sample rate
+_MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 _SAMPLES = 3.7  # in a period of the band's end
 # Bends in parts of the declared jitter, and gains: a first guess, and before they are free.
 _FREE, _FIXED = 0.1, 1e-4
@@ -430,7 +431,7 @@ class _States:
                 share[first[i]:last[i]] = told[i]
             share /= share.sum()
             taken = cycles * float(self.told.sum()) * float(share @ share) / (2 * len(power))
-            colour = float(share @ power[c]) / (1.0 - min(taken, 0.5))
+            colour = float(share @ power[c]) / (1.0 - min(taken, _MOST_TAKEN))
             self.weight[c] /= colour
             around[c] /= colour
         self.around = around

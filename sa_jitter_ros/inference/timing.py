@@ -153,15 +153,9 @@ def _of_average(observation: Observation, item: Acquisition, unit: float, grid: 
 def _runs(observation: Observation, chosen: Sequence[int]) -> list[tuple[int, int, int]]:
     """Return recording and first and last pulse of each run of neighbouring acquisitions."""
     runs: list[tuple[int, int, int]] = []
-    number, before = 0, -1
-    wanted = set(chosen)
-    previous = -2
-    for a, item in enumerate(observation.acquisitions):
-        if item.first <= before:
-            number += 1
-        before = item.first
-        if a not in wanted:
-            continue
+    recording, previous = observation.recording.tolist(), -2
+    for a in sorted(set(chosen)):
+        item, number = observation.acquisitions[a], recording[a]
         end = item.first + item.times.size - 1
         if runs and previous == a - 1 and runs[-1][0] == number:
             runs[-1] = (number, runs[-1][1], end)

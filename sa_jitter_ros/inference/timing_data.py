@@ -164,14 +164,14 @@ class TimingData:
 
     def transform(self, series: Sequence[Array]) -> Array:
         """Return the ordinates (ordinate, 3) of a series (pulse - 2, 3) of every stretch."""
-        rows, means = [], []
+        rows, means, spread = [], [], []
         for item in series:
             window = taper(len(item))
             means.append(np.average(item[:, :self.series], axis=0, weights=window))
             item = (item[:, :self.series] - means[-1]) * window[:, None]
-            rows.append(np.fft.rfft(item, axis=0)[1:len(item) // 2 + 1] / np.sqrt(
-                np.sum(window**2)))
-        spread = [np.sum(taper(n)**2) / np.sum(taper(n))**2 for n in self.lengths]
+            power = np.sum(window**2)
+            rows.append(np.fft.rfft(item, axis=0)[1:len(item) // 2 + 1] / np.sqrt(power))
+            spread.append(power / np.sum(window)**2)
         apart = [(means[i + 1] - means[i]) / np.sqrt(spread[i] + spread[i + 1])
                  for i in self._apart]
         return np.asarray(np.concatenate([np.reshape(apart, (-1, self.series)), *rows]

@@ -38,8 +38,7 @@ SHAFT, JITTER, NOISE = 'shaft', 'jitter_scale', 'noise'
 _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
-#: What the logarithm of the noise power is known to.
-_NOISE_KNOWN = 0.5
+_NOISE_KNOWN = 0.5  # what the logarithm of the noise power is known to
 _SAME = 0.05  # gain in log likelihood that ends a search
 _STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
 _CURVED = float(np.sqrt(_STEP))  # by which a curvature is

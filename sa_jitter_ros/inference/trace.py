@@ -51,7 +51,6 @@ from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
 from sa_jitter_ros.prediction.amplitudes import line_variance
-from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -457,10 +456,9 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
     names = {finding.name for finding in chosen}
     of_timing = timing.checks if timing is not None else ()
-    speeds = [model.trigger_revolutions / mean_period(item.times, item.missing)
-              for item in bench.observation.acquisitions]
+    speeds = model.trigger_revolutions / bench.observation.periods
     explained = np.mean([line_variance(replace(model, trigger_speed=speed), _effects(chosen))
-                         for speed in speeds], axis=0)
+                         for speed in speeds.tolist()], axis=0)
     of_lines = check_lines(bench.observation, bench.lines, explained)
     if _GAIN in names:
         of_lines = (*of_lines, check_gain(bench.scatter))
