@@ -115,6 +115,27 @@ def test_a_skew_shows_on_either_side_of_what_is_held_out():
     assert error < 1.3 * value_of(whole, 'clock_skew', 'skew')[1]
 
 
+def test_a_delay_shows_on_either_side_of_what_is_held_out():
+    """The turn that all pulses have in common is that of the whole fit, not of a part of it."""
+    for seed in range(4):
+        whole = machine([63, seed], delay=0.02, swing=2e-3)
+        timing = read_timing(without_the_middle(whole))
+        assert names_of(timing) == {'path_delay'}
+        value, error = value_of(timing, 'path_delay', 'delay')
+        assert abs(value - 0.02) < 4.0 * error
+        assert error < 1.5 * value_of(read_timing([whole]), 'path_delay', 'delay')[1]
+
+
+def test_a_beat_within_the_cycles_is_no_acceleration(rng):
+    """Neighbouring bends of a slow motion are more alike than those of a line that comes by."""
+    part = machine(7)
+    index = part.setting.index
+    phase = 0.31 * index + np.cumsum(rng.normal(0.0, 0.02, index.size))
+    beat = 2e-4 * np.cos(2.0 * np.pi * phase)
+    timing = read_timing([replace(part, bends=part.bends + beat[:-1])])
+    assert 'speed_fluctuation' not in {item.name for item in timing.findings}
+
+
 @pytest.mark.parametrize('noise', [0.02, 0.3])
 def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
     found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))

@@ -111,9 +111,13 @@ def band_of_ripple(correlation: Array) -> Array:
     """Return the bandwidth of an acceleration whose ripple has a `correlation` of neighbours."""
     widths = np.geomspace(NARROWEST, WIDEST, 200)
     bands = [slow_band(width, ACCELERATION_BAND) for width in widths]
-    known = np.array([_ripple_covariance(band, 1) / _ripple_covariance(band, 0)
-                      for band in bands])
+    known = np.array([ripple_correlation(band) for band in bands])
     return np.asarray(np.interp(correlation, known[::-1], widths[::-1]))
+
+
+def ripple_correlation(band: tuple[float, float]) -> float:
+    """Return the correlation of neighbouring ripples that an acceleration in a band makes."""
+    return _ripple_covariance(band, 1) / _ripple_covariance(band, 0)
 
 
 def _ripple_covariance(band: tuple[float, float], lag: int) -> float:

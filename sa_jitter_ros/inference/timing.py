@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.band import band_of_ripple
+from sa_jitter_ros.effects.band import (
+    ACCELERATION_BAND, band_of_ripple, ripple_correlation, slow_band, WIDEST)
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
     beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
@@ -413,6 +414,9 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     size, size_error = root(power, error)
     together = float(np.mean(next_)) / power  # correlation of neighbours
     wrong = _mean(np.array(next_) - together * np.array(parts))[1] / power
+    below = max(ripple_correlation(slow_band(WIDEST, ACCELERATION_BAND)) - together, 0.0)
+    if beyond_chance(0.5 * (below / wrong) ** 2, 1, data.cycles) > ODDS:  # a line that comes by
+        return None
     low, bandwidth, high = band_of_ripple(together + wrong * np.array([1.0, 0.0, -1.0])).tolist()
     effect = SpeedFluctuation.of_ripple(size, setting.model, bandwidth)
     if not possible(effect, setting.model):
