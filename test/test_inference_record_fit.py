@@ -10,11 +10,14 @@
 
 """Pulse errors and lines of whole recordings, against the truth of another simulator."""
 
+from itertools import pairwise, product
+
 from independent_effects import draw_case
 import numpy as np
 import pytest
 from record_recovery import fitted
-from sa_jitter_ros.inference.record_fit import _States, fit_record, independent_power
+from sa_jitter_ros.inference.record_fit import fit_record, independent_power
+from sa_jitter_ros.inference.slips import shortest_path
 
 
 @pytest.mark.machines
@@ -165,12 +168,87 @@ def test_a_tone_has_the_errors_that_it_states(seed):
 
 
 def test_sidebands_turn_with_those_of_their_spacing(rng):
-    """Beside three lines 0.37 orders away; alone at 0.37, which turns with the shaft, too."""
-    states = _States.__new__(_States)
-    states.cycle_length, states.times, states.declared = 1.0, np.arange(301.0), 3
-    states.orders = np.array([8.0, 16.0, 24.0, 8.37, 15.63, 0.3701, 24.6, 11.2])
-    turning = np.array([True] * 4 + [False] * 4)
-    assert states._families(turning).tolist() == [True] * 6 + [False] * 2
+    """On a steady machine, beside three lines 0.37 orders away, and alone at 0.37."""
+    count, rate, speed = 300, 2000.0, 20.0
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    others = [8.37, 15.63, 24.37, 0.37, 11.21]
+    vibration = sum(size * np.cos(2.0 * np.pi * order * speed * time + order) for order, size
+                    in zip([8.0, 16.0, 24.0, *others], [1.0, 0.7, 0.5] + [0.1] * 5))
+    found = fit_record((vibration + 0.02 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+                       (np.arange(count) + 0.5) / speed + rng.normal(0.0, 5e-5, count),
+                       measured=np.ones(count, bool), cycle_length=1.0, orders=[8.0, 16.0, 24.0],
+                       jitter_std=5e-5)
+    lines = np.append(found.orders, found.tones / speed)
+    turning = {other: found.turning[np.argmin(np.abs(lines - other))] for other in others}
+    assert [other for other, turns in turning.items() if not turns] == [11.21]
+
+
+@pytest.mark.parametrize('memory', [0.0, 0.9])
+def test_errors_of_more_than_half_a_turn_are_found(rng, memory):
+    """Where steps alone would end at a place that fits as badly as any near it."""
+    count, rate, speed, size = 600, 4000.0, 25.0, 4e-4  # 0.24 turns of order 24
+    errors = rng.standard_normal(count)
+    for k in range(1, count):
+        errors[k] = memory * errors[k - 1] + np.sqrt(1.0 - memory**2) * errors[k]
+    errors *= size
+    assert np.abs(errors).max() > 0.5 / (24.0 * speed)
+    time = np.arange(int((count + 2) / speed * rate)) / rate
+    vibration = sum(size * np.cos(2.0 * np.pi * g * speed * time)
+                    for g, size in ((8.0, 0.3), (12.0, 0.3), (24.0, 1.0)))
+    found = fit_record((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+                       (np.arange(count) + 0.5) / speed + errors,
+                       measured=np.ones(count, bool), cycle_length=1.0, orders=[8.0, 12.0, 24.0],
+                       jitter_std=5e-5)
+    wrong = (found.errors - errors)[2:-2]
+    z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
+    assert np.abs(z).max() < 6.0
+    assert found.orders.size == 3
+    assert found.tones.size == 0
+
+
+def test_the_shortest_path_is_that_of_all_paths(rng):
+    costs = [rng.uniform(size=n) for n in (2, 3, 1, 4)]
+    steps = [rng.uniform(size=(a.size, b.size)) for a, b in pairwise(costs)]
+
+    def cost(path):
+        return sum(row[i] for row, i in zip(costs, path)) + sum(
+            step[i, j] for step, (i, j) in zip(steps, pairwise(path)))
+
+    best = min(product(*(range(row.size) for row in costs)), key=cost)
+    path, found = shortest_path(costs, steps)
+    assert tuple(path) == best
+    assert found == pytest.approx(cost(best))
+
+
+def foreign_shaft(rng, *, varying):
+    """Return a steady machine's vibration, pulses and errors, beside a shaft of its own speed."""
+    count, rate, speed = 700, 4000.0, 25.0
+    samples, times, errors = steady(rng, count=count, rate=rate, speed=speed)
+    time = np.arange(len(samples)) / rate
+    turns = 60.6 * time + varying * 60.6 / (2.0 * np.pi * 0.05) * np.sin(2.0 * np.pi * 0.05 * time)
+    for order, size in ((1, 0.3), (2, 0.3), (3, 0.3), (5, 0.4)):
+        samples[:, 0] += size * np.cos(2.0 * np.pi * order * turns + order)
+    sides = [7.0, 9.0, 15.0, 17.0, 23.0, 25.0]
+    for order in sides:
+        samples[:, 0] += 0.05 * np.cos(2.0 * np.pi * order * speed * time + order)
+    return samples, rate, times, errors, sides
+
+
+@pytest.mark.parametrize('varying', [0.0, 1.5e-3])
+def test_a_foreign_shaft_hides_no_lines_and_tells_no_errors(rng, varying):
+    """What is left beside its strong lines must not end the search for others."""
+    samples, rate, times, errors, sides = foreign_shaft(rng, varying=varying)
+    found = fit_record(samples, rate, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    assert np.all(np.abs(found.orders[:, None] - sides).min(axis=0) < 1e-3)
+    wrong = (found.errors - errors)[2:-2]
+    z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
+    assert np.sqrt(np.mean(z**2)) < 1.0 + 4.0 / np.sqrt(2.0 * z.size)  # less far from the shaft
+    assert np.std(wrong) < 0.5 * np.std(errors)
+    own = np.append(found.orders, found.tones / 25.0)
+    foreign = np.abs(own[:, None] - 60.6 / 25.0 * np.array([1, 2, 3, 5])).min(axis=1) < 0.04
+    assert foreign.sum() >= 4
+    assert not found.turning[foreign].any()
 
 
 def test_sidebands_that_do_not_change_are_no_bend_of_all_cycles(rng):

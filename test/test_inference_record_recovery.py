@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.inference.record_recovery import leaking_orders, recover_record
+from sa_jitter_ros.inference.record_recovery import recover_record
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -184,16 +184,6 @@ def test_roughness_is_that_of_what_the_errors_are_wrong_by(rng):
     # Neighbours are not independent. The fit allows for bends, which this machine does not have.
     assert np.mean(seen) == pytest.approx(
         np.mean(stated), rel=4.0 * np.sqrt(4.0 / count) + 0.15)
-
-
-def test_images_of_an_interpolator_are_no_orders_of_a_shaft(rng):
-    for clock, images in ((0.0, False), (1.23e-3, True)):
-        samples, pulses, _ = machine(rng, clock=clock)
-        found = recover_record(samples, 0.0, RATE, pulses, model_of())
-        beat = clock * RATE / (2.4 * SPEED)
-        near = np.abs(np.abs(found.fits[0].orders[2:, None] - [8.0, 16.0]) - beat) < 0.01
-        assert near.any() == images
-        assert leaking_orders(found, model_of()) == pytest.approx([8.37], abs=1e-3)
 
 
 @pytest.mark.machines

@@ -25,7 +25,6 @@ from sa_jitter_ros.effects.lattice import (
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
-from sa_jitter_ros.inference.record_recovery import doubtful_lines
 from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.prediction.influence import known_errors, Pulses, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
@@ -249,7 +248,7 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
         return None
     frequency = np.append(fit.orders * model.fundamental_frequency, fit.tones)
     amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
-    chosen = np.flatnonzero(doubtful_lines(fit, model))
+    chosen = np.flatnonzero(~fit.turning)
     if not chosen.size:
         return None
     order = np.append(lines.order, hidden_lines(observation, lines).order)

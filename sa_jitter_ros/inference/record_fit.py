@@ -36,6 +36,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.inference.slips import mend_slips
 from sa_jitter_ros.prediction.influence import trigger_periods
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import irfft, next_fast_len, rfft
@@ -53,10 +54,9 @@ _EDGE = 1.15  # of the band, where the low pass ends
 _FULL_BAND = 0.4  # of the sample rate
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 _SAMPLES = 3.7  # in a period of the band's end
-# Bends in parts of the declared jitter, and gains: a first guess, and before they are free.
-_FREE, _FIXED = 0.1, 1e-4
-# Those that are free keep at least so much: a bend of nothing would be certain.
-_LEAST_BEND, _LEAST_GAIN = 0.003, 1e-3
+# Bends in parts of the declared jitter, and gains: a first guess when they become free, and the
+# least that they keep always: a bend of nothing would be certain.
+_FREE, _LEAST_BEND, _LEAST_GAIN = 0.1, 0.003, 1e-3
 _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
@@ -66,6 +66,7 @@ _LAST_STEPS, _CONVERGED = 6, 1e-3
 # it must not be far below the strongest, which may leave images of itself.
 _FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
+_FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
 APART = 1.5
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
@@ -99,8 +100,9 @@ class RecordFit:
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
     lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
     amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
-    imaginary parts. `turning` (order,) tells which orders certainly turn with the shaft: the speed
-    varies enough to show it, of them or of a sideband as far from another line. `jitter_std` (s)
+    imaginary parts. `turning` (line,) tells which orders, and tones after them, turn with the
+    shafts: orders that shafts must have, those that a varying speed shows to turn, and sidebands
+    of several lines. `jitter_std` (s)
     is the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
     bends that the fit expected, towards 0, the errors towards a line that grows by `trend` s in a
     second. Declared lines that stand out of the noise have `held` the angle to the pulses: others
@@ -172,8 +174,8 @@ class OpenRecord:
         """
         band, rate = _low_passed(
             samples, sample_rate, top * cycle_length / float(np.diff(times).mean()))
-        self._begin = _States(band, rate, start_time, times, measured, cycle_length,
-                              np.array(orders), top, jitter_std)
+        self._begin = States(band, rate, start_time, times, measured, cycle_length,
+                             np.array(orders), top, jitter_std)
         self._begin.follow_trend(trend)
 
     def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
@@ -189,14 +191,14 @@ class OpenRecord:
         return states.result()
 
 
-def _search(states: '_States', known: tuple[Array, Array] | None) -> None:
+def _search(states: 'States', known: tuple[Array, Array] | None) -> None:
     """
     Fit states and lines by turns until no line is found any more.
 
     Lines that are `known` come after the first steps, too: high ones follow a trend that the
     declared ones have shown.
     """
-    look, lines = known is None, known or ((), ())
+    look, lines, mended = known is None, known or ((), ()), 0
     states.step()
     while True:
         for _ in range(2):
@@ -209,7 +211,9 @@ def _search(states: '_States', known: tuple[Array, Array] | None) -> None:
                 states.refine()
                 states.fit_amplitudes()
         elif states.all_free:
-            break
+            if mended == _LAST_STEPS or not mend_slips(states):
+                break
+            mended += 1
         else:
             states.free_all()
             for _ in range(4):
@@ -241,7 +245,7 @@ def _low_passed(samples: Array, rate: float, top: float) -> tuple[Array, float]:
     return np.ascontiguousarray(found * (size / padded)), rate * size / padded
 
 
-class _States:
+class States:
     """
     The states of all cycles and the lines, and one step of their fit.
 
@@ -267,7 +271,8 @@ class _States:
                                 np.ones(points), u])
         self.width = len(self.shapes) - 1
         self.states = np.zeros((times.size, self.width))
-        self.size = np.array([jitter_std, *[_FIXED * jitter_std] * (self.width - 2), _FIXED])
+        self.least = np.array([*[_LEAST_BEND * jitter_std] * (self.width - 2), _LEAST_GAIN])
+        self.size = np.append(jitter_std, self.least)
         self.all_free = self.settled = False
         self.told = np.zeros(self.width)
         self.around: Array | float = 1.0
@@ -278,12 +283,18 @@ class _States:
         self.ramp = (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean())
         self.trend = 0.0
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
-        self._read()
+        self.turning = self.surely = np.ones(orders.size, np.bool_)
+        self.read()
 
     @property
     def lines_found(self) -> int:
         """Return the number of undeclared lines."""
         return self.amplitudes.shape[1] - self.declared
+
+    @property
+    def moving(self) -> BoolArray:
+        """Return which lines (line,) are orders of shafts, which the states move."""
+        return self.surely & (np.arange(self.surely.size) < self.orders.size)
 
     @property
     def transformed(self) -> int:
@@ -298,7 +309,7 @@ class _States:
 
     # --- the vibration at the present angle, and the lines in it ---
 
-    def _read(self) -> None:
+    def read(self) -> None:
         corrected = self.times - self.states[:, 0]
         period = np.diff(corrected)
         self.slope = self.cycle_length / period
@@ -332,7 +343,7 @@ class _States:
         self.normal = np.block([[0.5 * (straight + mirrored).real, -cross],
                                 [-cross.T, 0.5 * (straight - mirrored).real]])
 
-    def _signals(self, amplitudes: ComplexArray) -> Array:
+    def signals(self, amplitudes: ComplexArray) -> Array:
         """Return the sums (channel, cycle, point) of lines with amplitudes (channel, line)."""
         n = self.orders.size
         # each order turned, its real and imaginary part side by side
@@ -360,8 +371,8 @@ class _States:
                 [(values * tone) @ some.T for tone in self.in_time], axis=2)], axis=2)
         return np.asarray(found if shapes is not None else found[:, 0])
 
-    def _residual(self) -> Array:
-        return np.asarray(self.vibration - (1.0 + self.states[:-1, -1:]) * self._signals(
+    def residual(self) -> Array:
+        return np.asarray(self.vibration - (1.0 + self.states[:-1, -1:]) * self.signals(
             self.amplitudes))
 
     def fit_amplitudes(self) -> None:
@@ -374,22 +385,23 @@ class _States:
         found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
         n = len(right)
         self.amplitudes = (found[:n] + 1j * found[n:]).T
+        self.turning, self.surely = self._turning()
 
     # --- one step ---
 
     def step(self, *, weak: float = 1.0, move: bool = True) -> float:
         """Do a Gauss-Newton step; return the RMS change of the pulse errors (s)."""
         self._make_tables()
-        of_orders = np.arange(self.amplitudes.shape[1]) < self.orders.size
-        moving = self._signals(of_orders * self.amplitudes)
-        residual = self._residual() if self.tones.size else (
+        # a line of no shaft tells nothing of the angle: its own frequency may vary
+        moving = self.signals(self.moving * self.amplitudes)
+        residual = self.residual() if not self.moving.all() else (
             self.vibration - (1.0 + self.states[:-1, -1:]) * moving)
         points = self.whole.sum() * self.u.size
         self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
         if self.settled:
             self._weigh(residual)
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
-        rate = self._signals(turns * self.amplitudes)
+        rate = self.signals(turns * self.moving * self.amplitudes)
         rate *= self.slope[:, None]
         change, amplitudes, trend = self._solve(residual, (rate, moving), weak)
         self.change = change[:, 0]
@@ -403,7 +415,7 @@ class _States:
             self.amplitudes = self.amplitudes + part * amplitudes
             if weak == 1.0:
                 self._estimate_sizes()
-            self._read()
+            self.read()
         return size
 
     def _weigh(self, residual: Array) -> None:
@@ -519,7 +531,7 @@ class _States:
         n = self.orders.size
         if self.tones.size or 2 * n >= self.u.size:
             return self._sums(values, shapes)
-        part = self.amplitudes[channel] * (self.turn if which else (
+        part = (self.moving * self.amplitudes[channel]) * (self.turn if which else (
             2j * np.pi * self.slope[:, None] * self.orders * self.turn))
         wave = (shapes[:, None] * self.wave).reshape(-1, self.u.size)
         each = np.ascontiguousarray(self.reading @ wave.T).view(np.float64)
@@ -561,8 +573,7 @@ class _States:
         power = max(power, min(more, self.most_power), (_LEAST_JITTER * self.jitter_std) ** 2)
         self.size[0] = np.sqrt(power)
         if self.all_free:
-            for i in range(1, self.width):
-                least = _LEAST_GAIN if i == self.width - 1 else _LEAST_BEND * self.jitter_std
+            for i, least in enumerate(self.least, start=1):
                 self.size[i] = np.sqrt(max(self._estimated(i, self.states[2:-2, i])[1], least**2))
 
     def _estimated(self, state: int, values: Array, share: float = 1.0) -> tuple[float, float]:
@@ -586,7 +597,7 @@ class _States:
     def free_all(self) -> None:
         """Let bends and gains free."""
         self.all_free = True
-        self.size[1:] *= _FREE / _FIXED
+        self.size[1:] = _FREE * np.array([*[self.jitter_std] * (self.width - 2), 1.0])
 
     # --- lines ---
 
@@ -619,13 +630,13 @@ class _States:
                  and np.mean(chance < _FALSE / slope.size) > _SLOPE_LINES)
         self.trend = float(best) if clear else expected
         self.states[:, 0] = self.trend * self.ramp
-        self._read()
+        self.read()
 
     def new_lines(self) -> tuple[list[float], list[float]]:
         """Return orders, and tones in Hz, that stand out of the residual; some if too many do."""
         self._make_tables()
         span = self.cycle_length * self.transformed
-        residual = self._residual()[:, :self.transformed]
+        residual = self.residual()[:, :self.transformed]
         flat = np.ascontiguousarray(residual.reshape(len(residual), -1).T)
         time = self.place[:self.transformed].ravel()
         duration = float(time[-1] - time[0])
@@ -650,8 +661,9 @@ class _States:
         orders: list[float] = []
         tones: list[float] = []
         room = _MOST_LINES // (1 if self.all_free else 2) - self.lines_found
+        least_power = 0.0
         for size, place, tone in found:
-            if size < _SHARE * found[0][0] or len(orders) + len(tones) >= room:
+            if size < least_power or len(orders) + len(tones) >= room:
                 break
             others = np.array([*self.orders, *orders])
             beside = np.array([*self.tones, *tones])
@@ -662,6 +674,7 @@ class _States:
                 near_one = np.any(np.abs(others - place) * self.span < APART)
             if not near_one:
                 (tones if tone else orders).append(float(place))
+                least_power = max(least_power, _SHARE * size)
         return orders, tones
 
     def add(self, orders: Sequence[float] | Array, tones: Sequence[float] | Array) -> None:
@@ -680,7 +693,7 @@ class _States:
         tone moves by at most is returned in standard errors.
         """
         self._make_tables()
-        residual = self._residual()
+        residual = self.residual()
         cycle = np.arange(self.times.size - 1) - 0.5 * (self.times.size - 1)
         angle = self.cycle_length * (cycle[:, None] + self.u)
         time = self.place - self.place.mean()
@@ -708,7 +721,7 @@ class _States:
         self.orders[self.declared:] *= 1.0 - stretch
         self.states[:, 0] += stretch * self.ramp
         self.trend += stretch
-        self._read()
+        self.read()
         return float(np.max(np.abs(step) * np.sqrt(bottom[count:] * curves[1]), initial=0.0))
 
     def prune(self, least: float) -> None:
@@ -719,6 +732,7 @@ class _States:
         orders, tones = np.split(kept, [self.orders.size])
         self.orders, self.tones = self.orders[orders], self.tones[tones]
         self.amplitudes = self.amplitudes[:, kept]
+        self.turning, self.surely = self.turning[kept], self.surely[kept]
 
     def _amplitude_variances(self) -> Array:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
@@ -731,11 +745,8 @@ class _States:
 
     def result(self) -> RecordFit:
         """Return the fit, pulse errors and bends as good as unshrunk."""
-        size = float(self.size[0])
         variance = float(np.median(self._variances(0, _SAMPLED)))
-        kept = self.told[0]  # of an error
-        most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency) / size
-        weak = _WEAK * max(1.0, min(float(np.sqrt(variance / kept)) / size, most))
+        weak = _WEAK * max(1.0, float(np.sqrt(variance / self.told[0]) / self.size[0]))
         self.step(weak=_WEAK)
         self.step(weak=weak, move=False)
         errors = self.states[:, 0] + self.change
@@ -755,7 +766,7 @@ class _States:
             errors, np.sqrt(self._variances(0)), self._roughness(), bends, bend_errors,
             self.declared, self.orders, self.tones, self.amplitudes[:, :self.orders.size],
             self.amplitudes[:, self.orders.size:],
-            np.sqrt(variances), self._families(self._turning()),
+            np.sqrt(variances), self.turning,
             float(self.size[0]), self.size[:3] * np.array([weak, 1.0, 1.0]), self.trend,
             bool(gammaincc(shown.size, 0.5 * shown.sum()) < _FALSE / self.slopes))
 
@@ -770,26 +781,45 @@ class _States:
         variance = np.sum(unit * self.solved.of_errors(unit), axis=0)
         return float(np.sqrt(variance @ whole / max(whole.sum(), 1)))
 
-    def _families(self, turning: BoolArray) -> BoolArray:
-        """Return which orders turn: sidebands as far from declared lines or 0 turn alike."""
-        orders = self.orders[self.declared:]
-        beside = np.abs(orders[:, None] - self.orders[:self.declared]).min(axis=1)
-        distance = np.stack([beside, orders], axis=1)
-        apart = np.abs(distance[:, None, :, None] - distance[:, None, :])
-        alike = apart.min(axis=(2, 3)) * self.span < APART
-        found = turning.copy()
-        found[self.declared:] = np.any(alike & turning[self.declared:], axis=1)
-        return found
+    def _turning(self) -> tuple[BoolArray, BoolArray]:
+        """
+        Tell which orders, and tones after them (line,), turn with the shafts, and surely so.
 
-    def _turning(self) -> BoolArray:
-        """Tell which orders have more power over angle than any tone near them has over time."""
+        Shafts must have whole orders and the lines of the trigger cycle. Others have more power
+        over angle than any tone near them over time; of several side by side, as a machine makes
+        them whose own speed varies, that is not sure. Sidebands turn with those as far from
+        declared lines or 0; on a steady machine, several show a shaft.
+        """
+        lines = np.append(self.orders, self.tones / self.frequency)
+        declared, others = np.split(lines, [self.declared])
+        least, r = APART / self.span, self.cycle_length
+        exact = np.minimum(np.abs(others - np.rint(others)),
+                           np.abs(others * r - np.rint(others * r)) / r) < least
+        apart = others[:, None] - declared
+        near = np.argmin(np.abs(apart), axis=1)
+        offset = apart[np.arange(near.size), near]
+        distance = np.stack([np.abs(offset), others], axis=1)
+        alike = np.abs(distance[:, None, :, None] - distance[:, None, :]).min(axis=(2, 3)) < least
+        known = exact & (np.arange(others.size) < self.orders.size - self.declared)
+        for size in np.unique(np.abs(offset)).tolist():
+            beside = np.abs(np.abs(offset) - size) < least
+            sides = {*zip(near[beside].tolist(), (offset[beside] < 0.0).tolist())}
+            if len(sides) >= _FEWEST_SIDES:
+                known |= beside | (np.abs(others - size) < least)
         over_angle, over_time, _ = self._both_ways()
-        return np.append(np.ones(self.declared, np.bool_), over_angle > _SHARPER * over_time)
+        sharper = np.append(over_angle > _SHARPER * over_time,
+                            np.zeros(self.tones.size, np.bool_))
+        beside = np.abs(others[:, None] - others) * self.span < _SKIRT
+        alone = (np.count_nonzero(beside, axis=1) < 2) | (np.abs(offset) * self.span < _SKIRT)
+        own = np.ones(self.declared, np.bool_)
+        turning, surely = (np.append(own, np.any(alike & found, axis=1) | found)
+                           for found in (known | sharper, known | (sharper & alone)))
+        return turning, surely
 
     def let_stand(self) -> None:
         """Make tones of the undeclared orders that show better over time than over angle."""
         over_angle, over_time, tones = self._both_ways()
-        standing = over_time > over_angle
+        standing = (over_time > over_angle) & ~self.turning[self.declared:self.orders.size]
         if not standing.any():
             return
         self.orders = self.orders[np.append(np.ones(self.declared, np.bool_), ~standing)]
@@ -805,7 +835,7 @@ class _States:
     def _both_ways(self) -> tuple[Array, Array, Array]:
         """Return the power of undeclared orders, that of the best tones near them, and these."""
         self._make_tables()
-        residual = self._residual()
+        residual = self.residual()
         middle = self.place.mean(axis=1)
         angle = self.cycle_length * (np.arange(self.times.size - 1) + 0.5)
         reach = math.ceil(1.0 / _FINE)

@@ -19,22 +19,18 @@ from one with declared lines only is decided by the pulses: measured times less 
 a shaft, which turns smoothly, plus what the errors are wrong by.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.inference.beat import METHODS
 from sa_jitter_ros.inference.record_fit import APART, band_end, OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.resampling import gain
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
 
 FloatArray = NDArray[np.float64]
-ComplexArray = NDArray[np.complex128]
-BoolArray = NDArray[np.bool_]
 
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
@@ -46,16 +42,11 @@ RESOLVED = 0.7
 _WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
 # Second differences that are larger than this many of their median are no motion.
 _OUTLIER = 6.0
-# RMS of second differences, in that of what the errors are wrong by, that needs no other fit.
+# Ratio of RMS second differences that counts: to what the errors are wrong by, and of two fits.
 _SMOOTH = 1.5
 # Lines of an average within which an order is one that the shafts are known to have; amplitude, in
 # parts of the channel's strongest declared order, and number of orders that leak.
-_SMEARED = 4.0  # in what a stretch resolves: a beat that is even in time, over angle
 _ON_LINE, _STRONG, _MOST = 0.1, 5e-3, 20
-# A modulation that lines share: so many sidebands, of more than one line; how much of their power
-# may be no part of it; factor by which images of an interpolator may be larger or smaller;
-# multiples.
-_FEWEST_SIDES, _UNLIKE, _OTHER_SIZE, _MULTIPLES = 3, 0.15, 1.3, 3
 
 
 @dataclass(frozen=True)
@@ -163,7 +154,8 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
         none = np.zeros(0), np.zeros(0)
         bare = _joined(pulses, stretches, fits(none, wider))
         # pulses that are hardly corrected stay as smooth as a source that moves leaves them
-        if (bare.resolved or not recovery.resolved) and _roughness(bare) < roughness:
+        if (bare.resolved or not recovery.resolved) and (
+                _SMOOTH * _roughness(bare) < roughness):
             return replace(bare, fits=recovery.fits)
     return recovery
 
@@ -281,8 +273,8 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     Return the undeclared orders that leak into the declared ones, strongest first.
 
     These are orders that a shaft must have, and those that certainly turn with the shaft.
-    Sidebands that change all lines in phase are a modulation of the amplitudes, no lines; nor are
-    those that an average does not resolve from a line: they change it from average to average.
+    Those that an average does not resolve from a line are none: they change it from average to
+    average.
     """
     if not recovery.fits:
         return []
@@ -290,7 +282,6 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
     declared = fit.declared
     level = np.abs(fit.amplitudes[:, :declared]).max(axis=1, keepdims=True)
     share = np.max(np.abs(fit.amplitudes) / level, axis=0)
-    kept_out = modulating_lines(fit, model) | doubtful_lines(fit, model)
     # a trigger cycle that missing pulses make longer reads these as the declared ones
     longer = 1 + np.unique(recovery.missing[recovery.missing > 0])
     read = np.divide.outer(np.array(model.orders), longer)
@@ -303,104 +294,10 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
             continue
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact
-        wanted = order == round(order) or not kept_out[i]
+        wanted = order == round(order) or fit.turning[i]
         if wanted and np.abs(np.subtract((*model.orders, *found), order)).min() > resolved:
             found.append(order)
     return found
-
-
-def doubtful_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
-    """
-    Tell which orders, and tones after them (line,), may be those of no shaft.
-
-    On a steady machine no line shows whether it turns. A shaft is then known by its sidebands:
-    several lines as far from declared ones, and one at that distance from 0.
-    """
-    found = ~modulating_lines(fit, model)
-    exact = np.array([_exact(float(order), model) is not None for order in fit.orders])
-    found[:fit.orders.size] &= ~(exact | fit.turning)
-    orders, near, offsets = _places(fit, model)
-    for beside, distance in _sidebands(fit, model, near, offsets):
-        found[beside] = False
-        found[np.abs(orders - distance) < _resolved(fit, model)] = False
-    return found
-
-
-def _resolved(fit: RecordFit, model: DeclaredModel) -> float:
-    """Return how far apart orders of a fit must be to differ."""
-    return _SMEARED / (model.cycle_length * (fit.errors.size - 1))
-
-
-def _places(fit: RecordFit, model: DeclaredModel
-            ) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
-    """Return the orders of all lines, their nearest declared lines, and how far behind these."""
-    orders = np.append(fit.orders, fit.tones / model.fundamental_frequency)
-    apart = orders[:, None] - orders[:fit.declared]
-    near = np.argmin(np.abs(apart), axis=1)
-    return orders, near, apart[np.arange(near.size), near]
-
-
-def _sidebands(fit: RecordFit, model: DeclaredModel, near: NDArray[np.intp], offsets: FloatArray
-               ) -> Iterator[tuple[NDArray[np.intp], float]]:
-    """Iterate over lines that are as far from declared ones on several sides, and how far."""
-    for distance in np.unique(np.abs(offsets[fit.declared:])).tolist():
-        beside = np.flatnonzero(np.abs(np.abs(offsets) - distance) < _resolved(fit, model))
-        beside = beside[beside >= fit.declared]
-        if len({(near[i], offsets[i] < 0.0) for i in beside}) >= _FEWEST_SIDES:
-            yield beside, distance
-
-
-def modulating_lines(fit: RecordFit, model: DeclaredModel) -> BoolArray:
-    """
-    Tell which orders, and tones after them (line,), are sidebands of a modulation of all lines.
-
-    An interpolator with the response H makes images of all lines, H(f + fs) and H(f - fs) over
-    H(f) times as large, which the drift between two clocks puts beside the lines; a gain that
-    varies makes sidebands of one size. In both cases one phase goes with all of them. What turns
-    the lines alike was taken for pulse errors, so that the sum of both sides is compared. A shaft
-    that shows itself, by a line as far from 0 or as the shaft of the keyphasor, makes sidebands
-    of any phases, which look like one another by chance.
-    """
-    orders, near, offsets = _places(fit, model)
-    amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
-    declared, least = orders[:fit.declared], _resolved(fit, model)
-    relative = declared * model.fundamental_frequency / model.sample_rate
-    shapes = [(np.ones(declared.size), np.inf)]
-    for method in METHODS:
-        images = np.array([gain(method, relative + turn) for turn in (-1.0, 1.0)])
-        shapes.append((np.abs(images / gain(method, relative)).sum(axis=0), _OTHER_SIZE))
-    found = np.zeros(orders.size, np.bool_)
-    level = np.abs(amplitudes[:, :fit.declared])
-    for beside, distance in _sidebands(fit, model, near, offsets):
-        turns = np.append(orders[fit.declared:], max(1.0, round(distance)))
-        if np.any(np.abs(turns - distance) < least):
-            continue
-        sides = np.zeros(level.shape, np.complex128)
-        for i in beside:
-            side = amplitudes[:, i] / amplitudes[:, near[i]]
-            sides[:, near[i]] += side if offsets[i] > 0.0 else side.conj()
-        if any(_follow(sides, shape, level, most) for shape, most in shapes):
-            strong = np.abs(amplitudes).max(axis=0)
-            strong[:fit.declared] = np.inf
-            for multiple in distance * np.arange(1, _MULTIPLES + 1):
-                away = np.abs(np.abs(orders[:, None] - orders) - multiple) < least
-                found |= np.any(away & (strong > strong[:, None]), axis=1)
-    found[:fit.declared] = False
-    return found
-
-
-def _follow(sides: ComplexArray, shape: FloatArray, level: FloatArray, most: float) -> bool:
-    """
-    Tell whether sidebands follow a shape, up to a phase and a size that is known to a factor.
-
-    `sides` (channel, line) are those of both sides over their lines, 0 where none was found;
-    `shape` is (line,); `level` (channel, line) are the lines.
-    """
-    weight = np.where(sides != 0.0, shape * level, 0.0)
-    scaled = sides / shape
-    common = np.sum(weight * scaled) / weight.sum()
-    away = np.sum(weight * np.abs(scaled - common) ** 2) / weight.sum()
-    return bool(away < _UNLIKE * abs(common) ** 2 and 1.0 / most < abs(common) < most)
 
 
 def _made_exact(orders: FloatArray, model: DeclaredModel) -> FloatArray:
