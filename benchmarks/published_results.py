@@ -55,7 +55,8 @@ CASES = (
     'none 1009 poor_reference', 'additive_noise 1007 fast_at_times', 'clock_skew 1000 short',
     'none 1009 much_jitter', 'none 1009 little_jitter', 'none 52619 coarse_clock',
     'none 52619 two_clocks', 'none 1009 swaying', 'none 1009 interrupted',
-    'clock_skew 1000 interrupted', 'none 1009 slow_clock', 'two_paths 56002')
+    'clock_skew 1000 interrupted', 'none 1009 slow_clock', 'two_paths 56002',
+    'excess_jitter 70001', 'none 1009 foreign_shaft', 'none 1013 late')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 #: What rounding decides: limits of an even likelihood, and changes near the bound of `undecided`.
@@ -129,6 +130,22 @@ def _slow_clock(times: NDArray[np.float64], made: Measurement) -> NDArray[np.flo
     return times + 2e-5 * (times - times[0])
 
 
+def _late(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times that are late by as much as the speed of the machine shows."""
+    return times + 0.012
+
+
+def _foreign_shaft(made: Measurement) -> None:
+    """Add the lines of a shaft whose speed varies by itself, as that of a second motor."""
+    vibration, rate = made.fields['vibration'], float(made.fields['sample_rate'])
+    time = np.arange(vibration.shape[-1]) / rate
+    speed, slow = 2.42 / made.interval, 2.3 / time[-1]
+    turns = speed * (time + 1e-3 * np.sin(2.0 * np.pi * slow * time) / (2.0 * np.pi * slow))
+    for order in (1, 2, 3, 5):
+        made.fields['vibration'] = made.fields['vibration'] + 0.3 * np.std(vibration) * np.cos(
+            2.0 * np.pi * order * turns + order)
+
+
 def _coarse_clock(made: Measurement) -> float:
     """Let a clock of 17.5 ticks an interval time the pulses, and declare it; return its rate."""
     rate = 17.5 / made.interval
@@ -186,6 +203,8 @@ DAMAGES: Mapping[str, Callable[[Measurement], Any]] = {
     'swaying': _replace_pulses(_swaying),
     'interrupted': _replace_pulses(_interrupted),
     'slow_clock': _replace_pulses(_slow_clock),
+    'late': _replace_pulses(_late),
+    'foreign_shaft': _foreign_shaft,
     'coarse_clock': _coarse_clock,
     'two_clocks': _two_clocks,
     'late_reference': _reference(0.1, 1.0),

@@ -34,7 +34,8 @@ REMARKS = {
     'short': 'no line is compared: 2 acquisitions of 12 trigger cycles'}
 EFFECTS = {
     'much_jitter': 'jitter_scale', 'little_jitter': 'excess_jitter',
-    'coarse_clock': 'keyphasor_quantisation'}
+    'coarse_clock': 'keyphasor_quantisation', 'late': 'path_delay',
+    'foreign_shaft': 'interfering_tone'}
 AGAINST = {'late_reference': 'reference keyphasor', 'poor_reference': 'vibration'}
 
 
@@ -82,6 +83,12 @@ def test_sizes_that_were_declared_wrong_are_measured():
     machine = truth('none 52619 coarse_clock')[0].machine
     clock = 17.5 * machine.speed * machine.pulses_per_revolution
     assert coarse['parameters']['clock_rate']['value'] == pytest.approx(clock, rel=1e-3)
+
+
+def test_a_delay_is_measured_by_the_speed_that_changes():
+    late, = json.loads(RESULTS.read_text())['none 1013 late']['missing_effects']
+    delay = late['parameters']['delay']
+    assert abs(delay['value'] - 0.012) < 3.0 * delay['standard_error'] < 2e-3
 
 
 def test_a_skew_too_small_to_matter_is_present():
