@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.inference.gathering import choose_lines
-from sa_jitter_ros.inference.line_checks import check_gain, check_lines
+from sa_jitter_ros.inference.line_checks import check_channels, check_gain, check_lines
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -65,6 +65,20 @@ def test_gain_of_single_events_is_no_modulation(rng, event):
         np.array([20.0, 40.0]), np.zeros(2, int), np.ones(2), np.ones((acquisitions, 2)),
         radial.reshape(acquisitions, cycles, 2), np.array([0.02, 0.02])))
     assert (found.p_value < 1e-6) == (event != 'none')
+
+
+@pytest.mark.parametrize('drifting', [False, True])
+def test_gain_of_one_channel_is_none_of_all(rng, drifting):
+    acquisitions, cycles = 12, 20
+    common = 0.1 * rng.standard_normal((acquisitions, 1, 1))
+    radial = common + 0.02 * rng.standard_normal((acquisitions, cycles, 4))
+    if drifting:
+        radial[..., 2:] += np.linspace(-0.2, 0.2, acquisitions)[:, None, None]
+    found = check_channels(LineEvidence(
+        np.array([20.0, 40.0] * 2), np.array([0, 0, 1, 1]), np.ones(4), np.ones((acquisitions, 4)),
+        radial, np.full(4, 0.02)))
+    assert (found.p_value < 1e-6) == drifting
+    assert not drifting or 'channel 1' in found.text
 
 
 @pytest.mark.parametrize('noise', [1.0, 4.0])

@@ -126,6 +126,14 @@ def test_a_delay_shows_on_either_side_of_what_is_held_out():
         assert error < 1.5 * value_of(read_timing([whole]), 'path_delay', 'delay')[1]
 
 
+def test_independent_errors_beside_a_slow_motion_have_no_memory():
+    """Errors with a memory explain both at first, so that jitter begins in their place."""
+    for seed in range(2):
+        timing = read_timing([machine(
+            [64, seed], excess=6.0, wander=6.0, band=(0.0, 0.1), noise=0.6, count=900)])
+        assert names_of(timing) == {'excess_jitter', 'phase_wander'}
+
+
 def test_a_beat_within_the_cycles_is_no_acceleration(rng):
     """Neighbouring bends of a slow motion are more alike than those of a line that comes by."""
     part = machine(7)

@@ -34,7 +34,7 @@ from scipy import special
 Array = NDArray[Any]
 
 LINES = 'lines'
-_TURN = 0.03  # rad, by which the lines of steady machines turn each by itself at most
+_TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
 _NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 9.0  # kurtosis; a gain that swings by a third loses cycles, which makes half of it
 _FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
@@ -57,6 +57,26 @@ def check_gain(lines: LineEvidence) -> Check:
     return Check(p_value, LINES, float(np.std(gain)),
                  'the amplitudes grow and shrink together by single events, as steps or losses of '
                  f'signal make them: {float(np.std(gain)):.2g} RMS')
+
+
+def check_channels(lines: LineEvidence) -> Check:
+    """Test whether the averages of one channel grow and shrink by themselves, as a drift does."""
+    weight = lines.radial_noise**-2.0 * lines.radial.shape[1]
+    means, checks = lines.radial.mean(axis=1), []
+    names = np.unique(lines.channel)
+    changes = [float(np.std(means[:, lines.channel == name])) for name in names]
+    for name in names[np.argsort(changes)[::-1]].tolist() if names.size > 1 else ():
+        parts = [lines.channel == name, lines.channel != name]
+        own, others = (means[:, part] @ weight[part] / weight[part].sum() for part in parts)
+        apart, freedom = own - others, len(own) - 1
+        noise = sum(1.0 / weight[part].sum() for part in parts) + _TURN**2
+        size = float(np.std(apart, ddof=1))
+        checks.append(Check(
+            min(1.0, float(special.chdtrc(freedom, freedom * size**2 / noise)) * names.size),
+            LINES, size, f'the amplitudes of channel {name} change by {size:.2g} RMS from average '
+            'to average, relative to the other channels'))
+    return min(checks, key=lambda check: check.p_value,
+               default=Check(1.0, LINES, 0.0, 'the amplitudes of one channel'))
 
 
 def _smooth(waves: Array) -> Array:

@@ -284,6 +284,7 @@ class States:
         self.trend = 0.0
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self.turning = self.surely = np.ones(orders.size, np.bool_)
+        self._made: tuple[bytes, bytes, Array] = b'', b'', np.zeros(0)
         self.read()
 
     @property
@@ -321,22 +322,35 @@ class States:
         self.vibration = np.moveaxis(found, 2, 0) * self.whole[:, None]
 
     def _make_tables(self) -> None:
-        """Make the lines: of orders, a phase for each cycle times a wave that all cycles share."""
+        """
+        Make the lines: of orders, a phase for each cycle times a wave that all cycles share.
+
+        What is there of the same lines at the same places is left as it is.
+        """
+        made = self.orders.tobytes(), self.tones.tobytes(), self.place
+        if self._made[:2] == made[:2] and self._made[2] is self.place:
+            return
+        self._made = made
         cycle = np.arange(self.times.size - 1)[:, None]
         self.turn = np.exp(2j * np.pi * (self.cycle_length * cycle * self.orders % 1.0))
         self.turn *= self.whole[:, None]
         self.wave = np.exp(2j * np.pi * self.cycle_length * self.orders[:, None] * self.u)
         self.reading = np.ascontiguousarray(self.wave.conj().T).view(np.float64).T
-        self.in_time = np.exp(2j * np.pi * self.tones[:, None, None]
-                              * (self.place - self.start_time)) * self.whole[:, None]
+        # cosines and sines of the tones side by side (cycle, point, 2 tone)
+        turned = (self.place - self.start_time)[..., None] * (2.0 * np.pi * self.tones)
+        self.in_time = np.stack([np.cos(turned), np.sin(turned)], axis=-1).reshape(
+            *self.place.shape, -1)
+        self.in_time *= self.whole[:, None, None]
         straight = (self.turn.conj().T @ self.turn) * (self.wave.conj() @ self.wave.T)
         mirrored = (self.turn.T @ self.turn) * (self.wave @ self.wave.T)
         if self.tones.size:
-            n, flat = self.orders.size, self.in_time.reshape(self.tones.size, -1)
+            n, tones = self.orders.size, self.in_time.reshape(-1, 2 * self.tones.size)
+            both = np.concatenate([self.wave.real, self.wave.imag]) @ self.in_time
+            cos, sin = both[:, :n].view(np.complex128), both[:, n:].view(np.complex128)
             plus, minus = (np.hstack([  # (tone, line)
-                np.einsum('tkn,kn->tn', self.in_time @ wave.T, turn), flat @ other.T])
-                for wave, turn, other in ((self.wave, self.turn, flat),
-                                          (self.wave.conj(), self.turn.conj(), flat.conj())))
+                np.einsum('knt,kn->tn', cos + sign * sin, turn), own])
+                for sign, turn, own in zip(
+                    (1j, -1j), (self.turn, self.turn.conj()), _products(tones.T @ tones)))
             straight = np.block([[straight, minus[:, :n].T], [minus.conj()]])
             mirrored = np.block([[mirrored, plus[:, :n].T], [plus]])
         cross = 0.5 * (mirrored.imag + straight.imag)
@@ -350,9 +364,9 @@ class States:
         parts = np.multiply(amplitudes[:, None, :n], self.turn, order='C').view(np.float64)
         found = (parts.reshape(-1, 2 * n) @ self.reading).reshape(
             len(parts), -1, self.u.size)
-        for total, row in zip(found, amplitudes[:, n:]):
-            for amplitude, tone in zip(row, self.in_time):
-                total += amplitude.real * tone.real - amplitude.imag * tone.imag
+        if self.tones.size:
+            rest = np.ascontiguousarray(amplitudes[:, n:].conj()).view(np.float64)
+            found += np.moveaxis(self.in_time @ rest.T, 2, 0)
         return np.asarray(found)
 
     def _sums(self, values: Array, shapes: Array | None = None) -> ComplexArray:
@@ -367,8 +381,8 @@ class States:
             len(values), len(some), -1)
         found *= self.turn[:, None]
         if self.tones.size:
-            found = np.concatenate([found, np.stack(
-                [(values * tone) @ some.T for tone in self.in_time], axis=2)], axis=2)
+            found = np.concatenate([found, ((values[:, None] * some) @ self.in_time).view(
+                np.complex128)], axis=2)
         return np.asarray(found if shapes is not None else found[:, 0])
 
     def residual(self) -> Array:
@@ -938,6 +952,12 @@ class _Solved:
             found[k] = last = own + step * last
         found = found[::-1]
         return found, -ratio[:-1] * found[1:]
+
+
+def _products(parts: Array) -> tuple[ComplexArray, ComplexArray]:
+    """Return products of waves, and those with the conjugate, of cosines and sines in turn."""
+    cos, sin = parts[::2].view(np.complex128), parts[1::2].view(np.complex128)
+    return cos + 1j * sin, (cos - 1j * sin).conj()
 
 
 def _of_errors(through: Array, right: Array) -> Array:

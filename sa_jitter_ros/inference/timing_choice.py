@@ -31,7 +31,7 @@ from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
 from sa_jitter_ros.effects.timing import (
-    FAINT, LARGE, MOTION, Pattern, Setting, SOURCE, Spectrum)
+    FAINT, LARGE, MOTION, Pattern, PULSES, Setting, SOURCE, Spectrum)
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing_data import Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
@@ -339,13 +339,20 @@ class Chooser:
             moves += [best - {name} for name in best]
             moves += [(best - {name}) | {other} for name in best for other in pool
                       if other not in best]
-            start = self.fits[best].starts
-            scores = {move: self.score(move, self.fit(move, start)) for move in moves}
+            scores = {move: self.score(move, self.fit(move, self._start(best, move)))
+                      for move in moves}
             better = max(scores, key=lambda move: scores[move])
             if scores[better] <= top:
                 break
             best, top = better, scores[better]
         return self.choice(best)
+
+    def _start(self, best: frozenset[str], move: frozenset[str]) -> Mapping[str, Array]:
+        """Return where the fit of a set begins: jitter in place of other errors is as large."""
+        start = self.fits[best].starts
+        power = sum(math.exp(start[name][0]) for name in best - move & self.spectra.keys()
+                    if self.spectra[name].direction == PULSES)
+        return {JITTER: np.array([math.log1p(power)]), **start} if power else start
 
     def _of_ticks(self) -> frozenset[str]:
         """Return a clock and the fewest other patterns beside which its ticks make all errors."""

@@ -43,7 +43,7 @@ from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, hidden_lines, line_evidence,
     pulse_evidence)
-from sa_jitter_ros.inference.line_checks import check_gain, check_lines
+from sa_jitter_ros.inference.line_checks import check_channels, check_gain, check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.observation import Observation, together
 from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UNDEFINED
@@ -461,7 +461,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
                          for speed in speeds.tolist()], axis=0)
     of_lines = check_lines(bench.observation, bench.lines, explained)
     if _GAIN in names:
-        of_lines = (*of_lines, check_gain(bench.scatter))
+        of_lines = (*of_lines, check_gain(bench.scatter), check_channels(bench.scatter))
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
