@@ -819,7 +819,8 @@ class States:
             beside = np.abs(np.abs(offset) - size) < least
             sides = {*zip(near[beside].tolist(), (offset[beside] < 0.0).tolist())}
             if len(sides) >= _FEWEST_SIDES:
-                known |= beside | (np.abs(others - size) < least)
+                known |= np.any(np.abs(np.abs(apart) - size) < least, axis=1)
+                known |= np.abs(others - size) < least
         over_angle, over_time, _ = self._both_ways()
         sharper = np.append(over_angle > _SHARPER * over_time,
                             np.zeros(self.tones.size, np.bool_))
