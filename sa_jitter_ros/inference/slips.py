@@ -32,8 +32,6 @@ Array = NDArray[np.float64]
 # Errors that are tried, in parts of a turn of the highest declared order, to either side; the size
 # of errors, in turns, from which one of some hundreds is half a turn or more.
 _PLACES, _SLIPPING = 6, 0.125
-# A cycle is fitted badly where noise leaves more once in so many recordings, by some margin.
-_FALSE, _MARGIN = 1e-3, 1.25
 
 
 def mend_slips(states: 'States') -> bool:
@@ -50,7 +48,7 @@ def mend_slips(states: 'States') -> bool:
     tried = turn / _PLACES * np.arange(-reach, reach + 1)
     power = np.einsum('c,ckp->k', states.weight, states.residual() ** 2)
     freedom = 0.5 * states.vibration.shape[0] * states.u.size
-    limit = gammainccinv(freedom, _FALSE / power.size) / freedom * _MARGIN
+    limit = gammainccinv(freedom, 1.0 / power.size) / freedom  # one cycle by chance
     bad = power > limit * np.median(power[states.whole])
     loose = np.append(bad, False) | np.append(False, bad)
     edges = np.flatnonzero(np.diff(np.pad(loose.astype(int), 1)))
