@@ -280,10 +280,11 @@ class States:
         even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
         self.most_power = independent_power(np.diff(times, 3)[even]) if even.any() else math.inf
         # the straight line of the errors, which is no jitter, is `trend` times this
-        self.ramp = (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean())
+        self.ramp: Array = float(np.diff(times).mean()) * (
+            np.arange(times.size) - 0.5 * (times.size - 1))
         self.trend = 0.0
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
-        self.turning = self.surely = np.ones(orders.size, np.bool_)
+        self.turning = self.single = np.ones(orders.size, np.bool_)
         self._made: tuple[bytes, bytes, Array] = b'', b'', np.zeros(0)
         self.read()
 
@@ -295,7 +296,7 @@ class States:
     @property
     def moving(self) -> BoolArray:
         """Return which lines (line,) are orders of shafts, which the states move."""
-        return self.surely & (np.arange(self.surely.size) < self.orders.size)
+        return self.single & (np.arange(self.single.size) < self.orders.size)
 
     @property
     def transformed(self) -> int:
@@ -399,7 +400,7 @@ class States:
         found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
         n = len(right)
         self.amplitudes = (found[:n] + 1j * found[n:]).T
-        self.turning, self.surely = self._turning()
+        self.turning, self.single = self._turning()
 
     # --- one step ---
 
@@ -746,7 +747,7 @@ class States:
         orders, tones = np.split(kept, [self.orders.size])
         self.orders, self.tones = self.orders[orders], self.tones[tones]
         self.amplitudes = self.amplitudes[:, kept]
-        self.turning, self.surely = self.turning[kept], self.surely[kept]
+        self.turning, self.single = self.turning[kept], self.single[kept]
 
     def _amplitude_variances(self) -> Array:
         """Return the variances (channel, line) of real and imaginary part of the amplitudes."""
@@ -797,12 +798,12 @@ class States:
 
     def _turning(self) -> tuple[BoolArray, BoolArray]:
         """
-        Tell which orders, and tones after them (line,), turn with the shafts, and surely so.
+        Tell which orders, and tones after them (line,), turn with the shafts, and which may.
 
         Shafts must have whole orders and the lines of the trigger cycle. Others have more power
-        over angle than any tone near them over time; of several side by side, as a machine makes
-        them whose own speed varies, that is not sure. Sidebands turn with those as far from
-        declared lines or 0; on a steady machine, several show a shaft.
+        over angle than any tone near them over time. Sidebands turn with those as far from
+        declared lines or 0; on a steady machine, several show a shaft. Lines that stand alone may
+        turn, but not several side by side, as a machine makes them whose own speed varies.
         """
         lines = np.append(self.orders, self.tones / self.frequency)
         declared, others = np.split(lines, [self.declared])
@@ -827,9 +828,9 @@ class States:
         beside = np.abs(others[:, None] - others) * self.span < _SKIRT
         alone = (np.count_nonzero(beside, axis=1) < 2) | (np.abs(offset) * self.span < _SKIRT)
         own = np.ones(self.declared, np.bool_)
-        turning, surely = (np.append(own, np.any(alike & found, axis=1) | found)
-                           for found in (known | sharper, known | (sharper & alone)))
-        return turning, surely
+        turning, single = (np.append(own, np.any(alike & found, axis=1) | found)
+                           for found in (known | sharper, known | alone))
+        return turning, single
 
     def let_stand(self) -> None:
         """Make tones of the undeclared orders that show better over time than over angle."""

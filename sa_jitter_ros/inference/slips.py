@@ -17,15 +17,12 @@ the wrong turn. Around cycles that the lines do not fit, errors are chosen anew,
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.special import gammainccinv
-
-if TYPE_CHECKING:
-    from sa_jitter_ros.inference.record_fit import States
 
 Array = NDArray[np.float64]
 
@@ -34,7 +31,47 @@ Array = NDArray[np.float64]
 _PLACES, _SLIPPING = 6, 0.125
 
 
-def mend_slips(states: 'States') -> bool:
+class States(Protocol):
+    """What slips are mended in: the states of the record fit, which says what its parts are."""
+
+    samples: Array
+    sample_rate: float
+    start_time: float
+    times: Array
+    whole: NDArray[np.bool_]
+    frequency: float
+    declared: int
+    orders: Array
+    tones: Array
+    amplitudes: NDArray[np.complex128]
+    states: Array
+    size: Array
+    trend: float
+    ramp: Array
+    u: Array
+    shapes: Array
+    slope: Array
+    vibration: Array
+    weight: Array
+
+    @property
+    def moving(self) -> NDArray[np.bool_]:
+        """Return which lines the states move."""
+
+    def residual(self) -> Array:
+        """Return the vibration less the lines (channel, cycle, point)."""
+
+    def signals(self, amplitudes: NDArray[np.complex128]) -> Array:
+        """Return the sums (channel, cycle, point) of orders."""
+
+    def read(self) -> None:
+        """Read the vibration at the present angle."""
+
+    def fit_amplitudes(self) -> None:
+        """Fit the amplitudes of all lines with the states as they are."""
+
+
+def mend_slips(states: States) -> bool:
     """
     Choose errors anew where the lines do not fit; return whether some have changed.
 
@@ -79,7 +116,7 @@ def mend_slips(states: 'States') -> bool:
     return mended
 
 
-def _misfits(states: 'States', cycle: int, one: Array, other: Array, signals: Array, rate: Array
+def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Array, rate: Array
              ) -> Array:
     """
     Return minus the log likelihood of a cycle for changes of its two errors (one, other).
