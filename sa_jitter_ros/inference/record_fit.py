@@ -280,8 +280,8 @@ class States:
         even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
         self.most_power = independent_power(np.diff(times, 3)[even]) if even.any() else math.inf
         # the straight line of the errors, which is no jitter, is `trend` times this
-        self.ramp: Array = float(np.diff(times).mean()) * (
-            np.arange(times.size) - 0.5 * (times.size - 1))
+        self.ramp: Array = np.asarray(
+            (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean()))
         self.trend = 0.0
         self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
         self.turning = self.single = np.ones(orders.size, np.bool_)
