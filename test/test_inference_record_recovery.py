@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.inference.record_recovery import recover_record
+from sa_jitter_ros.inference.record_recovery import leaking_orders, recover_record
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
@@ -100,27 +100,15 @@ def test_sidebands_of_a_shaft_are_no_tones_on_a_steady_machine(rng):
         assert not alone.size
 
 
-def machine(rng, *, ratio=2.4, clock=0.0, gap=False):
-    """
-    Return samples, pulses and true errors of a machine whose speed drifts.
-
-    `clock` is the relative offset of the clock whose samples were interpolated linearly.
-    """
+def machine(rng, *, ratio=2.4, gap=False):
+    """Return samples, pulses and true errors of a machine whose speed drifts."""
     time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
 
     def turns(when):
         return SPEED * (when + 0.005 * when**2 / time[-1])
 
-    def wave(when):
-        return sum(size * np.cos(2.0 * np.pi * order * ratio * turns(when) + order)
-                   for order, size in ((8.0, 1.0), (16.0, 0.7), (8.37, 0.2)))
-
-    vibration = wave(time)
-    if clock:
-        place = (1.0 + clock) * np.arange(time.size)
-        index = place.astype(int)
-        first, second = (wave((index + k) / RATE / (1.0 + clock)) for k in (0, 1))
-        vibration = first + (place - index) * (second - first)
+    vibration = sum(size * np.cos(2.0 * np.pi * order * ratio * turns(time) + order)
+                    for order, size in ((8.0, 1.0), (16.0, 0.7), (8.37, 0.2)))
     vibration = vibration + 0.02 * rng.standard_normal(time.size)
     true = np.interp(np.arange(0.5, turns(time[-1])), turns(time), time)
     errors = rng.uniform(-0.5, 0.5, true.size) / 10000.0
@@ -184,6 +172,12 @@ def test_roughness_is_that_of_what_the_errors_are_wrong_by(rng):
     # Neighbours are not independent. The fit allows for bends, which this machine does not have.
     assert np.mean(seen) == pytest.approx(
         np.mean(stated), rel=4.0 * np.sqrt(4.0 / count) + 0.15)
+
+
+def test_an_order_that_turns_with_the_shaft_leaks(rng):
+    samples, pulses, _ = machine(rng)
+    found = recover_record(samples, 0.0, RATE, pulses, model_of())
+    assert leaking_orders(found, model_of()) == pytest.approx([8.37], abs=1e-3)
 
 
 @pytest.mark.machines

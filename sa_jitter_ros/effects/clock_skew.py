@@ -31,7 +31,7 @@ def _growing(setting: Setting) -> Array:
 
     The turn that is common to all pulses takes longer where the speed is low.
     """
-    common = np.mean(setting.fitted - setting.begin) / np.mean(np.diff(setting.fitted))
+    common = np.mean(setting.fitted - setting.begin) / setting.common_period
     delay = setting.times - setting.begin - common * trigger_periods(setting.true_times)
     return np.asarray(delay)[None] / setting.model.trigger_period
 

@@ -36,7 +36,7 @@ STEADY = 1e-4
 def _of_speed(setting: Setting) -> Array:
     """Return a delay less the turn of all, which takes longer when slow; none if steady."""
     period = trigger_periods(setting.true_times)
-    longer = period / np.diff(setting.fitted).mean() - 1.0  # of all that the turn is common to
+    longer = period / setting.common_period - 1.0
     return np.asarray(-longer)[None] if np.std(longer) > STEADY else np.zeros((0, period.size))
 
 

@@ -57,6 +57,11 @@ class Setting:
     clock_errors: Array | None = None
     clock_rate: float = 0.0
 
+    @property
+    def common_period(self) -> float:
+        """Return the mean trigger period (s) of all pulses that have the turn in common."""
+        return float(np.diff(self.fitted).mean())
+
 
 @dataclass(frozen=True)
 class Spectrum:

@@ -61,7 +61,7 @@ _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
 _MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
-_LAST_STEPS, _CONVERGED = 6, 1e-3
+_LAST_STEPS, _CONVERGED = 6, 1e-3  # as often slips are mended
 # A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
 # it must not be far below the strongest, which may leave images of itself.
 _FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
@@ -102,11 +102,10 @@ class RecordFit:
     amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
     imaginary parts. `turning` (line,) tells which orders, and tones after them, turn with the
     shafts: orders that shafts must have, those that a varying speed shows to turn, and sidebands
-    of several lines. `jitter_std` (s)
-    is the estimated size of the pulse errors; `expected_std` (3,) in s are the sizes of errors and
-    bends that the fit expected, towards 0, the errors towards a line that grows by `trend` s in a
-    second. Declared lines that stand out of the noise have `held` the angle to the pulses: others
-    go along with any drift.
+    of several lines. `jitter_std` (s) is the estimated size of the pulse errors; `expected_std`
+    (3,) in s are the sizes of errors and bends that the fit expected, towards 0, the errors
+    towards a line that grows by `trend` s in a second. Declared lines that stand out of the noise
+    have `held` the angle to the pulses: others go along with any drift.
     """
 
     errors: Array
@@ -312,15 +311,19 @@ class States:
     # --- the vibration at the present angle, and the lines in it ---
 
     def read(self) -> None:
+        """Read the vibration at the present angle."""
         corrected = self.times - self.states[:, 0]
         period = np.diff(corrected)
         self.slope = self.cycle_length / period
         self.place = (corrected[:-1, None] + period[:, None] * self.u
                       - self.states[:-1, 1:-1] @ self.shapes[1:-2])
-        position = np.clip((self.place - self.start_time) * self.sample_rate, 0.0,
+        self.vibration = np.moveaxis(self.vibration_at(self.place), 2, 0) * self.whole[:, None]
+
+    def vibration_at(self, place: Array) -> Array:
+        """Return the vibration (..., channel) at times (...) in s."""
+        position = np.clip((place - self.start_time) * self.sample_rate, 0.0,
                            len(self.samples) - 1.0)
-        found = interpolate(self.samples, position.ravel()).reshape(*self.place.shape, -1)
-        self.vibration = np.moveaxis(found, 2, 0) * self.whole[:, None]
+        return interpolate(self.samples, position.ravel()).reshape(*place.shape, -1)
 
     def _make_tables(self) -> None:
         """
@@ -386,7 +389,15 @@ class States:
                 np.complex128)], axis=2)
         return np.asarray(found if shapes is not None else found[:, 0])
 
+    def rate(self) -> Array:
+        """Return the derivative (channel, cycle, point) of the lines by the pulse errors."""
+        turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
+        found = self.signals(turns * self.moving * self.amplitudes)
+        found *= self.slope[:, None]
+        return found
+
     def residual(self) -> Array:
+        """Return the vibration less the lines (channel, cycle, point)."""
         return np.asarray(self.vibration - (1.0 + self.states[:-1, -1:]) * self.signals(
             self.amplitudes))
 
@@ -415,10 +426,7 @@ class States:
         self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
         if self.settled:
             self._weigh(residual)
-        turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
-        rate = self.signals(turns * self.moving * self.amplitudes)
-        rate *= self.slope[:, None]
-        change, amplitudes, trend = self._solve(residual, (rate, moving), weak)
+        change, amplitudes, trend = self._solve(residual, (self.rate(), moving), weak)
         self.change = change[:, 0]
         size = float(np.sqrt(np.mean(self.change**2)))
         if move:
@@ -689,7 +697,7 @@ class States:
                 near_one = np.any(np.abs(others - place) * self.span < APART)
             if not near_one:
                 (tones if tone else orders).append(float(place))
-                least_power = max(least_power, _SHARE * size)
+                least_power = least_power or _SHARE * size
         return orders, tones
 
     def add(self, orders: Sequence[float] | Array, tones: Sequence[float] | Array) -> None:
@@ -825,8 +833,8 @@ class States:
         over_angle, over_time, _ = self._both_ways()
         sharper = np.append(over_angle > _SHARPER * over_time,
                             np.zeros(self.tones.size, np.bool_))
-        beside = np.abs(others[:, None] - others) * self.span < _SKIRT
-        alone = (np.count_nonzero(beside, axis=1) < 2) | (np.abs(offset) * self.span < _SKIRT)
+        close = np.abs(others[:, None] - others) * self.span < _SKIRT
+        alone = (np.count_nonzero(close, axis=1) < 2) | (np.abs(offset) * self.span < _SKIRT)
         own = np.ones(self.declared, np.bool_)
         turning, single = (np.append(own, np.any(alike & found, axis=1) | found)
                            for found in (known | sharper, known | alone))

@@ -21,7 +21,6 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.special import gammainccinv
 
 Array = NDArray[np.float64]
@@ -34,8 +33,6 @@ _PLACES, _SLIPPING = 6, 0.125
 class States(Protocol):
     """What slips are mended in: the states of the record fit, which says what its parts are."""
 
-    samples: Array
-    sample_rate: float
     start_time: float
     times: Array
     whole: NDArray[np.bool_]
@@ -50,19 +47,20 @@ class States(Protocol):
     ramp: Array
     u: Array
     shapes: Array
-    slope: Array
     vibration: Array
     weight: Array
-
-    @property
-    def moving(self) -> NDArray[np.bool_]:
-        """Return which lines the states move."""
 
     def residual(self) -> Array:
         """Return the vibration less the lines (channel, cycle, point)."""
 
     def signals(self, amplitudes: NDArray[np.complex128]) -> Array:
-        """Return the sums (channel, cycle, point) of orders."""
+        """Return the sums (channel, cycle, point) of lines."""
+
+    def rate(self) -> Array:
+        """Return the derivative (channel, cycle, point) of the lines by the pulse errors."""
+
+    def vibration_at(self, place: Array) -> Array:
+        """Return the vibration (..., channel) at times (...) in s."""
 
     def read(self) -> None:
         """Read the vibration at the present angle."""
@@ -92,10 +90,8 @@ def mend_slips(states: States) -> bool:
     expected = states.states.copy()
     expected[:, 0] -= states.trend * states.ramp
     before = 0.5 * np.sum((expected / states.size) ** 2, axis=1)
-    turns = 2j * np.pi * np.append(states.orders, np.zeros(states.tones.size)) * states.moving
     of_orders = np.arange(states.amplitudes.shape[1]) < states.orders.size
-    signals = states.signals(of_orders * states.amplitudes)
-    rate = states.signals(turns * states.amplitudes)
+    signals, rate = states.signals(of_orders * states.amplitudes), states.rate()
     mended = False
     for first, end in edges.reshape(-1, 2).tolist():
         chosen = np.arange(max(first - 1, 0), min(end + 1, states.times.size))
@@ -122,24 +118,20 @@ def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Arra
     Return minus the log likelihood of a cycle for changes of its two errors (one, other).
 
     Its bends and gain are then the likeliest ones. `signals` (channel, point) are its orders,
-    `rate` their derivative by the angle.
+    `rate` their derivative by the pulse errors.
     """
     if not states.whole[cycle]:
         return np.zeros((one.size, other.size))
     begin = states.times[cycle] - states.states[cycle, 0] - one[:, None, None]
     end = states.times[cycle + 1] - states.states[cycle + 1, 0] - other[:, None]
     place = begin + (end - begin) * states.u
-    position = np.clip((place - states.start_time) * states.sample_rate, 0.0,
-                       len(states.samples) - 1.0)
-    left = interpolate(states.samples, position.ravel()).reshape(*place.shape, -1)
-    left -= signals.T
+    left = states.vibration_at(place) - signals.T
     for row, tone in zip(states.amplitudes[:, states.orders.size:].T, states.tones):
         wave = np.exp(2j * np.pi * tone * (place - states.start_time))
         left -= (row * wave[..., None]).real
     left *= np.sqrt(states.weight)
     left = left.reshape(one.size, other.size, -1)
-    columns = np.concatenate([
-        states.shapes[1:-2, :, None] * (states.slope[cycle] * rate.T), signals.T[None]])
+    columns = np.concatenate([states.shapes[1:-2, :, None] * rate.T, signals.T[None]])
     columns = (columns * np.sqrt(states.weight)).reshape(len(columns), -1)
     known = np.linalg.inv(columns @ columns.T + np.diag(states.size[1:] ** -2.0))
     along = left @ columns.T
