@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects import (
     Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges)
+from sa_jitter_ros.effects.effect import departs
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.influence import Pulses
@@ -545,3 +546,18 @@ def test_the_library_refuses_unknown_effects_and_parameters():
         library.predict(**known, effects={'hum': {}})
     with pytest.raises(ParameterError, match="no 'rate'"):
         library.predict(**known, effects={'clock_skew': {'rate': 1.0}})
+
+
+@pytest.mark.parametrize(('declared', 'found', 'errors', 'expected'), [
+    ({'method': 'linear'}, {'method': 'linear'}, {'method': None}, False),
+    ({'method': 'cubic'}, {'method': 'linear'}, {'method': None}, True),
+    ({'pulse_angles': (0.0, 0.1)}, {'pulse_angles': (0.0, 0.1001)}, {
+        'pulse_angles': (1e-3, 1e-3)}, False),
+    ({'pulse_angles': (0.0, 0.1)}, {'pulse_angles': (0.0, 0.2)}, {
+        'pulse_angles': (1e-3, 1e-3)}, True),
+    ({'std': 1e-5}, {'std': 2e-5}, {'std': 1e-6}, True)])
+def test_numbers_depart_by_more_than_their_errors(declared, found, errors, expected):
+    name = {'method': 'interpolation_loss', 'pulse_angles': 'target_geometry'}.get(
+        next(iter(declared)), 'excess_jitter')
+    assert departs(make_effect(name, **found), errors, make_effect(name, **declared), 1000
+                   ) is expected

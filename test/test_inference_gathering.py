@@ -14,10 +14,32 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from sa_jitter_ros.effects.lattice import Clock, smooth_on_grid
 from sa_jitter_ros.inference.gathering import (
-    _Grid, _of_acquisitions, _of_centred, _runs, _slope, _uncertainty, _unskewed)
+    _Grid, _of_acquisitions, _of_centred, _runs, _slope, _uncertainty, _unskewed, dithered)
 
 PULSES, PERIOD, TICK, SKEW = 24, 0.025, 1e-4, 1e-3
+
+
+@pytest.mark.parametrize(('jitter', 'uneven', 'expected'), [
+    (0.0, 0.0, False), (0.05, 0.0, False), (0.5, 0.0, True), (1.0, 0.0, True), (0.0, 2.0, False)])
+def test_jitter_of_half_a_tick_makes_ticks_independent_errors(rng, jitter, uneven, expected):
+    """Uneven marks, which no motion of the shaft makes, are no such jitter."""
+    count, marks = 25 * PULSES, 4
+    true = PERIOD * np.cumsum(1.0 + 1e-5 * np.cumsum(rng.standard_normal(count)))
+    true += uneven * TICK * np.array([0.0, 1.0, -0.4, 0.3])[np.arange(count) % marks]
+    times = TICK * np.ceil(true / TICK + jitter * rng.standard_normal(count))
+    errors = times - true + uneven * TICK * np.array([0.0, 1.0, -0.4, 0.3])[
+        np.arange(count) % marks] + 0.02 * TICK * rng.standard_normal(count)
+    items = [SimpleNamespace(first=first, times=times[first:first + PULSES],
+                             errors=errors[first:first + PULSES], missing=np.zeros(PULSES - 1))
+             for first in range(0, count - PULSES + 1, PULSES)]
+    observation = SimpleNamespace(
+        model=SimpleNamespace(pulses_per_revolution=marks, pulses_per_trigger=1),
+        acquisitions=items, pulses=SimpleNamespace(number=np.arange(count)),
+        recoveries=[SimpleNamespace(roughness=0.05 * TICK)])
+    assert dithered(observation, Clock(1.0 / TICK, 0.0), smooth_on_grid(times, 1.0 / TICK)
+                    ) is expected
 
 
 @pytest.mark.parametrize('skew', [0.0, SKEW])

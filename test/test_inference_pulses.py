@@ -81,6 +81,20 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
         validated(np.sort(np.append(true, true[10::12] + 0.01 / marks)), marks)
 
 
+@pytest.mark.parametrize('marks', [1, 4])
+@pytest.mark.parametrize('apart', [-0.12, 0.12])
+def test_displaced_pulse_is_not_lost(rng, marks, apart):
+    """A pulse in the tail of its jitter is dropped; no pulse is missing for that."""
+    interval = 1.0 / SPEED / marks
+    times = interval * (np.arange(600) + 1e-3 * rng.standard_normal(600))
+    times[300] += apart * interval
+    found = validated(times, marks)
+    assert found.missing.sum() == 1
+    assert found.lost.sum() == 0
+    assert any('displaced by its jitter' in remark for remark in found.remarks)
+    assert validated(np.delete(times, 300), marks).lost.sum() == 1
+
+
 @pytest.mark.parametrize('count', [250, 2500])
 def test_pulses_at_random_are_no_shaft_of_another_speed(rng, count):
     with pytest.raises(RecordingError, match='at no interval that a shaft could have'):

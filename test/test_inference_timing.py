@@ -344,6 +344,18 @@ def test_missing_pulses_have_no_error():
     assert names_of(read_timing([replace(part, measured=measured, errors=errors)])) == set()
 
 
+@pytest.mark.parametrize('lost', [2, 6])
+def test_skew_beside_missing_pulses_is_no_jitter(lost):
+    """A missing pulse has the mean error, as it has in what a skew makes."""
+    part = machine(12, skew=3e-4)
+    measured = np.ones(part.errors.size, np.bool_)
+    measured[np.linspace(20, 380, lost).astype(int)] = False
+    timing = read_timing([replace(part, measured=measured)])
+    assert names_of(timing) == {'clock_skew'}
+    value, error = value_of(timing, 'clock_skew', 'skew')
+    assert abs(value - 3e-4) < 3.0 * error
+
+
 def test_memory_and_size_come_back_from_what_they_made():
     truth = CorrelatedJitter(2e-5, 0.6)
     setting = machine(0).setting

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from processes import gaussian_pulse_jitter
 import pytest
+from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.angle_error import GaussianAngleError, IndependentPulseJitter
@@ -264,3 +265,16 @@ def test_distribution_function_of_nothing_is_nothing():
 def test_what_is_no_number_is_refused(call, error, message):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_effect_of_no_size_changes_no_drawn_prediction():
+    """Averages of few cycles are drawn, but exact moments leave little of the chance in it."""
+    model = replace(MODEL, trigger_cycles=18, pulses_per_revolution=10, pulses_per_trigger=1,
+                    ratio=30.1, orders=(21.0, 63.0), trigger_speed=0.45, jitter_std=1.5e-4,
+                    jitter_distribution='normal')
+    angles = tuple(2e-4 * np.random.default_rng(3).standard_normal(10))
+    geometry = make_effect('target_geometry', pulse_angles=angles)
+    alone = predict(model, [geometry])
+    beside = predict(model, [geometry, make_effect('phase_wander', std=1e-9, bandwidth=0.2)])
+    np.testing.assert_allclose(beside.standard_deviation, alone.standard_deviation, rtol=5e-3)
+    np.testing.assert_allclose(beside.mean_attenuation, alone.mean_attenuation, atol=5e-5)

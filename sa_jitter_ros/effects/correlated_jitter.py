@@ -18,12 +18,10 @@ from typing import Any, ClassVar
 import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter, require_in_turn
 from sa_jitter_ros.effects.timing import (
-    autoregressive, FAINT, LARGE, PULSES, Setting, Spectrum)
+    autoregressive, FAINT, LARGE, PULSES, ROUNDING, Setting, Spectrum)
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, GaussianPulseJitter
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.model import DeclaredModel
-
-_FORGOTTEN = 1e-3
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class CorrelatedJitter(Effect):
         require_in_turn('the spread of correlated_jitter.std', Normal(self.std).width, model)
         variance = (self.std * model.fundamental_frequency) ** 2
         rho = abs(self.correlation)
-        memory = 1 if rho < _FORGOTTEN else 1 + math.ceil(math.log(_FORGOTTEN) / math.log(rho))
+        memory = 1 if rho < ROUNDING else 1 + math.ceil(math.log(ROUNDING) / math.log(rho))
         reach = memory + model.weights.pulses - 2
         return (GaussianPulseJitter.through(
             model.weights, lambda lags: variance * self.correlation ** np.abs(lags),

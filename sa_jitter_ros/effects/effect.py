@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
@@ -252,9 +253,17 @@ def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evid
 
 def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles: int) -> bool:
     """Return whether the numbers of a fitted effect, with their errors, are not the declared."""
-    away = [((effect.values[name] - declared.values[name]) / error) ** 2
-            for name, error in errors.items() if 0.0 < error < math.inf]
-    return beyond_chance(0.5 * sum(away), len(away), cycles) > ODDS
+    away: list[float] = []
+    for name, error in errors.items():
+        found, known = effect.values[name], declared.values[name]
+        if isinstance(found, str) or np.shape(found) != np.shape(known):
+            if found != known:
+                return True
+            continue
+        size = np.ravel(error)
+        told = np.isfinite(size) & (size > 0.0)
+        away += (np.ravel(np.subtract(found, known))[told] / size[told]).tolist()
+    return beyond_chance(0.5 * float(np.sum(np.square(away))), len(away), cycles) > ODDS
 
 
 def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:

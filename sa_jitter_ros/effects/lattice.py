@@ -32,10 +32,15 @@ _COARSEST = 4.0
 
 @dataclass(frozen=True)
 class Clock:
-    """A clock of `rate` Hz (0 where there is none) with its standard error."""
+    """
+    A clock of `rate` Hz (0 where there is none) with its standard error.
+
+    Jitter that moves pulses over the ticks of a `dithered` one makes their errors independent.
+    """
 
     rate: float
     standard_error: float
+    dithered: bool = False
 
     def visible(self, declared: float) -> bool:
         """Return whether there is one whose tick is not lost in one of the `declared` rate."""

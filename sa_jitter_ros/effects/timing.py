@@ -32,6 +32,8 @@ Array = NDArray[Any]
 PULSES, SOURCE, MOTION = 'pulses', 'source', 'motion'
 #: Logarithms of a power, in unit^2, below which there is as good as none, and that none exceeds.
 FAINT, LARGE = -12.0, 20.0
+#: Half of the digits of a number: a share that counts for nothing.
+ROUNDING = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,10 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
     power = np.abs(spectrum) ** 2
     floor = np.maximum(np.median(power, axis=0), median_filter(power, (_AROUND, 1)))
     noise = floor / np.log(2.0) * (2.0 / window.sum()) ** 2
+    # what motions inside the cycles make grows as a beat does, and all lines share it
+    together = np.abs(np.sum(swings * frequency**2 / noise, axis=1)) ** 2 / np.sum(
+        frequency**4 / noise, axis=1)
+    noise *= np.maximum(median_filter(together, _AROUND) / np.log(2.0), 1.0)[:, None]
     turns = np.arange(8, 8 + len(spectrum)) / (4 * count)
     depth_left = np.sinc(turns)[:, None]  # of the mean over a trigger cycle
     shown = np.abs(swings) ** 2 / noise

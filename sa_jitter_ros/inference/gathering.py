@@ -21,7 +21,7 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, on_grid, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, on_grid, ROOM, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
@@ -106,8 +106,10 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     usable = found.visible(model.keyphasor_rate)
     of_tick = 1.0 / math.sqrt(12.0) / clock if usable else 0.0
     grid = _Grid(clock, smooth_on_grid(pulses.times, clock)) if usable else None
+    if grid is not None and dithered(observation, found, grid.smooth):
+        found, grid = replace(found, dithered=True), None
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
-    if usable and group.max() > 0:
+    if grid is not None and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
                  for i in range(int(group.max()) + 1)]
     again = [None if motion is None or grid is None else _unskewed(
@@ -135,6 +137,35 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
                                pulses.missing[read.start:read.stop - 1], std, *unknown))
         known.append(rows)
     return (found if usable else Clock(0.0, 0.0)), known
+
+
+def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
+    """
+    Tell whether jitter moves pulses over the ticks of a clock.
+
+    Each tick is then an independent error (Widrow and Kollar 2008), and the errors that the
+    `smooth`est motion on the grid tells (pulse,) are wrong: that motion is rougher than the
+    recovered one, which the ticks do not allow. What repeats with the marks is left in both.
+    """
+    model = observation.model
+    marks = model.pulses_per_revolution
+    marks //= math.gcd(marks, model.pulses_per_trigger or marks)
+    usable = [item for item in observation.acquisitions
+              if np.all(np.isfinite(item.errors)) and not np.any(item.missing)]
+    if not usable:
+        return False
+    errors, imposed, times = (np.array(rows) for rows in (
+        [item.errors for item in usable],
+        [smooth[item.first:item.first + item.times.size] for item in usable],
+        [item.times for item in usable]))
+    place = (observation.pulses.number[[item.first for item in usable]][:, None]
+             + np.arange(errors.shape[1])) % marks
+    even = np.bincount(place.ravel(), errors.ravel(), marks) / np.maximum(
+        np.bincount(place.ravel(), None, marks), 1)
+    smoothest, recovered = (float(np.mean(np.diff(times - rows, 2) ** 2)) for rows in (
+        imposed, errors - even[place]))
+    noise = np.mean([item.roughness**2 for item in observation.recoveries] or [0.0])
+    return smoothest - max(recovered - float(noise), 0.0) > 6.0 * (ROOM / clock.rate) ** 2
 
 
 def gather(observation: Observation, lines: Lines, chosen: Sequence[int],

@@ -43,7 +43,6 @@ from scipy import special
 Array = NDArray[Any]
 
 _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
-_SLOWEST = 0.2  # share of a step by which the next one is shorter
 
 
 @dataclass(frozen=True)
@@ -152,7 +151,7 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
         if abs(step) < _EXACT or high - low < _EXACT:
             break
         turn = 1.0 if last is None else (last[1] - step) / (at - last[0])
-        last, to = (at, step), at + step / float(np.clip(turn, _SLOWEST, 1.0))
+        last, to = (at, step), at + step / (turn if 0.0 < turn < 1.0 else 1.0)
         at = to if low < to < high else 0.5 * (low + high)
     return fit.starts[name] if abs(step) < _EXACT or high < top else None
 

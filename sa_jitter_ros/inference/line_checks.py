@@ -36,7 +36,7 @@ Array = NDArray[Any]
 LINES = 'lines'
 _TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
 _NEAR = 1.5  # ratio of frequencies whose power is alike
-_EVENTS = 9.0  # kurtosis; a gain that swings by a third loses cycles, which makes half of it
+_EVENTS = 4.5  # kurtosis; a gain that swings by a third loses cycles, which makes 4
 _FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
 
 

@@ -33,12 +33,14 @@ from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
+from sa_jitter_ros.inference.record_fit import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
 from sa_jitter_ros.prediction.influence import mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
+from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording
 
 BoolArray = NDArray[np.bool_]
@@ -46,12 +48,10 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
 
-_MOST_SAMPLES = 200_000_000
 #: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
 CHANCE = 4
 _OTHER_MACHINE = 5.0
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
-_FULL_BAND = 0.45  # of the sample rate
 # A ripple with more than this many times the power of its noise is corrected.
 _RIPPLE = 3.0
 
@@ -182,9 +182,9 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     with it loses amplitude. Raises RecordingError if there is no whole acquisition, ModelError if
     the declared model does not fit the recording.
     """
-    if recording.samples * recording.channels > _MOST_SAMPLES:
+    if recording.samples * recording.channels > MAX_VALUES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
-                             f'most {_MOST_SAMPLES} values are read; cut the recording')
+                             f'most {MAX_VALUES} values are read; cut the recording')
     if model.trigger_cycles <= CHANCE:
         raise ModelError(f'trigger_cycles is {model.trigger_cycles}: the coherence of a line from '
                          f'cycle to cycle needs at least {CHANCE + 1}; raise trigger_cycles')
@@ -250,6 +250,8 @@ def together(observations: Sequence[Observation]) -> Observation:
     pulses = RecordPulses(
         **{name: np.concatenate([getattr(item.pulses, name) for item in observations])
            for name in ('times', 'missing', 'doubtful', 'bridged')},
+        displaced=np.concatenate([np.broadcast_to(
+            item.pulses.displaced, item.pulses.missing.shape) for item in observations]),
         # no interval ends where a recording begins
         starts_run=np.concatenate([first.pulses.starts_run, *(
             item.pulses.starts_run[1:] for item in observations[1:])]),
@@ -369,7 +371,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     floor = noise_floor(cycle_grid([cycles], method=reader.method, law=corrected_law,
                                    period=float(np.diff(bridged).max())),
                         model.cycle_length, sources[:len(model.orders)],
-                        _FULL_BAND * reader.rate / model.fundamental_frequency)
+                        FULL_BAND * reader.rate / model.fundamental_frequency)
     return Acquisition(
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
         radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,

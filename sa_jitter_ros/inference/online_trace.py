@@ -29,6 +29,7 @@ from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, smooth_on_grid, ticks_leave_room)
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.gathering import dithered
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
@@ -157,6 +158,9 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
         return Clock(0.0, 0.0), [
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     smooth = smooth_on_grid(times, clock.rate)
+    if dithered(observation, clock, smooth):
+        return replace(clock, dithered=True), [
+            2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
     recovered = np.asarray(observation.stacked('errors'))
     variance = float(np.mean(np.square(observation.stacked('standard_errors'))))

@@ -36,6 +36,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.effects.clock_skew import USUAL
+from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.slips import mend_slips
 from sa_jitter_ros.prediction.influence import trigger_periods
 from sa_jitter_ros.pulses.resampling import interpolate
@@ -51,7 +53,8 @@ BoolArray = NDArray[np.bool_]
 # trigger cycle. What lies further away does not leak into a cycle.
 _BEYOND, _BEYOND_LINES = 6.0, 3.0
 _EDGE = 1.15  # of the band, where the low pass ends
-_FULL_BAND = 0.4  # of the sample rate
+#: Of the sample rate: beyond it, filters may end.
+FULL_BAND = 0.4
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 _SAMPLES = 3.7  # in a period of the band's end
 # Bends in parts of the declared jitter, and gains: a first guess when they become free, and the
@@ -61,7 +64,8 @@ _LEAST_JITTER = 0.1  # of the declared one
 # Turns of the highest declared order, beyond which its phase tells errors ambiguously.
 _MOST_TURNS = 0.25
 _MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
-_LAST_STEPS, _CONVERGED = 6, 1e-3  # as often slips are mended
+# Steps that a search may take; what its last one may change, in standard errors.
+_MOST_STEPS, _SETTLED = 20, 0.1
 # A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
 # it must not be far below the strongest, which may leave images of itself.
 _FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
@@ -70,21 +74,14 @@ _FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
 APART = 1.5
 _ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
-# Steps that the frequency of a tone may take, each 0.6 of the one before where an order is near;
-# standard errors that the last one may have.
-_TONE_STEPS, _TONE_KNOWN = 20, 0.1
 _FINE = 0.3  # bins between frequencies that are tried
 _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
 _SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
 _SLOPE_GAIN = 0.7
-_MOST_SLOPE = 5e-3  # beyond it, other lines are taken for the declared ones
 _SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
 # The last fit expects pulse errors that are so many times as large as they, or their standard
 # errors, are, so that they are hardly shrunk.
 _WEAK = 3.0
-_SAMPLED = 60  # variances of which the median stands for all
-_LEAST_KEPT = 1e-6  # of a state by its prior, below which the vibration tells nothing of it
-_ROUNDING = float(np.sqrt(np.finfo(np.float64).eps))  # half of the digits
 
 
 @dataclass(frozen=True)
@@ -157,7 +154,7 @@ def band_end(times: Array, sample_rate: float, cycle_length: float, orders: Sequ
              wider: float) -> float:
     """Return the order at which the band of `fit_record` ends."""
     return min(wider * (max(orders) + max(_BEYOND, _BEYOND_LINES / cycle_length)), max(
-        max(orders), _FULL_BAND * sample_rate * float(np.diff(times).mean()) / cycle_length))
+        max(orders), FULL_BAND * sample_rate * float(np.diff(times).mean()) / cycle_length))
 
 
 class OpenRecord:
@@ -184,8 +181,8 @@ class OpenRecord:
         states.fit_amplitudes()
         _search(states, known)
         states.settled = True
-        for _ in range(_LAST_STEPS):
-            if states.step() < _CONVERGED * states.jitter_std:
+        for _ in range(_MOST_STEPS):
+            if states.step() < _SETTLED * states.unsure:
                 break
         return states.result()
 
@@ -210,7 +207,7 @@ def _search(states: 'States', known: tuple[Array, Array] | None) -> None:
                 states.refine()
                 states.fit_amplitudes()
         elif states.all_free:
-            if mended == _LAST_STEPS or not mend_slips(states):
+            if mended == _MOST_STEPS or not mend_slips(states):
                 break
             mended += 1
         else:
@@ -222,11 +219,11 @@ def _search(states: 'States', known: tuple[Array, Array] | None) -> None:
                 states.fit_amplitudes()
     if look:
         states.let_stand()
-        for _ in range(_TONE_STEPS):
+        for _ in range(_MOST_STEPS):  # each 0.6 of the one before where an order is near
             moved = states.refine()
             states.fit_amplitudes()
             states.step()
-            if moved < _TONE_KNOWN:
+            if moved < _SETTLED:
                 break
         states.prune(_PRUNED)
         states.fit_amplitudes()
@@ -291,6 +288,11 @@ class States:
     def lines_found(self) -> int:
         """Return the number of undeclared lines."""
         return self.amplitudes.shape[1] - self.declared
+
+    @property
+    def unsure(self) -> float:
+        """Return the standard error of the pulse errors (s), those of most pulses."""
+        return float(self.size[0] * np.sqrt(1.0 - self.told[0]))
 
     @property
     def moving(self) -> BoolArray:
@@ -407,7 +409,7 @@ class States:
         gain = 1.0 + self.states[:-1, -1:]
         right = np.stack([self._sums(row / gain).conj().sum(axis=0)
                           for row in self.vibration], axis=1)
-        ridge = _ROUNDING * self.normal[0, 0] * np.eye(len(self.normal))
+        ridge = ROUNDING * self.normal[0, 0] * np.eye(len(self.normal))
         found = np.linalg.solve(self.normal + ridge, np.vstack((right.real, right.imag)))
         n = len(right)
         self.amplitudes = (found[:n] + 1j * found[n:]).T
@@ -510,8 +512,8 @@ class States:
         # the trend that the errors are expected along stands after the amplitudes
         along = precision[:, 0] * self.ramp
         border[:, 0, -1] = -along
-        corner[-1, -1] = along @ self.ramp + _MOST_SLOPE**-2.0
-        below[-1] = along @ expected[:, 0] - self.trend * _MOST_SLOPE**-2.0
+        corner[-1, -1] = along @ self.ramp + USUAL**-2.0
+        below[-1] = along @ expected[:, 0] - self.trend * USUAL**-2.0
         scale = 1.0 / np.sqrt(total)  # seconds and gains together
         scales = np.hstack([scale, np.roll(scale[:, :1], -1)])
         cells *= scales[:, :, None] * scales[:, None, :]
@@ -546,7 +548,7 @@ class States:
             below[c] = np.append(total.real, -total.imag)
             corner[c, :, c] = weight * self.normal
         flat = np.pad(corner.reshape(below.size, -1), (0, 1))
-        flat[np.diag_indices(len(flat))] *= 1.0 + _ROUNDING
+        flat[np.diag_indices(len(flat))] *= 1.0 + ROUNDING
         return whole, flat, np.append(below, 0.0)
 
     def _sums_of(self, values: Array, which: int, channel: int, shapes: Array) -> ComplexArray:
@@ -563,28 +565,28 @@ class States:
         found *= self.turn[:, None]
         return np.asarray(found)
 
-    def _variances(self, state: int, most: int = 0) -> Array:
-        """
-        Return posterior variances of a state, of `most` cycles or all.
+    def _variance(self, state: int) -> float:
+        """Return the variance of a state of most cycles; that of errors is about their trend."""
+        return float(np.median(self._variances(state, about_trend=not state)[2:-2]))
 
-        Those of pulse errors are about their mean, which nothing tells; of some, which stand for
-        the size of errors, about their trend, too.
+    def _variances(self, state: int, *, about_trend: bool = False) -> Array:
         """
-        solved, pulses = self.solved, self.times.size
-        chosen = np.arange(pulses)
-        if most:
-            chosen = np.unique(np.linspace(2, pulses - 3, most).astype(int))
-        local, inner = solved.of_state(state, chosen)
-        if most and not state:
-            inner[:, -1] += self.ramp[chosen] / solved.scale[chosen, 0]
+        Return posterior variances (pulse,) of a state.
+
+        Those of pulse errors are about their mean, which nothing tells.
+        """
+        solved = self.solved
+        local, inner = solved.of_state(state)
+        if about_trend:
+            inner = inner.copy()
+            inner[:, -1] += self.ramp / solved.scale[:, 0]
         through = cho_solve(solved.schur, inner.T)
-        variance = (local + np.sum(inner * through.T, axis=1)) * solved.scale[chosen, state] ** 2
+        variance = (local + np.sum(inner * through.T, axis=1)) * solved.scale[:, state] ** 2
         if state:
             return np.asarray(variance)
         mean = solved.scale[:, 0] * self.measured / self.measured.sum()
         shared = solved.of_errors(mean)
-        return np.asarray(variance - 2.0 * shared[chosen] * solved.scale[chosen, 0]
-                          + mean @ shared)
+        return np.asarray(variance - 2.0 * shared * solved.scale[:, 0] + mean @ shared)
 
     def _estimate_sizes(self) -> None:
         """Estimate how large the states are from their values and variances."""
@@ -609,9 +611,9 @@ class States:
         a mean that nothing tells.
         """
         before = self.size[state] ** 2
-        expected, variance = share * before, float(np.median(self._variances(state, _SAMPLED)))
+        expected, variance = share * before, self._variance(state)
         power = float(np.mean(values**2)) + variance
-        self.told[state] = told = max(1.0 - variance / expected, _LEAST_KEPT)
+        self.told[state] = told = max(1.0 - variance / expected, ROUNDING)
         gained = power - expected
         if gained > 0.0:
             gained /= told**2 if self.settled and not state else told
@@ -636,7 +638,7 @@ class States:
         spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
         power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
         step = _FINE / self.orders.max() / span
-        most = int(_MOST_SLOPE / step)
+        most = int(USUAL / step)
         slope = step * np.arange(-most, most + 1)
         self.slopes = slope.size
         score = np.sum([np.log(1e-3 * power.max() + np.interp(
@@ -768,7 +770,7 @@ class States:
 
     def result(self) -> RecordFit:
         """Return the fit, pulse errors and bends as good as unshrunk."""
-        variance = float(np.median(self._variances(0, _SAMPLED)))
+        variance = self._variance(0)
         weak = _WEAK * max(1.0, float(np.sqrt(variance / self.told[0]) / self.size[0]))
         self.step(weak=_WEAK)
         self.step(weak=weak, move=False)
@@ -778,9 +780,9 @@ class States:
         errors -= period * (errors[self.measured].mean() / period[self.measured].mean())
         bends, bend_errors = self.states[:-1, 1:3].copy(), np.full(2, np.inf)
         for i in range(2):
-            variance = float(np.median(self._variances(1 + i, _SAMPLED)))
+            variance = self._variance(1 + i)
             kept = 1.0 - variance / self.size[1 + i] ** 2  # not shrunk
-            if kept > _LEAST_KEPT:
+            if kept > ROUNDING:
                 bends[:, i] /= kept
                 bend_errors[i] = np.sqrt(variance / kept)
         variances = self._amplitude_variances()
@@ -794,8 +796,8 @@ class States:
             bool(gammaincc(shown.size, 0.5 * shown.sum()) < _FALSE / self.slopes))
 
     def _roughness(self) -> float:
-        """Return the RMS of what second differences of the pulse errors are wrong by."""
-        chosen = np.unique(np.linspace(0, self.times.size - 3, _SAMPLED).astype(int))
+        """Return the RMS of what second differences of the pulse errors are wrong by, of some."""
+        chosen = np.arange(0, self.times.size - 2, math.isqrt(self.times.size))
         unit = np.zeros((self.times.size, chosen.size))
         whole = np.ones(chosen.size, np.bool_)
         for place, factor in zip((chosen, chosen + 1, chosen + 2), (1.0, -2.0, 1.0)):
@@ -937,18 +939,19 @@ class _Solved:
         return np.asarray(cho_solve_banded(self.factor, right)
                           + self.inner @ cho_solve(self.schur, self.inner.T @ right))
 
-    def of_state(self, state: int, chosen: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Return variances (chosen,) with the amplitudes as 0, and how it follows these."""
+    def of_state(self, state: int) -> tuple[Array, Array]:
+        """Return variances (pulse,) with the amplitudes as 0, and how it follows these."""
         variance, beside = self._variances
         if not state:
-            return variance[chosen], self.inner[chosen]
-        i, after = state - 1, chosen + 1
-        one, other = self.through[chosen, i].T
-        own = np.einsum('kj,kjl->kl', self.root[chosen, :, i], self.root[chosen])
-        local = own[:, i] + one**2 * variance[chosen] + other**2 * variance[after] + (
-            2.0 * one * other * beside[chosen])
-        inner = np.einsum('kl,kla->ka', own, self.border[chosen, 1:])
-        inner -= one[:, None] * self.inner[chosen] + other[:, None] * self.inner[after]
+            return variance, self.inner
+        i = state - 1
+        one, other = self.through[:, i].T
+        own = np.einsum('kj,kjl->kl', self.root[:, :, i], self.root)
+        inner = np.einsum('kl,kla->ka', own, self.border[:, 1:])
+        local = own[:, i] + one**2 * variance
+        local[:-1] += other[:-1] ** 2 * variance[1:] + 2.0 * (one * other)[:-1] * beside
+        inner -= one[:, None] * self.inner
+        inner[:-1] -= other[:-1, None] * self.inner[1:]
         return local, inner
 
     @cached_property

@@ -42,11 +42,12 @@ class RecordPulses:
     Trigger pulses of a recording.
 
     `times` (n,) in s are the measured ones; `missing` (n - 1,) is the number of trigger pulses
-    that are missing in each interval. `starts_run` (n,): the number of trigger cycles since the
-    pulse before is uncertain. `doubtful` (n,): a double pulse next to this one was dropped, and
-    this one may be the wrong one. `bridged` (m,), m = n + the missing ones, are the times with
-    missing pulses interpolated, `reference` (m,) those of a reference keyphasor (None without
-    one); both are NaN where there is no pulse. `remarks` say how pulses were repaired.
+    that are missing in each interval, `displaced` (n - 1,) that of those among them that came, but
+    so far from their place that they were dropped. `starts_run` (n,): the number of trigger cycles
+    since the pulse before is uncertain. `doubtful` (n,): a double pulse next to this one was
+    dropped, and this one may be the wrong one. `bridged` (m,), m = n + the missing ones, are the
+    times with missing pulses interpolated, `reference` (m,) those of a reference keyphasor (None
+    without one); both are NaN where there is no pulse. `remarks` say how pulses were repaired.
     """
 
     times: FloatArray
@@ -56,6 +57,7 @@ class RecordPulses:
     bridged: FloatArray
     reference: FloatArray | None = None
     remarks: tuple[str, ...] = ()
+    displaced: IntArray | int = 0
 
     @classmethod
     def unbroken(cls, times: FloatArray) -> 'RecordPulses':
@@ -70,8 +72,8 @@ class RecordPulses:
 
     @property
     def lost(self) -> IntArray:
-        """Return the number of missing pulses in each interval that does not end a run."""
-        return self.missing[~self.starts_run[1:]]
+        """Return the number of pulses that did not come in each interval that ends no run."""
+        return np.asarray(self.missing - self.displaced)[~self.starts_run[1:]]
 
     def broken_at(self, gaps: BoolArray, start_time: float, rate: float, reach: int
                   ) -> 'RecordPulses':
@@ -150,9 +152,10 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
         reference = _matched(found, better.every(1), step if longer**2 < step else 1)
-    remarks = [*_remarks(counts, measured.size), *_tach_rate_remark(recording, model)]
+    remarks = [*_remarks(counts, measured.size, int(pulses.displaced.sum())),
+               *_tach_rate_remark(recording, model)]
     return RecordPulses(found.times, found.missing, found.starts_run, found.doubtful,
-                        found.bridged, reference, tuple(remarks))
+                        found.bridged, reference, tuple(remarks), found.displaced)
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,7 @@ class _Accepted:
     measured: BoolArray
     starts_run: BoolArray
     doubtful: BoolArray
+    displaced: BoolArray
 
     def every(self, step: int) -> RecordPulses:
         """Return the pulses whose number is a multiple of `step`."""
@@ -173,10 +177,12 @@ class _Accepted:
         bridged = np.full(int(number[-1]) + 1 if there.size else 0, np.nan)
         bridged[number[chosen]] = self.times[chosen]
         run = np.cumsum(self.starts_run)[there]
+        displaced = np.diff(np.cumsum(chosen & self.displaced)[there])
         first, last = (int(number[there[k]]) if there.size else 0 for k in (0, -1))
         return RecordPulses(
             self.times[there], np.asarray(np.diff(number[there]) - 1, np.int64),
-            np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1])
+            np.diff(run, prepend=0) > 0, self.doubtful[there], bridged[first:last + 1],
+            displaced=displaced)
 
 
 def _validated(times: FloatArray, marks: int, longest: float, missing_teeth: int = 0
@@ -201,8 +207,13 @@ def _validated(times: FloatArray, marks: int, longest: float, missing_teeth: int
     # before an interruption may be its cause.
     doubtful = found.doubtful | np.append((found.doubtful | found.starts_run)[1:], False)
     doubtful[:-2] |= found.starts_run[2:]
-    return (_Accepted(found.times, number, found.measured, found.starts_run, doubtful),
-            validator.finish())
+    # A pulse that was dropped where one is missing is that one, far from its place by its jitter.
+    dropped = np.setdiff1d(times, found.times[found.measured])
+    displaced = np.zeros(number.size, np.bool_)
+    if number.size:
+        displaced[np.searchsorted(0.5 * (found.times[1:] + found.times[:-1]), dropped)] = True
+    return (_Accepted(found.times, number, found.measured, found.starts_run, doubtful,
+                      displaced & ~found.measured), validator.finish())
 
 
 def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArray:
@@ -225,7 +236,7 @@ def _matched(pulses: RecordPulses, better: RecordPulses, step: int) -> FloatArra
     return matched
 
 
-def _remarks(counts: PulseCounts, total: int) -> Sequence[str]:
+def _remarks(counts: PulseCounts, total: int, displaced: int) -> Sequence[str]:
     """Return what the validation dropped, interpolated or could not use, one sentence each."""
     found = []
     spurious = counts.doubles + counts.early
@@ -233,9 +244,12 @@ def _remarks(counts: PulseCounts, total: int) -> Sequence[str]:
         found.append(f'{spurious} of {total} pulses are spurious ({counts.doubles} double, '
                      f'{counts.early} early): they were dropped, and no acquisition contains a '
                      'trigger cycle next to them')
-    if counts.missing_bridged:
-        found.append(f'{counts.missing_bridged} pulses are missing between the {total} that were '
-                     'measured')
+    if displaced:
+        found.append(f'{displaced} of them came where a pulse is missing: they are that pulse, '
+                     'displaced by its jitter, and not lost')
+    if counts.missing_bridged > displaced:
+        found.append(f'{counts.missing_bridged - displaced} pulses are missing between the {total}'
+                     ' that were measured')
     if counts.late:
         found.append(f'{counts.late} of {total} pulses are late: the gap before them is not a '
                      'whole number of intervals, or longer than three missing pulses; no '

@@ -25,23 +25,20 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.record_fit import APART, band_end, OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE
+from scipy import special
 
 FloatArray = NDArray[np.float64]
 
 _EDGE = 15  # samples at either end that interpolation cannot read
 _FEWEST = 8  # pulses in a stretch
-_DEAD = 1e-9  # range of a channel, in its largest value, that is rounding
-#: Smallest standard deviation of declared errors that counts, in s.
-LEAST_JITTER = 1e-9
 #: Largest standard error of resolved pulse errors, in parts of their size.
 RESOLVED = 0.7
 _WIDER = 16.0  # band in which lines are looked for where the declared ones show no errors
-# Second differences that are larger than this many of their median are no motion.
-_OUTLIER = 6.0
 # Ratio of RMS second differences that counts: to what the errors are wrong by, and of two fits.
 _SMOOTH = 1.5
 # Lines of an average within which an order is one that the shafts are known to have; amplitude, in
@@ -160,6 +157,11 @@ def recover_record(samples: FloatArray, start_time: float, rate: float, pulses: 
     return recovery
 
 
+def jitter_unit(model: DeclaredModel) -> float:
+    """Return the standard deviation of the declared pulse errors (s), not quite 0 for none."""
+    return max(float(np.sqrt(model.distribution.variance)), ROUNDING * model.trigger_period)
+
+
 def _stretches(pulses: RecordPulses, begin: float, end: float, edge: float) -> list[slice]:
     """Return the unbroken stretches of the bridged pulses inside the vibration."""
     times = pulses.bridged
@@ -188,13 +190,13 @@ def _opened(samples: FloatArray, start_time: float, rate: float, pulses: RecordP
     last = int((times[-1] - start_time) * rate) + _EDGE
     part = samples[first:last + 1]
     part = part[:, np.ptp(part, axis=0) > np.maximum(
-        _DEAD * np.abs(part).max(axis=0), LEAST_RANGE)]
+        ROUNDING * np.abs(part).max(axis=0), LEAST_RANGE)]
     if not part.size:
         return None
     return OpenRecord(
         part, rate, start_time + first / rate, times,
         measured=measured[stretch], cycle_length=model.cycle_length, orders=model.orders,
-        jitter_std=max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER), top=top,
+        jitter_std=jitter_unit(model), top=top,
         trend=trend)
 
 
@@ -258,14 +260,14 @@ def _joined(pulses: RecordPulses, stretches: Sequence[slice], fits: Sequence[Rec
 
 
 def _roughness(recovery: RecordRecovery) -> float:
-    """Return the RMS of the second differences of the times of the corrected pulses."""
+    """Return the RMS of second differences of corrected pulse times, by their median."""
     corrected = recovery.times - recovery.errors
     whole = (recovery.missing[1:] == 0) & (recovery.missing[:-1] == 0)
     second = np.diff(corrected, 2)[whole]
     second = np.abs(second[np.isfinite(second)])
     if not second.size:
         return float('nan')
-    return float(np.sqrt(np.mean(np.minimum(second, _OUTLIER * np.median(second)) ** 2)))
+    return float(np.median(second) / special.ndtri(0.75))
 
 
 def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float]:

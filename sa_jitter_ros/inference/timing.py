@@ -37,7 +37,7 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import APART, independent_power, RecordFit
-from sa_jitter_ros.inference.record_recovery import LEAST_JITTER, RESOLVED
+from sa_jitter_ros.inference.record_recovery import jitter_unit, RESOLVED
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
@@ -52,8 +52,6 @@ from scipy import special
 Array = NDArray[Any]
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
-_PART = 20  # cycles whose mean power scatters by itself
-_FAR = 12.0  # times the power of the errors that pulses can have, beyond which none of them shows
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
@@ -100,7 +98,7 @@ class Timing:
         model = self.choice.setting.model
         size = max(model.distribution.variance, left - noise)
         turn = 2.0 * math.pi * max(model.orders) * model.fundamental_frequency
-        hidden = (stated > _FAR * possible_power and noise > RESOLVED**2 * size
+        hidden = (RESOLVED**2 * stated > possible_power and noise > RESOLVED**2 * size
                   and 0.5 * turn**2 * noise > ACCURACY)
         return math.sqrt(noise) if hidden else 0.0
 
@@ -108,7 +106,7 @@ class Timing:
 def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> list[Stretch]:
     """Return the unbroken stretches of pulses of some acquisitions; neighbours are in one."""
     model = observation.model
-    unit = max(float(np.sqrt(model.distribution.variance)), LEAST_JITTER)
+    unit = jitter_unit(model)
     found = []
     if not observation.recoveries:  # averages from topics, each with a mean error of 0
         grid = _grid(observation.pulses.times, clock)
@@ -202,7 +200,7 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
 
 def _grid(times: Array, clock: Clock) -> Array | None:
     """Return the errors that the grid of a clock imposes on pulses, None where it imposes none."""
-    if not clock.rate > 0.0:
+    if clock.dithered or not clock.rate > 0.0:
         return None
     smooth = smooth_on_grid(times, clock.rate)
     return smooth if np.std(smooth) > ROOM / clock.rate else None
@@ -399,7 +397,7 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
         if not np.isfinite(item.bend_std):
             continue
         bends = through(item.bends, kept, data) + kept[0] * item.bends.mean()
-        for part in np.array_split(bends, max(1, bends.size // _PART)):
+        for part in np.array_split(bends, max(1, int(bends.size * ACCELERATION_BAND[0]))):  # waves
             parts.append(np.mean(part**2) - passed * item.bend_std**2)
             next_.append(np.mean(part[1:] * part[:-1]))
             count += part.size

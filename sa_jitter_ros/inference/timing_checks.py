@@ -30,6 +30,7 @@ from sa_jitter_ros.inference.timing_shape import EDGE, through
 
 Array = NDArray[Any]
 
+_DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 #: Draws of what is there by chance, and their seed.
 DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
@@ -65,6 +66,8 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     found = [max((check(fit, fit.beside_motion(alias), direction)
                   for alias in range(ALIASES.size)), key=lambda item: item.p_value)
              for direction in directions for check in (_power, _sinusoid)]
+    if chooser.on_ticks(fit):  # near the edges of ticks, jitter makes errors of a whole one
+        return tuple(found)
     lasting = [name for name, item in fit.spectra.items()
                if name in EFFECTS and len(item.upper) > 1]
     return (*found, _shape(chooser, choice), *(_events(chooser, choice, name) for name in lasting),
@@ -167,10 +170,10 @@ def _likeness(chooser: Chooser, choice: Choice, gain: Array) -> float:
     p_values = []
     items = [item for item in data.stretches if item.errors.size >= _FEWEST]
     found = [_moments(_filtered(chooser.left(choice.fit, item), gain, data)) for item in items]
-    for scaled in _kinds(choice) if items else ():
+    for kind in _kinds(choice) if items else ():
         seen, null = np.zeros(2), np.zeros((2, DRAWS))
         for item, moments in zip(items, found):
-            draws = _moments(_filtered(_drawn(choice, item, scaled), gain, data))
+            draws = _moments(_filtered(_drawn(choice, item, kind), gain, data))
             middle = np.median(draws, axis=1)
             seen += item.errors.size * (moments - middle)
             null += item.errors.size * (draws - middle[:, None])
@@ -188,9 +191,9 @@ def _steadiness(chooser: Chooser, choice: Choice) -> Check:
         return Check(1.0, PULSES, 0.0, 'the size of the pulse errors')
     logs, p_value = np.log(np.array(seen)), 0.0
     place = np.arange(logs.size) - 0.5 * (logs.size - 1)  # most change along the recording
-    for scaled in _kinds(choice):
+    for kind in _kinds(choice):
         null = np.log(np.array([power for item in items for power in _powers(
-            chooser, choice, item, _drawn(choice, item, scaled))]))
+            chooser, choice, item, _drawn(choice, item, kind))]))
         each = (chance(float(np.var(logs)), np.var(null, axis=0)),
                 chance(float(abs(place @ logs)), np.abs(place @ null)))
         p_value = max(p_value, min(1.0, len(each) * min(each)))
@@ -202,10 +205,15 @@ def _steadiness(chooser: Chooser, choice: Choice) -> Check:
                  'times larger in some parts of the recording than in others')
 
 
-def _kinds(choice: Choice) -> Sequence[bool]:
-    """Return whether declared errors may have been scaled: what is more may be normal errors."""
+def _kinds(choice: Choice) -> Sequence[str]:
+    """
+    Return the shapes that errors may have: declared ones, scaled ones, those of a clock's ticks.
+
+    What is beside them may be normal errors.
+    """
     starts = choice.fit.starts
-    return (False, True) if JITTER in starts and starts[JITTER][0] > 0.0 else (False,)
+    scaled = (_SCALED,) if JITTER in starts and starts[JITTER][0] > 0.0 else ()
+    return _DECLARED, *scaled, *([_TICKS] if choice.setting.clock_rate else [])
 
 
 def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None) -> list[Array]:
@@ -218,15 +226,20 @@ def _powers(chooser: Chooser, choice: Choice, item: Stretch, drawn: Array | None
     return [np.asarray(np.mean(part**2, axis=-1)) for part in parts]
 
 
-def _drawn(choice: Choice, item: Stretch, scaled: bool) -> Array:
+def _drawn(choice: Choice, item: Stretch, kind: str) -> Array:
     """Return drawn errors (draw, pulse) in units, as the recovery shows them."""
     fit, data = choice.fit, choice.fit.data
     rng = np.random.default_rng([SEED, int(item.setting.index[0])])  # others in each stretch
     shape = DRAWS, item.errors.size
     power = math.exp(fit.starts[JITTER][0]) if JITTER in fit.starts else 1.0
-    power = power if scaled else min(power, 1.0)  # normal errors make the rest
-    declared = math.sqrt(power) / data.unit * np.asarray(
-        choice.setting.model.distribution.draw(rng, shape))
+    if kind == _TICKS:
+        tick = 1.0 / (choice.setting.clock_rate * data.unit)
+        power = min(power, tick**2 / 12.0)
+        declared = math.sqrt(12.0 * power) * rng.uniform(-0.5, 0.5, shape)
+    else:
+        power = power if kind == _SCALED else min(power, 1.0)  # normal errors make the rest
+        declared = math.sqrt(power) / data.unit * np.asarray(
+            choice.setting.model.distribution.draw(rng, shape))
     gain = np.abs(data.passed[:, 1, 1])
     total = fit.spectrum(fit.parameters)[:, 1, 1].real
     rest = np.sqrt(np.maximum(total - data.measured * power * gain**2, 0.0))

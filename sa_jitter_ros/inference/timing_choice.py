@@ -50,7 +50,7 @@ EXCESS = 'excess_jitter'
 NO_EFFECTS = RIPPLE, SIDEBANDS, RATIO
 #: Logarithm of the odds of two explanations from which on one of them is the answer.
 DECIDED = -math.log(RARE)
-_STEP, _STEPS = 0.01, 300  # ticks by which the size of a pattern is varied, to either side
+_STEP = 0.01  # of the tick by which the size of a pattern is varied, to either side
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Chooser:
             return fit if self._room([sizes[name] @ found[name] for name in names]) else None
         (column,) = found[min(names)]
         step = _STEP / (self.setting.clock_rate * self.data.unit * float(np.ptp(column)))
-        tried = fit.sizes[0] + step * np.arange(-_STEPS, _STEPS + 1)
+        tried = fit.sizes[0] + step * np.arange(-round(1.0 / _STEP), round(1.0 / _STEP) + 1)
         _, variance, rate = self._left([])
         possible, weight = sizes_within_ticks(
             lambda size: self._left([size * column])[0], tried, variance, rate)
@@ -241,10 +241,15 @@ class Chooser:
 
     def of_shape(self, fit: TimingFit, power: float) -> float:
         """Return what the distribution of single errors adds to the likelihood of a fit."""
-        if self.shapes is None or any(item.replaces_jitter for item, _ in fit.patterns.values()):
+        if self.shapes is None or self.on_ticks(fit):
             return 0.0
         return self.shapes.gain(fit, [self.left(fit, item) for item in self.data.stretches],
                                 power)
+
+    def on_ticks(self, fit: TimingFit) -> bool:
+        """Return whether errors that a clock imposes are part of a fit, or declared."""
+        return any(self.patterns[name][0].replaces_jitter for name in self.patterns
+                   if name in fit.columns or name in self.declared)
 
     def _powers(self, fit: TimingFit) -> Sequence[float]:
         """Return the powers of declared errors, in unit^2: more may be of normal ones beside."""

@@ -119,13 +119,10 @@ class TimingData:
 
     def _series(self, item: Stretch) -> Array:
         """Return the series (pulse - 2, 3) of a stretch; a missing pulse has no error."""
-        middle = float(np.mean(item.errors[item.measured]))
-        times = np.where(item.measured, item.setting.times,
-                         item.setting.times - item.errors + middle)
-        errors = np.where(item.measured, item.errors, middle)
-        n = times.size - 2
+        n = item.errors.size - 2
         bends = item.bends[:n] / (1.0 + (item.bend_std / item.bend_prior_std) ** 2)
-        return np.column_stack([np.diff(times - errors, 2), errors[:n], bends]) / self.unit
+        return np.column_stack([np.diff(item.setting.times - item.errors, 2),
+                                _of_measured(item, item.errors)[:n], bends]) / self.unit
 
     def _recovery(self) -> tuple[Array, Array]:
         """
@@ -180,8 +177,8 @@ class TimingData:
     def of_errors(self, errors: Sequence[Array], *, in_times: bool = True) -> Array:
         """Return the ordinates that errors (pulse,) of the pulses, in units, make."""
         return self.transform([np.column_stack([
-            (in_times - 1.0) * np.diff(row, 2), row[:-2], np.zeros(row.size - 2)])
-            for row in errors])
+            (in_times - 1.0) * np.diff(row, 2), _of_measured(item, row)[:-2],
+            np.zeros(row.size - 2)]) for item, row in zip(self.stretches, errors)])
 
     def of_wave(self, direction: str, frequency: float) -> tuple[Array, Array]:
         """Return the ordinates of a unit cosine and sine of a frequency in a direction."""
@@ -198,6 +195,11 @@ class TimingData:
         power = outer(ordinates) * self.weight[:, None, None]
         return np.asarray(np.add.reduceat(power, self.edges[:-1], axis=0)
                           / self.size[:, None, None])
+
+
+def _of_measured(item: Stretch, errors: Array) -> Array:
+    """Return errors (pulse,) with their mean in place of those of missing pulses."""
+    return np.where(item.measured, errors, np.mean(errors[item.measured]))
 
 
 def steering(direction: str, frequency: Array, turning: Array, *, referenced: bool = False

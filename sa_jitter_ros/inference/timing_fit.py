@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import (
-    FAINT, LARGE, MOTION, Pattern, PULSES, Spectrum, white)
+    FAINT, LARGE, MOTION, Pattern, PULSES, ROUNDING, Spectrum, white)
 from sa_jitter_ros.inference.record_fit import APART
 from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
@@ -39,9 +39,7 @@ _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # what the logarithm of the noise power is known to
-_SAME = 0.05  # gain in log likelihood that ends a search
-_STEP = float(np.sqrt(np.finfo(np.float64).eps))  # of a parameter, by which a slope is measured
-_CURVED = float(np.sqrt(_STEP))  # by which a curvature is
+_CURVED = float(np.sqrt(ROUNDING))  # step of a parameter by which a curvature is measured
 
 
 def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
@@ -94,7 +92,7 @@ class TimingFit:
                 self.declared_motion = self.declared_motion + made
         if not self.free_jitter:
             self._fixed = self._fixed + self._of(PULSES, white(np.zeros(1), data.alias))
-        self._apart = 1.0 + _STEP**1.5 * np.eye(data.series)
+        self._apart = 1.0 + ROUNDING**1.5 * np.eye(data.series)
         self._lay_out(start or {}, held or {})
         self._maximise()
 
@@ -142,7 +140,7 @@ class TimingFit:
             found = minimize(self._cost, self.parameters, method='L-BFGS-B', jac=True,
                              bounds=list(zip(self.lower, self.upper)))
             self.parameters, self.value = found.x, -float(found.fun)
-            if restart and not (self.columns and self.value > before + _SAME):
+            if restart and not (self.columns and self.value > before + ROUNDING * abs(before)):
                 break
 
     @property
@@ -220,8 +218,8 @@ class TimingFit:
             base = self.density(name, parameters)
             for i in range(place.start, place.stop):
                 moved = parameters.copy()
-                moved[i] += _STEP
-                step = (self.density(name, moved) - base) / _STEP
+                moved[i] += ROUNDING
+                step = (self.density(name, moved) - base) / ROUNDING
                 if direction == PULSES:
                     step = step[:1]
                 slope[i] += np.sum(step * along[direction])

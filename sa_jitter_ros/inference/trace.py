@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.additive_noise import less_noise
-from sa_jitter_ros.effects.effect import absent, DirectEffect, Finding
+from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
@@ -262,7 +262,8 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
     as_declared, (bench, noise) = bench, _less_noise(bench)
-    chosen, present = _of_timing(bench, timing)
+    whole = _refitted(bench, timing)
+    chosen, present = _of_timing(bench, timing, whole)
     first = as_declared.score((), unsteadiness=as_declared.unsteadiness(()))
     say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
     if noise is not None:
@@ -289,7 +290,6 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     before = as_declared.score((), unsteadiness=own) if chosen or noise else first
     after = bench.score(effects, chosen, unsteadiness=own) if chosen or noise else first
     moves = dependences(bench, effects, chosen) if chosen else at_first
-    whole = _refitted(bench, timing)
     left = _unexplained(bench, whole, chosen)
     unexplained = remains(after, moves) or left is not None
     of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
@@ -341,12 +341,23 @@ def _less_noise(bench: Bench) -> tuple[Bench, tuple[float, float] | None]:
     return (quiet, found) if np.max(declared - true) >= ACCURACY else (bench, None)
 
 
-def _of_timing(bench: Bench, timing: Timing | None) -> tuple[list[Finding], list[Finding]]:
-    """Return the effects that change an average, the most important first, and others."""
+def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
+               ) -> tuple[list[Finding], list[Finding]]:
+    """
+    Return the effects that change an average, the most important first, and others.
+
+    One that is as declared on the `whole` recording is none, whatever a part of it shows.
+    """
     chosen: list[Finding] = []
     present: list[Finding] = []
     findings = timing.findings if timing is not None else ()
+    of_all = {item.name: item for item in whole.findings} if whole is not None else {}
+    declared = {item.name: item for item in bench.declared}
     for finding in findings:
+        known, again = declared.get(finding.name), of_all.get(finding.name)
+        if known and whole and again and again.effect and not departs(
+                again.effect, again.standard_errors, known, whole.chooser.data.cycles):
+            continue
         others = [item.effect for item in findings if item is not finding
                   and item.effect is not None and item.name != _SPEED]
         effect = finding.effect
@@ -454,10 +465,11 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     """
     model = bench.observation.model
     rad = 2.0 * np.pi * model.fundamental_frequency * max(model.orders)
-    names = {finding.name for finding in chosen}
+    effects = bench.with_declared(_effects(chosen))
+    names = {effect.name for effect in effects}
     of_timing = timing.checks if timing is not None else ()
     speeds = model.trigger_revolutions / bench.observation.periods
-    explained = np.mean([line_variance(replace(model, trigger_speed=speed), _effects(chosen))
+    explained = np.mean([line_variance(replace(model, trigger_speed=speed), effects)
                          for speed in speeds.tolist()], axis=0)
     of_lines = check_lines(bench.observation, bench.lines, explained)
     if _GAIN in names:

@@ -125,9 +125,9 @@ class Amplitudes:
                  ) -> SampledDistribution:
         assert self.noise is not None
         size = np.sqrt(noise).astype(np.float32)
-        values = np.abs(draws + shift.astype(np.complex64)[..., None]
-                        + size[..., None] * self.noise[:draws.shape[1]])
-        return SampledDistribution(values, moments.mean_square)
+        values = (draws + shift.astype(np.complex64)[..., None]
+                  + size[..., None] * self.noise[:draws.shape[1]])
+        return SampledDistribution(np.abs(values), moments.mean_square, (values, moments))
 
 
 def component_gain(model: DeclaredModel, influences: Sequence[Influence]) -> Array:

@@ -32,6 +32,7 @@ from sa_jitter_ros.errors import RecordingError, SaJitterError
 FloatArray = NDArray[np.float64]
 
 MIN_RATE, MAX_RATE = 1e-12, 1e12  # Hz
+MAX_VALUES = 200_000_000  # samples of all channels that are read into memory
 _MAX_TIME = 1e15  # s, as 30 million years
 _MAX_SAMPLE = 1e100  # sums of its squares are far below 1e308
 #: A range of samples whose fourth powers are above 1e-308; a smaller one is none.
