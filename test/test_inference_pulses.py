@@ -81,6 +81,14 @@ def test_spurious_pulses_and_their_cycles_are_dropped(rng, marks):
         validated(np.sort(np.append(true, true[10::12] + 0.01 / marks)), marks)
 
 
+def test_pulses_may_be_missing_in_every_acquisition():
+    recording = simulated(acquisitions=14)
+    lost = np.delete(recording.pulse_times, np.arange(7, recording.pulse_times.size, 13))
+    found = traced(replace(recording, pulse_times=lost))
+    assert all(item.missing.any() for item in found.observation.acquisitions)
+    assert [item.name for item in found.findings] == ['missing_pulses']
+
+
 @pytest.mark.parametrize('marks', [1, 4])
 @pytest.mark.parametrize('apart', [-0.12, 0.12])
 def test_displaced_pulse_is_not_lost(rng, marks, apart):

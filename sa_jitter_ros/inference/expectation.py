@@ -40,6 +40,7 @@ from sa_jitter_ros.prediction.influence import (
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
+from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES
 
 Array = NDArray[Any]
 
@@ -49,7 +50,6 @@ Distribution = AmplitudeDistribution | SampledDistribution
 RESOLUTION = 5e-4
 _NODES = 32  # of an integral over a cycle, and of each panel of a longer one
 _PLACES = 12  # in a cycle, where errors turn hardly
-_MOST_KEPT = 40_000_000  # values of 8 bytes
 # Draws of all lines of all acquisitions together: as many as take less time than the moments.
 _MOST_VALUES = 1_000_000
 # Speeds closer than this are the same: no amplitude changes by more than 1e-3.
@@ -113,21 +113,21 @@ class Memory:
         self._kept = 0
 
     def make_room(self) -> None:
-        """Drop all predictions if there are too many."""
-        if self._kept > _MOST_KEPT:
+        """Drop all predictions if they take too much."""
+        if self._kept > IN_MEMORY_BYTES:
             self.shown.clear()
             self._kept = 0
 
     def keep(self, key: tuple[tuple[Influence, ...], int], shown: list[_Shown]) -> None:
         """Keep what an acquisition shows."""
         self.shown[key] = shown
-        self._kept += sum(value.size for item in shown for value in vars(item).values()
+        self._kept += sum(value.nbytes for item in shown for value in vars(item).values()
                           if isinstance(value, np.ndarray))
 
     def count(self, amplitudes: Amplitudes) -> None:
         """Count the draws that are kept with these amplitudes."""
         if amplitudes.draws is not None:
-            self._kept += amplitudes.draws.size
+            self._kept += amplitudes.draws.nbytes
 
 
 @dataclass(frozen=True)

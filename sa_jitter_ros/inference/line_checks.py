@@ -164,13 +164,16 @@ def _accelerations(observation: Observation) -> Array:
 
 def _late(observation: Observation) -> Array:
     """Return by how much the pulses of each acquisition are late in the mean, in s."""
-    return np.array([float(np.nan_to_num(errors.mean())) for errors in _errors(observation)])
+    return np.array([float(np.nan_to_num(errors[item.number].mean()))
+                     for item, errors in zip(observation.acquisitions, _errors(observation))])
 
 
 def _errors(observation: Observation) -> Iterator[Array]:
-    """Yield the recovered errors of the pulses of each acquisition in s, their mean included."""
+    """Yield the errors of the bridged pulses of each acquisition in s, their mean included."""
     for item, recording in zip(observation.acquisitions, observation.recording.tolist()):
-        yield observation.recoveries[recording].errors[item.first:item.first + item.times.size]
+        recovery = observation.recoveries[recording]
+        start = int(recovery.number[item.first])
+        yield recovery.bridged_errors[start:start + item.bridged.size]
 
 
 def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:

@@ -31,8 +31,9 @@ from sa_jitter_ros.effects.timing import MOTION, PULSES, Setting, SOURCE
 
 Array = NDArray[Any]
 
+_NEXT = 1
 #: Whole cycles a trigger cycle that a frequency may have more: itself and its neighbours.
-ALIASES = np.array([0, 1, -1])
+ALIASES = np.array([0, _NEXT, -_NEXT])
 #: Share of a series, at either end, over which a `taper` rises or falls.
 TAPER = 0.05
 _BINS, _SHARP = 60, 12  # least numbers: of bins, and of the frequency over the width of one

@@ -27,6 +27,7 @@ then the distribution of averages of few cycles is sampled (`sampled_distributio
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -188,7 +189,10 @@ def joint_characteristic(
     return product
 
 
+@lru_cache(maxsize=64)
 def unit_nodes(count: int) -> tuple[Array, Array]:
-    """Return the nodes and weights of the Gauss-Legendre rule on [0, 1]."""
+    """Return nodes and weights of the Gauss-Legendre rule on [0, 1], which are not to change."""
     x, w = np.polynomial.legendre.leggauss(count)
-    return 0.5 * (x + 1.0), 0.5 * w
+    nodes, weights = 0.5 * (x + 1.0), 0.5 * w
+    nodes.flags.writeable = weights.flags.writeable = False
+    return nodes, weights
