@@ -55,7 +55,7 @@ MODEL_PARAMETERS = (
     Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
               unit='s'),
     Parameter('noise_std', 0.0, 'standard deviation of white noise per vibration sample, in '
-              "units of the component's amplitude", minimum=0.0),
+              'units of the vibration; predicted components have the amplitude 1', minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),
     Parameter('angle_law', 'linear', 'how the angle runs between pulses, as in the averager',

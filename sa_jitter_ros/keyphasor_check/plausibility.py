@@ -181,7 +181,7 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
         beyond = ' more often than by chance' if count else ''
         return (f'none of the orders {listed} stands above its noise{beyond} at {speed:.4g} Hz '
                 f'and ratio {ratio:.6g}: check ratio, pulses_per_revolution and sample_rate '
-                '(check_keyphasor finds them)',)
+                '(check_keyphasor finds them), and that one clock times pulses and vibration',)
     marks, larger = validator.pulses_per_revolution, _LARGER if count < stand.size else _FAR_LARGER
     for other in _OTHER_MARKS:
         fitting = round(other * marks)
