@@ -39,7 +39,7 @@ from sa_jitter_ros.prediction.influence import (
     Influence, known_errors, Pulses, random_processes, without_gaps)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
-from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
+from sa_jitter_ros.prediction.sampled_distribution import COARSEST, SampledDistribution
 from sa_jitter_ros.recordings.limits import IN_MEMORY_BYTES
 
 Array = NDArray[Any]
@@ -193,7 +193,7 @@ class Expectation:
 
     @property
     def _most(self) -> int:
-        return 1 + _MOST_VALUES // self.noise.size
+        return max(COARSEST, _MOST_VALUES // self.noise.size)
 
     def _gathered(self, distributions: Sequence[Distribution], name: str) -> Array:
         values = np.empty(self.noise.size)

@@ -35,7 +35,8 @@ KnownErrors = Callable[[int], Array]
 _SEED = 20190215
 _BUDGET = 3_000_000  # phasors in one distribution: a tenth of a second
 _FEWEST, _MOST = 4096, 65536  # draws: standard errors of 0.008 and 0.002 of a median
-_COARSEST = 512  # fewest draws of long averages
+#: Fewest draws of long averages.
+COARSEST = 512
 _IN_EACH = 256  # draws in a scenario that counts by itself: 6 % of its standard deviation
 LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
 _MOST_POINTS = 1000  # of a process drawn at once: the cube of it is its time
@@ -165,7 +166,7 @@ def _affordable(phasors: int, orders: int) -> int:
     """Return how many averages of so many phasors are worth their time and memory."""
     count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
     most = min(MOST_PHASORS, LONGEST * orders)
-    return max(_COARSEST, min(count, _COARSEST * most // phasors))
+    return max(COARSEST, min(count, COARSEST * most // phasors))
 
 
 def moments_of(draws: Array) -> AverageMoments:
@@ -183,17 +184,14 @@ def _mean_size(draws: Array, moments: AverageMoments) -> Array:
     nearly a sum: the mean of some thousand draws scatters far more.
     """
     off = draws - moments.mean[:, None]
-    variance, twice = moments.variance[:, None], moments.pseudo_variance[:, None]
-    controls = np.stack([np.ones(off.shape), off.real, off.imag,
-                         np.abs(off) ** 2 - variance, *_parts(off**2 - twice)])
+    power = np.abs(off) ** 2 - moments.variance[:, None]
+    square = off**2 - moments.pseudo_variance[:, None]
+    controls = np.stack([
+        np.ones(off.shape), off.real, off.imag, power, square.real, square.imag])
     controls /= np.sqrt(np.mean(controls**2, axis=-1, keepdims=True)) + np.finfo(float).tiny
     normal = np.einsum('iod,jod->oij', controls, controls)
     right = np.einsum('iod,od->oi', controls, np.abs(draws.astype(complex)))
     return np.asarray(np.einsum('oi,oi->o', np.linalg.pinv(normal, hermitian=True)[:, 0], right))
-
-
-def _parts(values: Array) -> tuple[Array, Array]:
-    return values.real, values.imag
 
 
 def _linear_cycles(errors: Array) -> tuple[Array, Array]:
