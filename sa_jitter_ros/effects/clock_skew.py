@@ -23,7 +23,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 
 #: Clocks, and ratios, are seldom wrong by more.
-USUAL = 5e-3
+USUAL_SKEW = 5e-3
 
 
 def _growing(setting: Setting) -> Array:
@@ -69,7 +69,7 @@ class ClockSkew(Effect):
     remedy: ClassVar[str] = 'time pulses and vibration by one clock'
     timing: ClassVar[Pattern] = Pattern(
         _growing, show_in_times=False, usual=lambda setting: (
-            USUAL * setting.model.trigger_period / setting.unit))
+            USUAL_SKEW * setting.model.trigger_period / setting.unit))
     skew: float = parameter(0.0, 'relative speed of the keyphasor clock, less 1', '1',
                             minimum=-0.1, maximum=0.1)
     by_angle: float = 0.0

@@ -29,7 +29,7 @@ from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
-def _own(model: DeclaredModel) -> tuple[int, int]:
+def own_marks(model: DeclaredModel) -> tuple[int, int]:
     """Return how many marks begin trigger cycles, and the pulses in a trigger cycle."""
     marks = model.pulses_per_revolution
     step = model.pulses_per_trigger or marks
@@ -38,7 +38,7 @@ def _own(model: DeclaredModel) -> tuple[int, int]:
 
 def _marks(setting: Setting) -> Array:
     """Return for each mark but the last that begins trigger cycles where it is late, alone."""
-    own, _ = _own(setting.model)
+    own, _ = own_marks(setting.model)
     mark = np.asarray(setting.index) % own
     return np.array([(mark == m) * 1.0 - (mark == own - 1) for m in range(own - 1)])
 
@@ -106,7 +106,7 @@ class TargetGeometry(Effect):
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting
                   ) -> tuple['TargetGeometry', Mapping[str, Any]]:
         """Return the angles of all marks; those that begin no trigger cycle stay at 0."""
-        own, step = _own(setting.model)
+        own, step = own_marks(setting.model)
         marks = setting.model.pulses_per_revolution
         rad = 2.0 * np.pi * setting.model.trigger_speed * setting.unit
         angles, unsure = np.zeros(marks), np.full(marks, np.nan)
@@ -117,7 +117,7 @@ class TargetGeometry(Effect):
 
     def remark(self, model: DeclaredModel) -> str:
         """Return how many marks nothing is known of."""
-        own, _ = _own(model)
+        own, _ = own_marks(model)
         if own == model.pulses_per_revolution:
             return ''
         return (f' ({own} of the {model.pulses_per_revolution} marks begin trigger cycles, '
@@ -125,7 +125,7 @@ class TargetGeometry(Effect):
 
     def in_timing(self, setting: Setting) -> Array:
         """Return the delays in units of the marks that begin trigger cycles, but the last."""
-        own, step = _own(setting.model)
+        own, step = own_marks(setting.model)
         angles = np.asarray(self.pulse_angles)[(np.arange(own) * step) % len(self.pulse_angles)]
         delays = angles / (2.0 * np.pi * setting.model.trigger_speed * setting.unit)
         return np.asarray((delays - delays.mean())[:-1])

@@ -84,10 +84,10 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
             share = (_KNOWN * wanted[peak]) ** 2 / unsure[peak]
             off = np.clip(np.abs(swings[peak]) / wanted[peak] - 1.0, -0.5, 0.5)
             name, at, kept = method, peak, 1.0 - (1.0 - mean) * (1.0 + share * off)
-    peaks = np.flatnonzero((rival[1:-1] > ODDS) & (rival[1:-1] > rival[:-2])
-                           & (rival[1:-1] >= rival[2:]))
+    peaks = int(np.count_nonzero((rival[1:-1] > ODDS) & (rival[1:-1] > rival[:-2])
+                                 & (rival[1:-1] >= rival[2:])))
     # each method, and each line that stands there by itself and may look like a beat
-    tried += np.log(len(METHODS) * max(peaks.size, 1))
+    tried += np.log(len(METHODS) * max(peaks, 1))
     gained, p_value = float(best - tried), float(np.exp(min(tried - best, 0.0)))
     if gained <= ODDS:
         return Beat(gained, p_value)

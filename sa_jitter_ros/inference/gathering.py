@@ -22,6 +22,7 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
     Clock, find_clock, on_grid, ROOM, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
+from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
@@ -101,13 +102,8 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
     Pulses beside an acquisition that its angle law uses are included.
     """
     model, pulses = observation.model, observation.pulses
-    found = find_clock(pulses.times)
-    clock = found.rate
-    usable = found.visible(model.keyphasor_rate)
-    of_tick = 1.0 / math.sqrt(12.0) / clock if usable else 0.0
-    grid = _Grid(clock, smooth_on_grid(pulses.times, clock)) if usable else None
-    if grid is not None and dithered(observation, found, grid.smooth):
-        found, grid = replace(found, dithered=True), None
+    clock, imposed = clock_of(observation)
+    grid = None if imposed is None else _Grid(clock.rate, imposed)
     again: Sequence[Array | None] = [None] * (int(group.max()) + 1)
     if grid is not None and group.max() > 0:
         again = [recovered_again(recording, observation, np.flatnonzero(group != i).tolist())
@@ -128,15 +124,31 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
         rows = []
         for motion, uncertain in zip(again, error_std):
             errors, std, unknown = smooth, 0.0, missed
-            precise = item.recovered and item.standard_errors.mean() < of_tick
-            if smooth is not None and motion is not None and precise and np.all(
-                    np.isfinite(motion[a])):
+            if smooth is not None and motion is not None and item.recovered and (
+                    item.standard_errors.mean() < 1.0 / math.sqrt(12.0) / clock.rate
+                    and np.all(np.isfinite(motion[a]))):
                 errors, std, unknown = smooth.copy(), uncertain, (0.0, 0.0)
-                errors[own] = on_grid(motion[a], clock)
+                errors[own] = on_grid(motion[a], clock.rate)
             rows.append(Pulses(pulses.times[read], first, errors,
                                pulses.missing[read.start:read.stop - 1], std, *unknown))
         known.append(rows)
-    return (found if usable else Clock(0.0, 0.0)), known
+    return clock, known
+
+
+def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
+    """
+    Return the clock of the pulses, and the errors (pulse,) of the smoothest motion on its grid.
+
+    These are None where no clock shows, or where its ticks are errors independent of each other.
+    """
+    times = observation.pulses.times
+    clock = find_clock(times)
+    if not clock.visible(observation.model.keyphasor_rate):
+        return Clock(0.0, 0.0), None
+    smooth = smooth_on_grid(times, clock.rate)
+    if dithered(observation, clock, smooth):
+        return replace(clock, dithered=True), None
+    return clock, smooth
 
 
 def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
@@ -147,9 +159,7 @@ def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
     `smooth`est motion on the grid tells (pulse,) are wrong: that motion is rougher than the
     recovered one, which the ticks do not allow. What repeats with the marks is left in both.
     """
-    model = observation.model
-    marks = model.pulses_per_revolution
-    marks //= math.gcd(marks, model.pulses_per_trigger or marks)
+    marks, _ = own_marks(observation.model)
     usable = [item for item in observation.acquisitions
               if np.all(np.isfinite(item.errors)) and not np.any(item.missing)]
     if not usable:

@@ -25,11 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import LineEvidence
-from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, smooth_on_grid, ticks_leave_room)
+from sa_jitter_ros.effects.lattice import Clock, ticks_leave_room
 from sa_jitter_ros.errors import ModelError, SignalError
 from sa_jitter_ros.inference.expectation import Lines
-from sa_jitter_ros.inference.gathering import dithered
+from sa_jitter_ros.inference.gathering import clock_of
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAverage
 from sa_jitter_ros.inference.record_pulses import RecordPulses
@@ -151,15 +150,10 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
     clock allows: they test the clock. The second errors predict: they are the recovered ones, if
     the ticks of the clock can make these.
     """
-    times = observation.pulses.times
     items = observation.acquisitions
-    clock = find_clock(times)
-    if not clock.visible(observation.model.keyphasor_rate):
-        return Clock(0.0, 0.0), [
-            2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
-    smooth = smooth_on_grid(times, clock.rate)
-    if dithered(observation, clock, smooth):
-        return replace(clock, dithered=True), [
+    clock, smooth = clock_of(observation)
+    if smooth is None:
+        return clock, [
             2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
     recovered = np.asarray(observation.stacked('errors'))

@@ -36,7 +36,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
-from sa_jitter_ros.effects.clock_skew import USUAL
+from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.slips import mend_slips
 from sa_jitter_ros.prediction.influence import trigger_periods
@@ -512,8 +512,8 @@ class States:
         # the trend that the errors are expected along stands after the amplitudes
         along = precision[:, 0] * self.ramp
         border[:, 0, -1] = -along
-        corner[-1, -1] = along @ self.ramp + USUAL**-2.0
-        below[-1] = along @ expected[:, 0] - self.trend * USUAL**-2.0
+        corner[-1, -1] = along @ self.ramp + USUAL_SKEW**-2.0
+        below[-1] = along @ expected[:, 0] - self.trend * USUAL_SKEW**-2.0
         scale = 1.0 / np.sqrt(total)  # seconds and gains together
         scales = np.hstack([scale, np.roll(scale[:, :1], -1)])
         cells *= scales[:, :, None] * scales[:, None, :]
@@ -638,7 +638,7 @@ class States:
         spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
         power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
         step = _FINE / self.orders.max() / span
-        most = int(USUAL / step)
+        most = int(USUAL_SKEW / step)
         slope = step * np.arange(-most, most + 1)
         self.slopes = slope.size
         score = np.sum([np.log(1e-3 * power.max() + np.interp(

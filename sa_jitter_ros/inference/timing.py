@@ -397,7 +397,8 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
         if not np.isfinite(item.bend_std):
             continue
         bends = through(item.bends, kept, data) + kept[0] * item.bends.mean()
-        for part in np.array_split(bends, max(1, int(bends.size * ACCELERATION_BAND[0]))):  # waves
+        # as long as the slowest wave, so that their powers scatter by themselves
+        for part in np.array_split(bends, max(1, int(bends.size * ACCELERATION_BAND[0]))):
             parts.append(np.mean(part**2) - passed * item.bend_std**2)
             next_.append(np.mean(part[1:] * part[:-1]))
             count += part.size

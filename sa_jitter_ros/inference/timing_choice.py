@@ -30,6 +30,7 @@ from sa_jitter_ros.effects import Effect, EFFECTS
 from sa_jitter_ros.effects.clock_skew import WRONG_RATIO
 from sa_jitter_ros.effects.effect import ODDS, possible, RARE
 from sa_jitter_ros.effects.lattice import sizes_within_ticks, ticks_leave_room
+from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, Setting, SOURCE, Spectrum)
 from sa_jitter_ros.errors import ParameterError
@@ -275,9 +276,7 @@ class Chooser:
 
     def _ripple(self) -> Array | None:
         """Return the ordinates of a motion that repeats with the revolution."""
-        model = self.setting.model
-        marks = model.pulses_per_revolution
-        own = marks // math.gcd(marks, model.pulses_per_trigger or marks)
+        own, _ = own_marks(self.setting.model)
         if own == 1 or own > self.data.longest // 4:
             return None
         waves: list[Array] = []

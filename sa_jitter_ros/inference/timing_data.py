@@ -123,7 +123,7 @@ class TimingData:
         n = item.errors.size - 2
         bends = item.bends[:n] / (1.0 + (item.bend_std / item.bend_prior_std) ** 2)
         return np.column_stack([np.diff(item.setting.times - item.errors, 2),
-                                _of_measured(item, item.errors)[:n], bends]) / self.unit
+                                of_measured(item, item.errors)[:n], bends]) / self.unit
 
     def _recovery(self) -> tuple[Array, Array]:
         """
@@ -178,7 +178,7 @@ class TimingData:
     def of_errors(self, errors: Sequence[Array], *, in_times: bool = True) -> Array:
         """Return the ordinates that errors (pulse,) of the pulses, in units, make."""
         return self.transform([np.column_stack([
-            (in_times - 1.0) * np.diff(row, 2), _of_measured(item, row)[:-2],
+            (in_times - 1.0) * np.diff(row, 2), of_measured(item, row)[:-2],
             np.zeros(row.size - 2)]) for item, row in zip(self.stretches, errors)])
 
     def of_wave(self, direction: str, frequency: float) -> tuple[Array, Array]:
@@ -198,7 +198,7 @@ class TimingData:
                           / self.size[:, None, None])
 
 
-def _of_measured(item: Stretch, errors: Array) -> Array:
+def of_measured(item: Stretch, errors: Array) -> Array:
     """Return errors (pulse,) with their mean in place of those of missing pulses."""
     return np.where(item.measured, errors, np.mean(errors[item.measured]))
 

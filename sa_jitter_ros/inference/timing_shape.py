@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.inference.residual import DRAWS
-from sa_jitter_ros.inference.timing_data import Stretch, TimingData
+from sa_jitter_ros.inference.timing_data import of_measured, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import TimingFit
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from scipy.fft import irfft, rfft
@@ -48,8 +48,7 @@ def through(values: Array, gain: Array, data: TimingData) -> Array:
 
 def errors_left(item: Stretch, unit: float, known: Array) -> Array:
     """Return the errors (pulse,) that `known` ones and a trend leave, in units."""
-    errors = item.errors / unit - known
-    errors = np.where(item.measured, errors, np.mean(errors[item.measured]))
+    errors = of_measured(item, item.errors / unit - known)
     place = np.arange(errors.size)
     return np.asarray(errors - np.polynomial.Polynomial.fit(place, errors, 1)(place))
 
