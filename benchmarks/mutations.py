@@ -158,12 +158,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--only', default='', help='only names with this text')
     parser.add_argument('--new', action='store_true', help='only numbers that nothing noticed yet')
+    parser.add_argument('--stale', action='store_true',
+                        help='only numbers that the case which noticed them no longer notices')
     parser.add_argument('--cases', nargs='+', default=CASES, help='the results that are asked')
     options = parser.parse_args(arguments)
     known = kept()
     for number in numbers():
         last, before = known.get(number.name, ['', ''])
         if options.only not in number.name or (options.new and before):
+            continue
+        if options.stale and (not before or noticed(number, last == 'up', [before])):
             continue
         found = ['', '']
         for way in sorted(('up', 'down'), key=lambda item: item != last):

@@ -30,7 +30,7 @@ from independent_machines import Array, Machine, pulses, record
 import numpy as np
 from page import table
 import sa_jitter_ros as sa
-from sa_jitter_ros.inference.record_fit import fit_record, RecordFit
+from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.record_recovery import recover_record
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -86,11 +86,11 @@ def fitted(names: tuple[str, ...], seed: int) -> Fitted:
     measured, true = measured[part], true[part]
     there = np.isfinite(measured)
     begin = time.process_time()
-    found = fit_record(
+    found = OpenRecord(
         samples, machine.sample_rate, machine.start_time,
         np.interp(np.arange(measured.size), np.flatnonzero(there), measured[there]),
         measured=there, cycle_length=machine.cycle_length, orders=machine.orders.tolist(),
-        jitter_std=1.0 / np.sqrt(12.0) / machine.keyphasor_rate)
+        jitter_std=1.0 / np.sqrt(12.0) / machine.keyphasor_rate).fit()
     seconds = time.process_time() - begin
     wrong = found.errors - (measured - true)
     return Fitted(machine, found, measured - true, wrong - np.nanmean(wrong), seconds)

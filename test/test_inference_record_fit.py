@@ -16,7 +16,8 @@ from independent_effects import draw_case
 import numpy as np
 import pytest
 from record_recovery import fitted
-from sa_jitter_ros.inference.record_fit import fit_record, independent_power
+from sa_jitter_ros.inference.cycle_states import independent_power
+from sa_jitter_ros.inference.record_fit import OpenRecord
 from sa_jitter_ros.inference.slips import shortest_path
 
 
@@ -75,8 +76,8 @@ def steady(rng, count=60, rate=5000.0, speed=25.0, noise=0.02):
 
 def test_without_noise_nothing_is_made_up(rng):
     samples, times, errors = steady(rng, noise=0.0)
-    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    found = OpenRecord(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5).fit()
     assert found.orders.tolist() == [8.0, 16.0, 24.0]
     wrong = found.errors - errors
     assert wrong[1:-1] == pytest.approx(wrong.mean(), abs=1e-8)  # half as much tells the ends
@@ -86,8 +87,8 @@ def test_without_noise_nothing_is_made_up(rng):
 @pytest.mark.parametrize('size', [0.2, 1.0, 5.0, 100.0])
 def test_the_declared_size_hardly_matters(rng, size, noise):
     samples, times, errors = steady(rng, noise=noise)
-    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size)
+    found = OpenRecord(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size).fit()
     wrong = found.errors - (errors - errors.mean())
     assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
         1.0, abs=4.0 / np.sqrt(2.0 * times.size))
@@ -98,8 +99,8 @@ def test_the_declared_size_hardly_matters(rng, size, noise):
 @pytest.mark.parametrize('size', [1.0, 100.0])
 def test_errors_are_hardly_shrunk_however_little_shows_of_them(rng, size):
     samples, times, errors = steady(rng, noise=4.0)
-    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size)
+    found = OpenRecord(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5 / size).fit()
     wrong = found.errors - (errors - errors.mean())
     assert np.sqrt(np.mean((wrong / found.standard_errors) ** 2)) == pytest.approx(
         1.0, abs=4.0 / np.sqrt(2.0 * times.size))
@@ -120,8 +121,8 @@ def test_noise_counts_as_it_is_at_the_lines(rng, power, noise):
     """Noise that grows with frequency is less there than in the band that is read, or more."""
     samples, times, errors = steady(rng, count=300, noise=0.0)
     samples = samples + noise * coloured(rng.standard_normal(samples.shape), power)
-    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    found = OpenRecord(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5).fit()
     z = ((found.errors - (errors - errors.mean())) / found.standard_errors)[2:-2]
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size) + 0.1)
 
@@ -132,8 +133,8 @@ def test_a_trend_shows_where_no_single_error_does(rng, noise, slope):
     """A clock is told from errors of 1 us of which the vibration shows each to 20 us or more."""
     samples, times, _ = steady(rng, count=200, noise=noise)
     times = times + slope * times
-    found = fit_record(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=1e-6)
+    found = OpenRecord(samples, 5000.0, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=1e-6).fit()
     assert np.median(found.standard_errors) > 20e-6
     # of a straight line through errors with independent noise
     error = np.sqrt(12.0 / times.size) * np.median(found.standard_errors) / np.ptp(times)
@@ -174,10 +175,10 @@ def test_sidebands_turn_with_those_of_their_spacing(rng):
     others = [8.37, 15.63, 24.37, 0.37, 11.21]
     vibration = sum(size * np.cos(2.0 * np.pi * order * speed * time + order) for order, size
                     in zip([8.0, 16.0, 24.0, *others], [1.0, 0.7, 0.5] + [0.1] * 5))
-    found = fit_record((vibration + 0.02 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+    found = OpenRecord((vibration + 0.02 * rng.standard_normal(time.size))[:, None], rate, 0.0,
                        (np.arange(count) + 0.5) / speed + rng.normal(0.0, 5e-5, count),
                        measured=np.ones(count, bool), cycle_length=1.0, orders=[8.0, 16.0, 24.0],
-                       jitter_std=5e-5)
+                       jitter_std=5e-5).fit()
     lines = np.append(found.orders, found.tones / speed)
     turning = {other: found.turning[np.argmin(np.abs(lines - other))] for other in others}
     assert [other for other, turns in turning.items() if not turns] == [11.21]
@@ -195,10 +196,10 @@ def test_errors_of_more_than_half_a_turn_are_found(rng, memory):
     time = np.arange(int((count + 2) / speed * rate)) / rate
     vibration = sum(size * np.cos(2.0 * np.pi * g * speed * time)
                     for g, size in ((8.0, 0.3), (12.0, 0.3), (24.0, 1.0)))
-    found = fit_record((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+    found = OpenRecord((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
                        (np.arange(count) + 0.5) / speed + errors,
                        measured=np.ones(count, bool), cycle_length=1.0, orders=[8.0, 12.0, 24.0],
-                       jitter_std=5e-5)
+                       jitter_std=5e-5).fit()
     wrong = (found.errors - errors)[2:-2]
     z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
     assert np.abs(z).max() < 6.0
@@ -238,8 +239,8 @@ def foreign_shaft(rng, *, varying):
 def test_a_foreign_shaft_hides_no_lines_and_tells_no_errors(rng, varying):
     """What is left beside its strong lines must not end the search for others."""
     samples, rate, times, errors, sides = foreign_shaft(rng, varying=varying)
-    found = fit_record(samples, rate, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5)
+    found = OpenRecord(samples, rate, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[8.0, 16.0, 24.0], jitter_std=5e-5).fit()
     assert np.all(np.abs(found.orders[:, None] - sides).min(axis=0) < 1e-3)
     wrong = (found.errors - errors)[2:-2]
     z = (wrong - wrong.mean()) / found.standard_errors[2:-2]
@@ -263,9 +264,9 @@ def test_sidebands_that_do_not_change_are_no_bend_of_all_cycles(rng):
                     for (order, size), phase in zip(lines.items(), phases))
     times = np.interp(np.arange(count) + 0.5, turns, time) + rng.normal(0.0, 5e-5, count)
     declared = [25, 27, 52, 53, 78]
-    found = fit_record((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+    found = OpenRecord((vibration + 0.05 * rng.standard_normal(time.size))[:, None], rate, 0.0,
                        times, measured=np.ones(count, bool), cycle_length=1.0, orders=declared,
-                       jitter_std=5e-5, known=(np.zeros(0), np.zeros(0)))
+                       jitter_std=5e-5).fit((np.zeros(0), np.zeros(0)))
     wrong = np.abs(found.amplitudes[0, :5]) - [lines[order] for order in declared]
     assert np.all(np.abs(wrong) < 4.0 * found.amplitude_errors[0, :5])
 
@@ -282,9 +283,9 @@ def test_declared_lines_alone_tell_how_fast_the_angle_runs(rng):
                     for (order, size), phase in zip(lines.items(), phases))
     true = np.interp(np.arange(count) + 0.5, turns, time)
     times = true * (1.0 + skew) + rng.normal(0.0, 2e-5, count)
-    found = fit_record((vibration + 0.5 * rng.standard_normal(time.size))[:, None], rate, 0.0,
+    found = OpenRecord((vibration + 0.5 * rng.standard_normal(time.size))[:, None], rate, 0.0,
                        times, measured=np.ones(count, bool), cycle_length=1.0,
-                       orders=[13, 27], jitter_std=2e-5)
+                       orders=[13, 27], jitter_std=2e-5).fit()
     assert np.polyfit(times, found.errors, 1)[0] == pytest.approx(skew, rel=0.005)
 
 
@@ -301,8 +302,8 @@ def test_a_tone_near_an_order_is_one_tone_of_the_right_numbers(rng, swing):
     samples += 0.05 * rng.standard_normal(time.size)
     times = np.interp(np.arange(turns[0] + 0.5, turns[-1] - 0.5), turns, time)
     times += rng.normal(0.0, 5e-5, times.size)
-    found = fit_record(samples[:, None], rate, 0.0, times, measured=np.ones(times.size, bool),
-                       cycle_length=1.0, orders=[20.0, 21.0, 25.0, 42.0], jitter_std=5e-5)
+    found = OpenRecord(samples[:, None], rate, 0.0, times, measured=np.ones(times.size, bool),
+                       cycle_length=1.0, orders=[20.0, 21.0, 25.0, 42.0], jitter_std=5e-5).fit()
     assert found.orders.size == 4
     error, amplitude = found.amplitude_errors[0, 4], np.abs(found.tone_amplitudes[0])
     unsure = np.sqrt(12.0) * error / amplitude / (2.0 * np.pi * np.ptp(times))

@@ -17,10 +17,11 @@ the wrong turn. Around cycles that the lines do not fit, errors are chosen anew,
 """
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.inference.cycle_states import States
+from sa_jitter_ros.inference.line_search import fit_lines
 from scipy.special import gammainccinv
 
 Array = NDArray[np.float64]
@@ -28,45 +29,6 @@ Array = NDArray[np.float64]
 # Errors that are tried, in parts of a turn of the highest declared order, to either side; the size
 # of errors, in turns, from which one of some hundreds is half a turn or more.
 _PLACES, _SLIPPING = 6, 0.125
-
-
-class States(Protocol):
-    """What slips are mended in: the states of the record fit, which says what its parts are."""
-
-    start_time: float
-    times: Array
-    whole: NDArray[np.bool_]
-    frequency: float
-    declared: int
-    orders: Array
-    tones: Array
-    amplitudes: NDArray[np.complex128]
-    states: Array
-    size: Array
-    trend: float
-    ramp: Array
-    u: Array
-    shapes: Array
-    vibration: Array
-    weight: Array
-
-    def residual(self) -> Array:
-        """Return the vibration less the lines (channel, cycle, point)."""
-
-    def signals(self, amplitudes: NDArray[np.complex128]) -> Array:
-        """Return the sums (channel, cycle, point) of lines."""
-
-    def rate(self) -> Array:
-        """Return the derivative (channel, cycle, point) of the lines by the pulse errors."""
-
-    def vibration_at(self, place: Array) -> Array:
-        """Return the vibration (..., channel) at times (...) in s."""
-
-    def read(self) -> None:
-        """Read the vibration at the present angle."""
-
-    def fit_amplitudes(self) -> None:
-        """Fit the amplitudes of all lines with the states as they are."""
 
 
 def mend_slips(states: States) -> bool:
@@ -108,7 +70,7 @@ def mend_slips(states: States) -> bool:
             mended = True
     if mended:
         states.read()
-        states.fit_amplitudes()
+        fit_lines(states)
     return mended
 
 

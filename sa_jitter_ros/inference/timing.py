@@ -35,8 +35,10 @@ from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
+from sa_jitter_ros.inference.cycle_states import independent_power
+from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.observation import Acquisition, Observation
-from sa_jitter_ros.inference.record_fit import APART, independent_power, RecordFit
+from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RESOLVED
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing

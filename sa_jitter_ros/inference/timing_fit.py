@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import (
     FAINT, LARGE, MOTION, Pattern, PULSES, ROUNDING, Spectrum, white)
-from sa_jitter_ros.inference.record_fit import APART
+from sa_jitter_ros.inference.line_search import APART
 from sa_jitter_ros.inference.timing_data import TimingData
 from scipy.optimize import minimize
 

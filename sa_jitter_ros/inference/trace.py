@@ -310,11 +310,11 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     for name in EFFECTS:
         if name in known:
             continue
-        if timing is not None and name in timing.probabilities:
+        if name in {item.name for item in declared}:
+            reason = _AS_DECLARED
+        elif timing is not None and name in timing.probabilities:
             reason = ('the likelihood of the timing gains nothing by it: probability '
                       f'{timing.probabilities[name]:.2g}')
-        elif name in {item.name for item in declared}:
-            reason = _AS_DECLARED
         else:
             reason = bench.untold.get(name, _UNSEEN)
         candidates.append(Candidate(name, 0, absent(name, reason), None, reason))

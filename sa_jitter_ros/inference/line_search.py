@@ -1,0 +1,305 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The search for undeclared lines in what the record fit leaves.
+
+Undeclared orders of other shafts and sidebands leak into trigger cycles that are too short to keep
+them apart, and would be taken for pulse errors. So the fit looks for them in the spectrum of what
+it leaves, over angle (orders) and over time (tones): the sharper peak decides which it is.
+"""
+
+from collections.abc import Sequence
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.noise import row_medians
+from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
+from sa_jitter_ros.inference.cycle_states import hann, States
+from sa_jitter_ros.pulses.resampling import interpolate
+from scipy.fft import rfft
+from scipy.special import gammaincc, gammainccinv
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
+# A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
+# it must not be far below the strongest, which may leave images of itself.
+FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
+_SHARPER = 1.3  # in power, over angle than over time or the reverse
+_FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
+#: Bins between lines, or cycles in a stretch between waves, that are told apart.
+APART = 1.5
+_ACCURACY = 1e-5  # of the RMS: amplitudes that resampling may make
+_FINE = 0.3  # bins between frequencies that are tried
+_SKIRT = 24  # bins beside a line, of which the median is the floor; half an order is one, too
+_SLOPE_GAIN = 0.7
+_SLOPE_LINES = 0.7  # share of the declared lines that must stand out of the noise with a slope
+
+
+def follow_trend(states: States, expected: float) -> int:
+    """
+    Start from the slope of the errors that keeps the declared lines together.
+
+    A clock that is fast or slow, or a wrong ratio, makes it. It is the `expected` one where
+    no other is clearly better. How many were tried is returned.
+    """
+    span = states.cycle_length * states.transformed
+    flat = states.vibration[:, :states.transformed].reshape(len(states.vibration), -1)
+    spectrum = np.abs(np.fft.rfft(flat * np.hanning(flat.shape[1]))).T ** 2
+    power = np.sum(spectrum / spectrum.mean(axis=0), axis=1)
+    step = _FINE / states.orders.max() / span
+    most = int(USUAL_SKEW / step)
+    slope = step * np.arange(-most, most + 1)
+    score = np.sum([np.log(1e-3 * power.max() + np.interp(
+        g * (1.0 + slope) * span, np.arange(power.size), power)) for g in states.orders],
+        axis=0)
+    best = slope[np.argmax(score)]
+    before = score[np.argmin(np.abs(slope - expected))]
+    ratio = sum(item * np.log(2.0) / _medians(item, max(int(span / 2), _SKIRT))
+                for item in spectrum.T)
+    places = np.rint(states.orders * (1.0 + best) * span).astype(int)
+    chance = gammaincc(spectrum.shape[1], ratio[places])
+    clear = (score.max() - before > _SLOPE_GAIN * states.declared
+             and abs(best - expected) > 1.5 * step
+             and np.mean(chance < FALSE / slope.size) > _SLOPE_LINES)
+    states.trend = float(best) if clear else expected
+    states.states[:, 0] = states.trend * states.ramp
+    states.read()
+    return len(slope)
+
+
+def new_lines(states: States) -> tuple[list[float], list[float]]:
+    """Return orders, and tones in Hz, that stand out of the residual; some if too many do."""
+    states.make_tables()
+    span = states.cycle_length * states.transformed
+    residual = states.residual()[:, :states.transformed]
+    flat = np.ascontiguousarray(residual.reshape(len(residual), -1).T)
+    time = states.place[:states.transformed].ravel()
+    duration = float(time[-1] - time[0])
+    at = np.interp(np.linspace(time[0], time[-1], time.size), time, np.arange(time.size))
+    even = interpolate(flat, np.clip(at, 0.0, time.size - 1.0))
+    least = _ACCURACY * np.sqrt(np.mean(states.vibration**2, axis=(1, 2)))
+    over_angle, over_time = (_spectrum(item, span, least) for item in (flat, even))
+    limit = gammainccinv(flat.shape[1], FALSE / len(over_angle[0])) * _MARGIN
+    found: list[tuple[float, float, bool]] = []
+    for tone, (ratio, power), (_, other) in ((False, over_angle, over_time),
+                                             (True, over_time, over_angle)):
+        middle = ratio[1:-1]
+        peaks = 1 + np.flatnonzero((middle > ratio[:-2]) & (middle >= ratio[2:])
+                                   & (middle > limit))
+        order = peaks / span
+        for peak in peaks[(order > 3.0 / span) & (order < states.highest)]:
+            near = other[max(peak - 8, 0):peak + 9].max()
+            if power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER):
+                place = _between(np.log(ratio[peak - 1:peak + 2])) + peak
+                found.append((power[peak], place / (duration if tone else span), tone))
+    found.sort(reverse=True)
+    orders: list[float] = []
+    tones: list[float] = []
+    room = _MOST_LINES // (1 if states.all_free else 2) - states.lines_found
+    least_power = 0.0
+    for size, place, tone in found:
+        if size < least_power or len(orders) + len(tones) >= room:
+            break
+        others = np.array([*states.orders, *orders])
+        beside = np.array([*states.tones, *tones])
+        if tone:
+            near_one = np.any(np.abs(beside - place) * duration < APART) or np.any(
+                np.abs(others - place / states.frequency) * states.span < APART)
+        else:
+            near_one = np.any(np.abs(others - place) * states.span < APART)
+        if not near_one:
+            (tones if tone else orders).append(float(place))
+            least_power = least_power or _SHARE * size
+    return orders, tones
+
+
+def add_lines(states: States, orders: Sequence[float] | Array,
+              tones: Sequence[float] | Array) -> None:
+    """Add undeclared lines, their amplitudes 0."""
+    old = np.split(states.amplitudes, [states.orders.size], axis=1)
+    none = [np.zeros((len(states.amplitudes), len(new))) for new in (orders, tones)]
+    states.amplitudes = np.hstack([old[0], none[0], old[1], none[1]])
+    states.orders = np.append(states.orders, orders)
+    states.tones = np.append(states.tones, tones)
+
+
+def refine(states: States) -> float:
+    """
+    Move each undeclared line to where the residual has nothing left of it.
+
+    The declared lines alone tell how fast the angle runs; those that may move do not. What a
+    tone moves by at most is returned in standard errors.
+    """
+    states.make_tables()
+    residual = states.residual()
+    cycle = np.arange(states.times.size - 1) - 0.5 * (states.times.size - 1)
+    angle = states.cycle_length * (cycle[:, None] + states.u)
+    time = states.place - states.place.mean()
+    count = states.orders.size
+    top, bottom = np.zeros(states.amplitudes.shape[1]), np.zeros(states.amplitudes.shape[1])
+    for c, (weight, row) in enumerate(zip(states.weight, states.amplitudes)):
+        moved = np.append(states.sums(angle * residual[c])[:, :count].sum(axis=0),
+                          states.sums(time * residual[c])[:, count:].sum(axis=0))
+        top += weight * np.real(2j * np.pi * row * moved)
+        bottom += weight * 2.0 * np.pi**2 * np.abs(row) ** 2
+    curves = [float(np.sum(x**2 * states.whole[:, None])) for x in (angle, time)]
+    most_of = [0.5 / float(np.ptp(x)) for x in (angle, time)]
+    declared = states.orders[:states.declared]
+    stretch = float(top[:states.declared] @ declared) / max(
+        float(bottom[:states.declared] @ declared**2) * curves[0], np.finfo(np.float64).tiny)
+    most_stretched = most_of[0] / declared.max()
+    stretch = min(max(stretch, -most_stretched), most_stretched)
+    for chosen, curve, most in zip((slice(states.declared, count), slice(count, None)), curves,
+                                   most_of):
+        with np.errstate(divide='ignore', invalid='ignore'):
+            step = np.nan_to_num(top[chosen] / (bottom[chosen] * curve), posinf=0.0,
+                                 neginf=0.0).clip(-most, most)
+        lines = states.orders[states.declared:] if chosen.stop else states.tones
+        lines += step
+    states.orders[states.declared:] *= 1.0 - stretch
+    states.states[:, 0] += stretch * states.ramp
+    states.trend += stretch
+    states.read()
+    return float(np.max(np.abs(step) * np.sqrt(bottom[count:] * curves[1]), initial=0.0))
+
+
+def prune(states: States, least: float) -> None:
+    """Take out undeclared lines whose amplitudes are noise."""
+    lines = states.amplitudes.shape[1]
+    power = np.abs(states.amplitudes) ** 2 / states.amplitude_variances()
+    kept = (np.arange(lines) < states.declared) | (power.mean(axis=0) > 2.0 * least)
+    orders, tones = np.split(kept, [states.orders.size])
+    states.orders, states.tones = states.orders[orders], states.tones[tones]
+    states.amplitudes = states.amplitudes[:, kept]
+    states.turning, states.single = states.turning[kept], states.single[kept]
+
+
+def _turning(states: States) -> tuple[BoolArray, BoolArray]:
+    """
+    Tell which orders, and tones after them (line,), turn with the shafts, and which may.
+
+    Shafts must have whole orders and the lines of the trigger cycle. Others have more power
+    over angle than any tone near them over time. Sidebands turn with those as far from
+    declared lines or 0; on a steady machine, several show a shaft. Lines that stand alone may
+    turn, but not several side by side, as a machine makes them whose own speed varies.
+    """
+    lines = np.append(states.orders, states.tones / states.frequency)
+    declared, others = np.split(lines, [states.declared])
+    least, r = APART / states.span, states.cycle_length
+    exact = np.minimum(np.abs(others - np.rint(others)),
+                       np.abs(others * r - np.rint(others * r)) / r) < least
+    apart = others[:, None] - declared
+    near = np.argmin(np.abs(apart), axis=1)
+    offset = apart[np.arange(near.size), near]
+    distance = np.stack([np.abs(offset), others], axis=1)
+    alike = np.abs(distance[:, None, :, None] - distance[:, None, :]).min(axis=(2, 3)) < least
+    known = exact & (np.arange(others.size) < states.orders.size - states.declared)
+    for size in np.unique(np.abs(offset)).tolist():
+        beside = np.abs(np.abs(offset) - size) < least
+        sides = {*zip(near[beside].tolist(), (offset[beside] < 0.0).tolist())}
+        if len(sides) >= _FEWEST_SIDES:
+            known |= np.any(np.abs(np.abs(apart) - size) < least, axis=1)
+            known |= np.abs(others - size) < least
+    over_angle, over_time, _ = _both_ways(states)
+    sharper = np.append(over_angle > _SHARPER * over_time,
+                        np.zeros(states.tones.size, np.bool_))
+    close = np.abs(others[:, None] - others) * states.span < _SKIRT
+    alone = (np.count_nonzero(close, axis=1) < 2) | (np.abs(offset) * states.span < _SKIRT)
+    own = np.ones(states.declared, np.bool_)
+    turning, single = (np.append(own, np.any(alike & found, axis=1) | found)
+                       for found in (known | sharper, known | alone))
+    return turning, single
+
+
+def fit_lines(states: States) -> None:
+    """Fit the amplitudes of all lines, and tell which of them turn."""
+    states.fit_amplitudes()
+    states.turning, states.single = _turning(states)
+
+
+def let_stand(states: States) -> None:
+    """Make tones of the undeclared orders that show better over time than over angle."""
+    over_angle, over_time, tones = _both_ways(states)
+    standing = (over_time > over_angle) & ~states.turning[states.declared:states.orders.size]
+    if not standing.any():
+        return
+    states.orders = states.orders[np.append(np.ones(states.declared, np.bool_), ~standing)]
+    apart = APART / float(np.ptp(states.place))
+    for i in np.flatnonzero(standing)[np.argsort(-over_time[standing])].tolist():
+        if np.all(np.abs(states.tones - tones[i]) > apart):  # else a part of the same
+            states.tones = np.append(states.tones, tones[i])
+    lines = states.orders.size + states.tones.size
+    states.amplitudes = np.zeros((len(states.amplitudes), lines), np.complex128)
+    fit_lines(states)
+    states.step()
+
+
+def _both_ways(states: States) -> tuple[Array, Array, Array]:
+    """Return the power of undeclared orders, that of the best tones near them, and these."""
+    states.make_tables()
+    residual = states.residual()
+    middle = states.place.mean(axis=1)
+    angle = states.cycle_length * (np.arange(states.times.size - 1) + 0.5)
+    reach = math.ceil(1.0 / _FINE)
+    near = _FINE * np.arange(-reach, reach + 1) / float(np.ptp(middle))
+    count = states.orders.size - states.declared
+    over_angle, over_time, tones = np.zeros((3, count))
+    sums = [states.sums(item) for item in residual]
+    for k, i in enumerate(range(states.declared, states.orders.size)):
+        timed = np.zeros(near.size)
+        wave, turn = states.wave[i], states.turn[:, i]
+        tone = states.orders[i] * states.frequency + near
+        beside = np.exp(2j * np.pi * (states.orders[i] * angle - tone[:, None] * middle))
+        for c, row in enumerate(states.amplitudes):
+            part = row[i] * turn
+            alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
+            each = (sums[c][:, i] + alone).conj()
+            over_angle[k] += states.weight[c] * float(np.abs(each.sum()) ** 2)
+            timed += states.weight[c] * np.abs(beside @ each) ** 2
+        best = int(np.argmax(timed))
+        over_time[k], tones[k] = timed[best], tone[best]
+    return over_angle, over_time, tones
+
+
+def _spectrum(values: Array, span: float, least: Array) -> tuple[Array, Array]:
+    """
+    Return power over its floor, summed over channels (last axis), and power (bin,).
+
+    The floor of a channel is at least the power of a line of the amplitude `least` (channel,).
+    """
+    window = hann(len(values))
+    lines = rfft(values.T * window)
+    power = lines.real**2 + lines.imag**2
+    ratio = np.zeros(power.shape[1])
+    for channel, limit in zip(power, (0.5 * least * window.sum()) ** 2):
+        floor = np.full(channel.size, limit)
+        for reach in (max(int(span / 2), _SKIRT), _SKIRT):
+            np.maximum(floor, _medians(channel, reach), out=floor)
+        ratio += channel * np.log(2.0) / floor
+    return ratio, power.sum(axis=0)
+
+
+def _medians(power: Array, reach: int) -> Array:
+    """Return the median of the values up to `reach` bins away, between some bins linearly."""
+    size, step = min(2 * reach, len(power)), max(1, reach // 2)
+    medians = row_medians(np.lib.stride_tricks.sliding_window_view(power, size)[::step])
+    inner = np.linspace(medians[:-1], medians[1:], step, endpoint=False, axis=1).ravel()
+    return np.pad(inner, (size // 2, len(power) - size // 2 - inner.size), mode='constant',
+                  constant_values=(medians[0], medians[-1]))
+
+
+def _between(values: Array) -> float:
+    """Return where a parabola through three values has its top, from the middle one."""
+    left, middle, right = values
+    return float(0.5 * (left - right) / (left - 2.0 * middle + right))
