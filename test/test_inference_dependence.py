@@ -179,4 +179,6 @@ def test_report_says_what_the_residual_changes_with(pickup):
     page = html(content, (), {})
     assert 'Dependence of the residual' in page
     assert '>trigger cycles</td>' in page
-    assert report(replace(pickup, dependences_after=(), left=None))['remains'] == ''
+    rest = replace(pickup, dependences_after=(), left=None)
+    assert 'held-out acquisitions' in report(rest)['remains']
+    assert report(replace(rest, verdict='none'))['remains'] == ''

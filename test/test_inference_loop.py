@@ -279,6 +279,25 @@ def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, param
 
 
 @pytest.mark.machines
+@pytest.mark.parametrize(('name', 'declared', 'size'), [
+    ('additive_noise', {'std': 1.0}, 'std'),
+    ('amplitude_modulation', {'std': 0.05}, 'std'),
+    ('missing_pulses', {'probability': 0.03}, 'probability'),
+    ('excess_jitter', {'std': 3e-4}, 'std'),
+    ('clock_skew', {'skew': 4e-4}, 'skew'),
+    ('phase_wander', {'std': 0.01}, 'std'),
+])
+def test_declared_effect_that_is_not_there_is_named(name, declared, size):
+    recording = simulated()
+    content = report(trace([observe(recording, MODEL)], [recording],
+                           declared=declared_effects({name: declared})))
+    assert (content['verdict'], content['missing_effects']) == ('traced', [])
+    changed, = [item for item in content['declared_changes'] if item['parameter'] == size]
+    assert changed['name'] == name
+    assert abs(changed['value']) < max(0.2 * declared[size], 3.0 * changed['standard_error'])
+
+
+@pytest.mark.machines
 def test_measured_gearbox_needs_the_phases_of_its_pulses(shared_data):
     recording = with_slower_clock(read(shared_data / 'gear0_gearbox.npz'), 3300.0)
     model = DeclaredModel(keyphasor_rate=3300.0, trigger_speed=33.33, trigger_cycles=40,

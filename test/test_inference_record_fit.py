@@ -309,3 +309,27 @@ def test_a_tone_near_an_order_is_one_tone_of_the_right_numbers(rng, swing):
     unsure = np.sqrt(12.0) * error / amplitude / (2.0 * np.pi * np.ptp(times))
     assert found.tones == pytest.approx([tone], abs=4.0 * unsure[0])
     assert amplitude == pytest.approx([0.3], abs=4.0 * error)
+
+
+@pytest.mark.parametrize('seed', [0, 3, 4])
+def test_a_strong_tone_of_the_supply_leads_no_error_astray(seed):
+    """It beats the shaft slowly, and the sidebands that a converter makes are as far from it."""
+    rng = np.random.default_rng(seed)
+    rate, speed, supply = 2500.0, 24.55, 100.0
+    time = np.arange(int(40.0 * rate)) / rate
+    waves, phases = rng.uniform(0.02, 0.2, (30, 1)), rng.uniform(0.0, 2.0 * np.pi, (30, 1))
+    swing = np.sqrt(2.0 / waves.size) * 3e-4 * np.sin(2.0 * np.pi * waves * time + phases)
+    turns = speed * (time + np.sum(swing / (2.0 * np.pi * waves), axis=0))
+    samples = 0.2 * rng.standard_normal(time.size)
+    for order, size in ((1.0, 1.0), (36.0, 0.6)):
+        samples += size * np.cos(2.0 * np.pi * order * turns + order)
+    for tone, size in ((supply, 1.0), (36.0 * speed - supply, 0.3), (36.0 * speed + supply, 0.3)):
+        samples += size * np.cos(2.0 * np.pi * tone * time)
+    times = np.interp(np.arange(turns[0] + 1.5, turns[-1] - 1.5), turns, time)
+    errors = rng.normal(0.0, 7e-5, times.size)
+    found = OpenRecord(samples[:, None], rate, 0.0, times + errors,
+                       measured=np.ones(times.size, bool), cycle_length=1.0, orders=[1.0, 36.0],
+                       jitter_std=7e-5).fit()
+    z = (found.errors - (errors - errors.mean())) / found.standard_errors
+    assert np.sqrt(np.mean(z**2)) == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * z.size))
+    assert np.abs(found.tones - supply).min() < 0.01

@@ -10,6 +10,7 @@
 
 """The likelihood of the timing: what it finds, how surely, and what it cannot see."""
 
+from copy import copy
 from dataclasses import replace
 
 from limit_coverage import limit_of, lines, machine, MODEL, recovered_source, UNIT
@@ -309,6 +310,24 @@ def test_errors_far_beyond_a_tiny_declared_jitter_have_a_limit():
     limit = largest(read_timing([part], names=frozenset()), 'excess_jitter')
     # 400 pulses tell a power to 7 %, beside that of the noise
     assert 120.0 * UNIT < limit.std < 120.0 * UNIT * (1.0 + 4.0 * 0.5 * 0.08)
+
+
+def test_search_for_a_limit_stays_finite_where_smaller_sizes_fit_worse(monkeypatch):
+    """Errors that were recovered wrongly make a likelihood of many hills."""
+    timing = read_timing([machine(1)], names=frozenset())
+    tried, fit = [], timing.chooser.fit
+
+    def poor(names, start=None, *, held=None):
+        found = copy(fit(names, start, held=held))
+        if held:
+            tried.extend(held.values())
+            found.value -= 1e6 * (len(tried) > 1)
+            found.more_than_held = lambda *_: (-10.0, 5.0)  # far less is seen
+        return found
+    monkeypatch.setattr(timing.chooser, 'fit', poor)
+    largest(timing, 'excess_jitter')
+    assert len(tried) > 2
+    assert np.all(np.isfinite(tried))
 
 
 def test_what_no_machine_can_have_is_in_no_set():

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.target import EvenTarget
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
 
@@ -474,3 +475,21 @@ def test_the_first_revolutions_of_two_marks_lose_no_pulse_by_jitter():
         times = 0.02 * (np.cumsum(speed) + rng.uniform(-0.01, 0.01, count))
         accepted += validate(times, pulses_per_revolution=2, missing_pulses='bridge')[3].accepted
     assert accepted >= 60 * 320 - 8
+
+
+def test_pulses_that_no_lock_keeps_are_tried_seldom(rng, monkeypatch):
+    """Marks that scatter by a fifth of their distance would keep a computer busy."""
+    tried, lock = [], EvenTarget.lock
+    monkeypatch.setattr(EvenTarget, 'lock', lambda self, pulses, scatter: tried.append(
+        pulses.size) or lock(self, pulses, scatter))
+    errors = np.sqrt(3.0) * rng.uniform(-1.0, 1.0, 5000) * np.repeat([0.07, 0.22], [2000, 3000])
+    *_, counts = validate(np.sort(np.arange(5000) + errors) / 750.0, pulses_per_revolution=60)
+    assert counts.unlocked > 1500
+    assert len(tried) < 3000 / 10
+
+
+def test_a_speed_that_jumps_twice_is_found_again_as_fast():
+    """The first lock that is lost soon makes no match wait."""
+    speeds = np.repeat([30.0, 12.0, 30.0], [40, 8, 40])
+    _, runs, *_ = validate(5.0 + np.cumsum(1.0 / speeds))
+    assert runs[-1].size > 32

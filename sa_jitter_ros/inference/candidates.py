@@ -19,8 +19,11 @@ belongs to the best set whose gain exceeds the odds against it.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
+from sa_jitter_ros.effects.effect import (
+    absent, departs, DirectEffect, Finding, ONE_SIDED, weighed)
+from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
 from sa_jitter_ros.inference.scoring import Bench
 
@@ -51,6 +54,8 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
         evidence = bench.without(name).gather(effects, bench.fit) if name in declared else shared
         untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
         finding = absent(name, untold) if untold else kind.fit(evidence)
+        if name in declared and finding.effect is None and not untold:
+            finding = _without(declared[name], kind.limit(evidence), evidence)
         effect = finding.effect
         if name in declared and (effect is None or not departs(
                 effect, finding.standard_errors, declared[name], evidence.cycles)):
@@ -58,6 +63,20 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
         found.append(Candidate(name, 1, finding, None, finding.contradiction)
                      if effect is None else _scored(bench, effects, finding))
     return found
+
+
+def _without(declared: Effect, largest: Effect | None, evidence: Evidence) -> Finding:
+    """Return a declared effect whose size is 0 if it exceeds the `largest` that may be there."""
+    if largest is None:
+        return absent(declared.name, 'nothing tells how large it is')
+    (name, size), *_ = declared.values.items()
+    error = max(largest.values[name] / ONE_SIDED, np.finfo(np.float64).tiny)
+    likelihood = 0.5 * (size / error) ** 2
+    found = weighed(Finding(
+        declared.name, type(declared)(**{**declared.values, name: 0.0}), {name: error}, 1.0,
+        f'{name} is declared as {size:.3g}, and nothing of it shows: at most '
+        f'{largest.values[name]:.3g} could be there'), likelihood, 1, evidence)
+    return replace(found, gain=-likelihood)
 
 
 def _scored(bench: Bench, others: Sequence[Effect], finding: Finding) -> Candidate:

@@ -91,7 +91,7 @@ class States:
         self.size = np.append(jitter_std, self.least)
         self.all_free = self.settled = False
         self.told = np.zeros(self.width)
-        self.around: Array | float = 1.0
+        self.weight, self.around = np.ones(samples.shape[1]), np.ones(1)
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
         self.most_power = independent_power(np.diff(times, 3)[even]) if even.any() else math.inf

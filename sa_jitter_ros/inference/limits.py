@@ -34,9 +34,10 @@ from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import rounding
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
-from sa_jitter_ros.effects.timing import Pattern, Spectrum
+from sa_jitter_ros.effects.timing import FAINT, Pattern, Spectrum
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing import Timing
+from sa_jitter_ros.inference.timing_choice import SIDEBANDS
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import special
 
@@ -131,7 +132,8 @@ def _bound(timing: Timing, name: str, far: float) -> Array | None:
     chooser, choice = timing.chooser, timing.choice
     names, kurtosis = choice.best | {name}, chooser.shapes.kurtosis if chooser.shapes else 0.0
     fit = chooser.fit(names, choice.fit.starts)
-    at, low, high = float(fit.starts[name][0]), -math.inf, float(fit.upper[fit.place[name]][0])
+    at = float(fit.starts[name][0])
+    low, high = min(at, FAINT) - 1.0, float(fit.upper[fit.place[name]][0])
     top, best, first, begin = high, -math.inf, fit.starts, fit.starts
     last: tuple[float, float] | None = None
     for _ in range(_STEPS):
@@ -178,9 +180,13 @@ def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
 
 
 def _of_speed(timing: Timing) -> Effect | None:
-    """Return the largest acceleration that the bends inside the cycles allow."""
+    """
+    Return the largest acceleration that the bends inside the cycles allow.
+
+    Lines that stand for a steady torsion leave no bend to see.
+    """
     parts = timing.chooser.data.stretches
-    if not all(np.isfinite(item.bend_std) for item in parts):
+    if SIDEBANDS in timing.choice.best or not all(np.isfinite(item.bend_std) for item in parts):
         return None
     bends = np.concatenate([item.bends for item in parts])
     noise = float(np.mean([item.bend_std**2 for item in parts]))

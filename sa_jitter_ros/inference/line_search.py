@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
+from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.inference.cycle_states import hann, States
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import rfft
@@ -212,10 +213,12 @@ def _turning(states: States) -> tuple[BoolArray, BoolArray]:
             known |= np.any(np.abs(np.abs(apart) - size) < least, axis=1)
             known |= np.abs(others - size) < least
     over_angle, over_time, _ = _both_ways(states)
-    sharper = np.append(over_angle > _SHARPER * over_time,
-                        np.zeros(states.tones.size, np.bool_))
+    none = np.zeros(states.tones.size, np.bool_)
+    sharper = np.append(over_angle > _SHARPER * over_time, none)
+    stands = np.append(over_time > over_angle + ODDS, ~none)
     close = np.abs(others[:, None] - others) * states.span < _SKIRT
     alone = (np.count_nonzero(close, axis=1) < 2) | (np.abs(offset) * states.span < _SKIRT)
+    alone &= ~stands
     own = np.ones(states.declared, np.bool_)
     turning, single = (np.append(own, np.any(alike & found, axis=1) | found)
                        for found in (known | sharper, known | alone))
@@ -246,29 +249,31 @@ def let_stand(states: States) -> None:
 
 
 def _both_ways(states: States) -> tuple[Array, Array, Array]:
-    """Return the power of undeclared orders, that of the best tones near them, and these."""
+    """Return the gain in log likelihood of undeclared orders, of tones near them, and these."""
     states.make_tables()
     residual = states.residual()
     middle = states.place.mean(axis=1)
     angle = states.cycle_length * (np.arange(states.times.size - 1) + 0.5)
     reach = math.ceil(1.0 / _FINE)
-    near = _FINE * np.arange(-reach, reach + 1) / float(np.ptp(middle))
+    step = _FINE / float(np.ptp(middle))
     count = states.orders.size - states.declared
     over_angle, over_time, tones = np.zeros((3, count))
     sums = [states.sums(item) for item in residual]
+    weights = states.weight / (states.whole.sum() * states.u.size)
     for k, i in enumerate(range(states.declared, states.orders.size)):
-        timed = np.zeros(near.size)
         wave, turn = states.wave[i], states.turn[:, i]
-        tone = states.orders[i] * states.frequency + near
-        beside = np.exp(2j * np.pi * (states.orders[i] * angle - tone[:, None] * middle))
-        for c, row in enumerate(states.amplitudes):
-            part = row[i] * turn
-            alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
-            each = (sums[c][:, i] + alone).conj()
-            over_angle[k] += states.weight[c] * float(np.abs(each.sum()) ** 2)
-            timed += states.weight[c] * np.abs(beside @ each) ** 2
-        best = int(np.argmax(timed))
-        over_time[k], tones[k] = timed[best], tone[best]
+        part = states.amplitudes[:, i, None] * turn  # (channel, cycle)
+        alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
+        each = (np.stack([item[:, i] for item in sums]) + alone).conj()
+        over_angle[k] = weights @ np.abs(each.sum(axis=1)) ** 2
+        away = states.orders[i] * (angle - states.frequency * middle)
+        beside = each * np.exp(2j * np.pi * away)
+        tried = np.exp(-2j * np.pi * step * np.arange(-reach, reach + 1)[:, None] * middle)
+        found = np.abs(tried @ beside.T) ** 2 @ weights
+        best = min(max(int(np.argmax(found)), 1), found.size - 2)
+        off = step * (best - reach + _between(np.log(found[best - 1:best + 2])))
+        over_time[k] = weights @ np.abs(beside @ np.exp(-2j * np.pi * off * middle)) ** 2
+        tones[k] = states.orders[i] * states.frequency + off
     return over_angle, over_time, tones
 
 

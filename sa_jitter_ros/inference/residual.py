@@ -93,6 +93,18 @@ class Residual:
         """Return the p value of all three tests together."""
         return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude_scatter)
 
+    @property
+    def text(self) -> str:
+        """Return the surest of what is not as predicted, in words."""
+        p_value, text = min(
+            (self.p_mean, 'the mean attenuation of the held-out acquisitions is not the '
+             'predicted one'),
+            (self.p_scatter, 'the attenuation scatters more among the held-out acquisitions than '
+             'predicted'),
+            (self.p_amplitude_scatter, 'the amplitudes scatter more among the held-out '
+             'acquisitions than predicted'))
+        return f'{text} (p = {_one_of_three(p_value):.2g})'
+
 
 def _one_of_three(*p_values: float) -> float:
     """Return the smallest p value, corrected for there being three tests."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.effects.timing import PULSES, SOURCE
-from sa_jitter_ros.inference.timing_choice import Choice, Chooser
+from sa_jitter_ros.inference.timing_choice import Choice, Chooser, SIDEBANDS
 from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
 from sa_jitter_ros.inference.timing_shape import EDGE, through
@@ -89,7 +89,7 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
         return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
 
     draws = np.random.default_rng(SEED).gamma(size, 1.0 / size, (DRAWS, size.size))
-    ratio = fit.excess(direction, inverse)
+    ratio = np.where(_told(fit, inverse), fit.excess(direction, inverse), 1.0)
     gain = statistic(ratio)[0]
     top = int(np.argmax(gain))
     near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
@@ -105,7 +105,7 @@ def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid in a direction stands out; `inverse` is as in `_power`."""
     data = fit.data
     frequency = data.each
-    tried = frequency > _SLOWEST / data.longest
+    tried = (frequency > _SLOWEST / data.longest) & _told(fit, inverse)[data.bin]
     inverse = inverse[data.bin]
     wave = np.einsum('fij,fj->fi', data.passed, steering(direction, data.frequency, data.frequency)
                      )[data.bin]
@@ -116,6 +116,14 @@ def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     return Check(-math.expm1(count * math.log1p(-math.exp(-max(float(size[top]), 1e-9)))),
                  direction, data.unit * math.sqrt(2.0 * size[top] / known[top] / data.longest),
                  f'a sinusoid of the {direction} of {frequency[top]:.4g} cycles a trigger cycle')
+
+
+def _told(fit: TimingFit, inverse: Array) -> Array:
+    """Return which bins (bin,) show more than sidebands, whose shape nobody knows."""
+    if SIDEBANDS not in fit.spectra:
+        return np.ones(fit.data.size.size, np.bool_)
+    made = fit.density(SIDEBANDS, fit.parameters)[0]
+    return np.asarray(made < 0.5 * fit.floor(SOURCE, inverse))
 
 
 def _shape(chooser: Chooser, choice: Choice) -> Check:

@@ -33,7 +33,7 @@ from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
-from sa_jitter_ros.effects.timing import Pattern, SOURCE, Spectrum
+from sa_jitter_ros.effects.timing import Pattern, SOURCE
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
@@ -435,7 +435,9 @@ def _undecided(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
     found = []
     for row in rows:
         if row.effect is None:
-            if row.lower is None and isinstance(EFFECTS[row.name].timing, Spectrum):
+            kind = EFFECTS[row.name]
+            if row.lower is None and not issubclass(kind, DirectEffect) and not isinstance(
+                    kind.timing, Pattern):
                 found.append(row.name)
             continue
         try:

@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000
-_SHORT = 0.8  # of the vibration
+_SHORT = 0.8  # of the longer of pulses and vibration
 _FEWEST_REVOLUTIONS = 12
 _LONGEST_GAP = 10.0  # trigger cycles without a pulse
 # Bins of a peak on either side, and of what is beside it; the peak over the median of the
@@ -80,7 +80,7 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
     found = []
     covered = min(end, float(pulses[-1])) - max(start, float(pulses[0]))
     usual = float(np.median(np.diff(pulses)))
-    if covered + 2.0 * usual < _SHORT * recording.duration:
+    if covered + 2.0 * usual < _SHORT * max(recording.duration, float(np.ptp(pulses))):
         found.append(f'the pulses span {np.ptp(pulses):.6g} s, the vibration spans '
                      f'{recording.duration:.6g} s: check that both were recorded together, and '
                      'their sampling rates')

@@ -117,8 +117,8 @@ class IntervalJudge:
         self._candidate: Lock | None = None
         self._end: _End | None = None
         self._queue: list[float] = []
-        self._tried = 0  # pulses of the queue that were tried to match, and failures
-        self._failed = 0
+        self._tried = 0  # pulses of the queue that were tried to match
+        self._failed = 0  # matches that found nothing, or were lost soon: the next waits longer
         self._recent: list[float] = []  # of the latest pulses, dropped ones too
         self._slot = 0
         self.confirmed = -np.inf
@@ -515,13 +515,16 @@ class IntervalJudge:
     def _lose(self) -> None:
         """Discard the trigger cycle and match the target again from the waiting pulses on."""
         known = self._model.known
+        self._failed += 1
         if self._model.taken < _KNOWN_WELL:  # what is lost so soon may have other intervals
             known //= 2
+        else:
+            self._failed = 0
         self._end = _End(self.confirmed, self._model.level, self._model.scatter, known)
         self._counter.stop()
         self._alternation = Alternation()
         self._lock = self._candidate = None
-        self._tried = self._failed = 0
+        self._tried = 0
         self._marks, self._levels, self._times = [], [], []
 
     def _match(self, final: bool) -> bool:
@@ -671,7 +674,7 @@ class IntervalJudge:
         self._remember(first)
         self.confirmed = first
         self._end = None
-        self._tried = self._failed = 0
+        self._tried = 0
         self._model.start(math.log(lock.interval), scatter=scatter, count=count,
                           intervals=lock.intervals.tolist())
 

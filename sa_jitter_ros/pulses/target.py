@@ -33,7 +33,8 @@ IntArray = npt.NDArray[np.int64]
 
 # Pulses from which the interval is learnt: those of this time (s), in these limits.
 _LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12
-_SELDOM = 64  # pulses after which noise is tried again
+# Pulses after which noise is tried again; the most that are waited for after locks lost soon.
+_SELDOM, _MORE = 64, 6
 # A pulse after less than this fraction of the expected interval is a second one of the same tooth.
 _DOUBLE = 0.5
 # Sensors shift the pulses of teeth next to a gap by up to 2 degrees, a fifth of the pitch of 36
@@ -104,7 +105,7 @@ class Target(Protocol):
         """
         Return how many of the waiting pulses to match next, after the first `tried` ones.
 
-        It `failed` so often before.
+        It `failed` so often before, or found a lock that was lost soon.
         """
 
     def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
@@ -124,7 +125,7 @@ class EvenTarget:
         """
         Return how many of the waiting pulses to match next, after the first `tried` ones.
 
-        It `failed` so often before.
+        It `failed` so often before, or found a lock that was lost soon.
         """
         if pulses.size < _FEWEST:
             return _FEWEST
@@ -132,7 +133,8 @@ class EvenTarget:
         first = _FEWEST
         if not known and interval * _FEWEST < _LEARNING_TIME:
             first = int(_LEARNING_TIME / interval) if interval * _MOST > _LEARNING_TIME else _MOST
-        return first if tried < first else tried + min(2 << (failed // 2), _SELDOM)
+        more = 2 << (failed // 2)
+        return first + min(more - 2, _MORE) if tried < first else tried + min(more, _SELDOM)
 
     def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
         """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
@@ -182,7 +184,7 @@ class ToothedWheel:
         """
         Return how many of the waiting pulses to match next, after the first `tried` ones.
 
-        It `failed` so often before.
+        It `failed` so often before, or found a lock that was lost soon.
         """
         return max(self._present + 1, tried + 1)
 

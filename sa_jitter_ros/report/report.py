@@ -83,11 +83,18 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
             trace.dependences_before, trace.dependences_after)],
         'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
-        'remains': trace.left.text if trace.left else str(
-            moving(trace.dependences_after) or ''),
+        'remains': _remains(trace),
         'lines': lines,
     })
     return content
+
+
+def _remains(trace: Trace) -> str:
+    """Return what no effect explains, '' where nothing is left."""
+    if trace.verdict != 'unexplained':
+        return ''
+    return trace.left.text if trace.left else str(
+        moving(trace.dependences_after) or trace.after.text)
 
 
 def errors(item: Residual) -> Mapping[str, Json]:
