@@ -37,6 +37,7 @@ from sa_jitter_ros.simulation.components import mesh
 from sa_jitter_ros.simulation.effect import Effect
 from sa_jitter_ros.simulation.effects import AdditiveNoise, DeclaredJitter, make_effects
 from sa_jitter_ros.simulation.gearbox import Gearbox
+from sa_jitter_ros.simulation.motion import Torsion
 from scipy import stats
 from worse_pulses import with_added_jitter, with_slower_clock
 
@@ -52,14 +53,14 @@ class Hum(Effect):
         return 100e-6 * np.sin(2.0 * np.pi * 0.2871 * setting.trigger_rate * times)
 
 
-def simulated(*effects, acquisitions=16, jitter=True, seed=3, reference=False):
+def simulated(*effects, acquisitions=16, jitter=True, seed=3, reference=False, torsion=()):
     """Return a recording with the declared jitter and noise, and effects that nobody declares."""
     declared = [AdditiveNoise(NOISE, name='declared_noise')]
     if jitter:
         declared.append(DeclaredJitter('uniform', 1.0 / math.sqrt(12.0) / 5000.0))
     gearbox = Gearbox(
         mesh('shaft', 8, harmonics=(1.0, 0.8, 0.6, 0.5), channel_gains=(1.0, 0.7), seed=seed),
-        RATE, speed=((0.0, SPEED),), effects=(*declared, *effects), seed=seed)
+        RATE, speed=((0.0, SPEED),), effects=(*declared, *effects), torsion=torsion, seed=seed)
     duration = (acquisitions * CYCLES + 3) / SPEED
     pulses = gearbox.pulses(0.0, duration)
     return Recording(
@@ -247,6 +248,15 @@ def test_effect_of_no_module_stays_unexplained():
     assert 'of the pulses' in content['remains']
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert 'unexplained' in summary(content)
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('order', [0.1, 0.15, 0.2])
+def test_torsion_that_makes_sidebands_is_within_the_limit_of_the_speed(order):
+    """Beside every line it makes sidebands, which are no bends of the speed any more."""
+    found = traced(torsion=(Torsion(order, 0.03),), acquisitions=32)
+    row, = (item for item in found.limits if item.name == 'speed_fluctuation')
+    assert row.upper > 0.03 * (2.0 * np.pi * order * SPEED) ** 2 / np.sqrt(2.0)
 
 
 def test_declared_effect_is_not_missing():

@@ -401,8 +401,13 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     degree = min(model.weights.pulses - 1, 3)  # of what a law makes of the errors
     path = model.weights.path(e, np.linspace(0.0, 1.0, _PLACES), count)  # (acquisition, cycle, u)
     most = 2.0 * np.pi * sources.max() * np.abs(path - path[..., :1]).max(axis=2)
-    calm = 2 * _few(degree, most) < u.size  # else all nodes take less time
-    places, gathered = _few_places(u, int(_few(degree, most[calm].max(initial=0.0))))
+    few = _few(degree, most)
+    tried = np.unique(few)
+    wild = few.size - np.searchsorted(np.sort(few, axis=None), tried, side='right')
+    least = int(tried[np.argmin(  # work of the waves, and of the matrix that gathers them
+        sources.size * (tried * (few.size - wild) + u.size * wild) + tried * u.size)])
+    calm = few <= least
+    places, gathered = _few_places(u, least)
     turn = 2j * np.pi * r
     first = joint_characteristic(processes, [sources[:, None]], [u], [0]) * w
     first = first * np.exp(turn * sources[:, None] * u)

@@ -37,7 +37,6 @@ from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, Pattern, Spectrum
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.inference.timing import Timing
-from sa_jitter_ros.inference.timing_choice import SIDEBANDS
 from sa_jitter_ros.inference.timing_fit import JITTER
 from scipy import special
 
@@ -181,17 +180,18 @@ def _of_scale(timing: Timing) -> tuple[float | None, Effect | None]:
 
 def _of_speed(timing: Timing) -> Effect | None:
     """
-    Return the largest acceleration that the bends inside the cycles allow.
+    Return the largest acceleration that the bends, and lines that stand for some, allow.
 
-    Lines that stand for a steady torsion leave no bend to see.
+    A shaft that twists steadily makes sidebands, which leave no bend to see.
     """
     parts = timing.chooser.data.stretches
-    if SIDEBANDS in timing.choice.best or not all(np.isfinite(item.bend_std) for item in parts):
+    if not all(np.isfinite(item.bend_std) for item in parts):
         return None
     bends = np.concatenate([item.bends for item in parts])
     noise = float(np.mean([item.bend_std**2 for item in parts]))
     power = largest_power(float(np.mean(bends**2)) - noise, bends.size, noise, noise**2,
                           memory(ACCELERATION_BAND))
+    power += max(item.twist for item in parts) ** 2
     return None if math.isinf(power) else SpeedFluctuation.of_ripple(
         math.sqrt(power), timing.choice.setting.model)
 

@@ -29,7 +29,7 @@ from sa_jitter_ros.effects.band import (
     ACCELERATION_BAND, band_of_ripple, ripple_correlation, slow_band, WIDEST)
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import (
-    beyond_chance, departs, Finding, ODDS, parameter_ranges, possible)
+    beyond_chance, departs, Finding, ODDS, ONE_SIDED, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
@@ -121,20 +121,63 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
                 continue
-            found.append(replace(_stretch(observation, number, part, here, clock, unit),
-                                 sidebands=_sidebands(fit, model),
+            stretch = _stretch(observation, number, part, here, clock, unit)
+            sidebands, bends = _sidebands(fit, model)
+            bends = np.minimum(bends, _bends_of_motion(stretch.setting.times, sidebands))
+            found.append(replace(stretch, sidebands=sidebands,
+                                 twist=float(np.sqrt(0.5 * np.sum(bends**2))),
                                  held=fit.held or observation.against_reference))
     return found
 
 
-def _sidebands(fit: RecordFit, model: DeclaredModel) -> Array:
-    """Return how far sidebands of several lines are from these, in cycles a trigger cycle."""
-    declared, least = fit.orders[:fit.declared], APART / fit.errors.size
-    apart = np.abs(fit.orders[fit.declared:, None] - declared)
-    turns = np.sort(apart.min(axis=1, initial=math.inf) * model.cycle_length)
-    turns = turns[(turns > least) & (turns < ALIASES.max())]
-    groups = np.split(turns, np.flatnonzero(np.diff(turns) > least) + 1)
-    return np.array([group.mean() for group in groups if group.size > 1])
+def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
+    """
+    Return how far sidebands of several lines are from these, in cycles a trigger cycle.
+
+    The bends (s) follow, as peak values, that they stand for if the shaft twists: upper and lower
+    ones then are opposite. What repeats with the revolution is no torsion, but gears; faster
+    ones are no acceleration of the band.
+    """
+    declared, others = np.split(fit.orders, [fit.declared])
+    apart = others[:, None] - declared
+    near = np.argmin(np.abs(apart), axis=1)
+    offset = apart[np.arange(near.size), near]
+    turns, least = np.abs(offset) * model.cycle_length, APART / fit.errors.size
+    chosen = np.flatnonzero((turns > least) & (turns < ALIASES.max()))
+    chosen = chosen[np.argsort(turns[chosen])]
+    groups = [group for group in np.split(
+        chosen, np.flatnonzero(np.diff(turns[chosen]) > least) + 1) if group.size > 1]
+    places = np.array([turns[group].mean() for group in groups])
+    bends = np.zeros(places.size)
+    for k, group in enumerate(groups):
+        order = places[k] / model.cycle_length
+        turn = abs(places[k] - np.rint(places[k]))  # of the image that an even angle leaves
+        if abs(order - np.rint(order)) * model.cycle_length < least or (
+                turn > ACCELERATION_BAND[1] + least):
+            continue
+        swings = []
+        for line in np.unique(near[group]).tolist():
+            carrier = fit.amplitudes[:, line]
+            channel = int(np.argmax(np.abs(carrier)))
+            beside = group[near[group] == line]
+            size = fit.amplitudes[channel, fit.declared + beside] / carrier[channel]
+            swings.append(np.abs(size[offset[beside] > 0.0].sum() - np.conj(
+                size[offset[beside] < 0.0].sum())) / declared[line])
+        even = np.sinc(places[k]) ** 2  # share that an even angle between pulses makes there
+        share = even if places[k] > 0.5 else 1.0 - even
+        bends[k] = max(swings) / share * np.pi * turn**2 / model.fundamental_frequency
+    return places, bends
+
+
+def _bends_of_motion(times: Array, frequency: Array) -> Array:
+    """Return the largest bends (s) of sinusoids of some frequencies that pulse times allow."""
+    second = np.diff(times, 2)
+    window = np.hanning(second.size + 2)[1:-1]
+    waves = np.exp(-2j * np.pi * np.outer(frequency, np.arange(second.size)))
+    noise = ONE_SIDED * math.sqrt(0.5 * np.sum((window * second) ** 2))
+    shown = 2.0 * (np.abs(waves @ (window * second)) + noise) / window.sum()
+    turn = np.abs(frequency - np.rint(frequency))
+    return np.asarray(0.5 * shown / np.sinc(turn) ** 2)
 
 
 def _of_average(observation: Observation, item: Acquisition, unit: float, grid: Array | None,

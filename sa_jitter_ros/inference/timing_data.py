@@ -51,7 +51,8 @@ class Stretch:
     infinite for none); `bends` (cycle,) in s are the factors of u (1 - u) inside the cycles, not
     shrunk, with the noise `bend_std` that a prior of `bend_prior_std` left. Against a reference
     keyphasor (`referenced`) no motion of the source shows. `sidebands` (k,) are those of several
-    lines, in cycles a trigger cycle from them. Without a line that holds the angle to the pulses
+    lines, in cycles a trigger cycle from them, `twist` (s) the RMS of the bends that they stand
+    for if the shaft twists. Without a line that holds the angle to the pulses
     (`held`) any drift between them may be there.
     """
 
@@ -65,6 +66,7 @@ class Stretch:
     bend_prior_std: float
     referenced: bool = False
     sidebands: Array = field(default_factory=lambda: np.zeros(0))
+    twist: float = 0.0
     held: bool = True
 
 
