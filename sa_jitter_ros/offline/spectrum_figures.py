@@ -115,8 +115,8 @@ def _draw_spectrum(axes: Axes, series: ShaftSeries, amplitude: Array, noise: flo
     axes.plot(whole, np.maximum(amplitude[whole], floor), 'v', color='tab:green', markersize=4.0,
               label=f'tracked orders, {corrected}', linestyle='none')
     axes.set_yscale('log')
-    axes.set_ylim(bottom=floor)
     axes.margins(x=0.01, y=0.15)
+    axes.set_ylim(bottom=floor)
 
 
 def order_map_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear: GearSettings
