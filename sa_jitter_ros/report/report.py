@@ -182,8 +182,9 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
                           model.ratio * error['skew'], '1'))
         elif item.name in declared:
             for name, limits in parameter_ranges(type(effect)).items():
-                found.append((item.name, name, declared[item.name].values[name],
-                              effect.values[name], error.get(name), limits.unit))
+                if name in error or effect.values[name] != declared[item.name].values[name]:
+                    found.append((item.name, name, declared[item.name].values[name],
+                                  effect.values[name], error.get(name), limits.unit))
         elif isinstance(effect, AdditiveNoise):
             total = math.hypot(model.noise_std, effect.std)
             found.append(('noise', 'noise_std', model.noise_std, total,
