@@ -65,7 +65,7 @@ def test_nothing_is_doubted_where_all_fits(recording):
     (lambda r: {'pulse_times': 1e3 * r.pulse_times}, {}, 'look like milliseconds'),
     (lambda r: {'sample_rate': RATE / 1e3}, {}, 'looks like kHz'),
     (lambda r: {'pulse_times': r.pulse_times[:60]}, {}, 'the pulses span 2.3'),
-    (lambda r: {'source': ArraySource(r.read()[:, :r.samples // 2])}, {}, 'the pulses span '),
+    (lambda r: {'vibration': ArraySource(r.read()[:, :r.samples // 2])}, {}, 'the pulses span '),
     (lambda r: {'pulse_times': r.pulse_times[r.pulse_times < 9.0],
                 'sample_rate': RATE / 1.03}, {}, 'none of the orders 8, 16 stands above'),
     (lambda r: {}, {'ratio': 1.37}, 'Hz and ratio 1.37'),

@@ -270,8 +270,9 @@ def _both_ways(states: States) -> tuple[Array, Array, Array]:
         beside = each * np.exp(2j * np.pi * away)
         tried = np.exp(-2j * np.pi * step * np.arange(-reach, reach + 1)[:, None] * middle)
         found = np.abs(tried @ beside.T) ** 2 @ weights
-        best = min(max(int(np.argmax(found)), 1), found.size - 2)
-        off = step * (best - reach + _between(np.log(found[best - 1:best + 2])))
+        best = int(np.argmax(found))
+        near = np.log(found[best - 1:best + 2])
+        off = step * (best - reach + (_between(near) if near.size == 3 else 0.0))
         over_time[k] = weights @ np.abs(beside @ np.exp(-2j * np.pi * off * middle)) ** 2
         tones[k] = states.orders[i] * states.frequency + off
     return over_angle, over_time, tones
