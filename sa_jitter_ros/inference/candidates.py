@@ -21,11 +21,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import (
-    absent, departs, DirectEffect, Finding, ONE_SIDED, weighed)
-from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding, ONE_SIDED
 from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
 from sa_jitter_ros.inference.scoring import Bench
+from scipy import special
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
         untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
         finding = absent(name, untold) if untold else kind.fit(evidence)
         if name in declared and finding.effect is None and not untold:
-            finding = _without(declared[name], kind.limit(evidence), evidence)
+            finding = _without(declared[name], kind.limit(evidence))
         effect = finding.effect
         if name in declared and (effect is None or not departs(
                 effect, finding.standard_errors, declared[name], evidence.cycles)):
@@ -65,18 +64,18 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
     return found
 
 
-def _without(declared: Effect, largest: Effect | None, evidence: Evidence) -> Finding:
-    """Return a declared effect whose size is 0 if it exceeds the `largest` that may be there."""
+def _without(declared: Effect, largest: Effect | None) -> Finding:
+    """Return a declared effect with a size of 0, known as well as the `largest` possible one."""
     if largest is None:
         return absent(declared.name, 'nothing tells how large it is')
     (name, size), *_ = declared.values.items()
     error = max(largest.values[name] / ONE_SIDED, np.finfo(np.float64).tiny)
     likelihood = 0.5 * (size / error) ** 2
-    found = weighed(Finding(
-        declared.name, type(declared)(**{**declared.values, name: 0.0}), {name: error}, 1.0,
+    return Finding(
+        declared.name, type(declared)(**{**declared.values, name: 0.0}), {name: error},
+        float(special.chdtrc(1, 2.0 * likelihood)),
         f'{name} is declared as {size:.3g}, and nothing of it shows: at most '
-        f'{largest.values[name]:.3g} could be there'), likelihood, 1, evidence)
-    return replace(found, gain=-likelihood)
+        f'{largest.values[name]:.3g} could be there', gain=-likelihood)
 
 
 def _scored(bench: Bench, others: Sequence[Effect], finding: Finding) -> Candidate:

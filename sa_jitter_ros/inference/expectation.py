@@ -402,10 +402,10 @@ def _leakage(observation: Observation, processes: Sequence[AngleErrorProcess], e
     path = model.weights.path(e, np.linspace(0.0, 1.0, _PLACES), count)  # (acquisition, cycle, u)
     most = 2.0 * np.pi * sources.max() * np.abs(path - path[..., :1]).max(axis=2)
     few = _few(degree, most)
-    tried = np.unique(few)
-    wild = few.size - np.searchsorted(np.sort(few, axis=None), tried, side='right')
+    tried, counts = np.unique(few, return_counts=True)
+    served = np.cumsum(counts)
     least = int(tried[np.argmin(  # work of the waves, and of the matrix that gathers them
-        sources.size * (tried * (few.size - wild) + u.size * wild) + tried * u.size)])
+        sources.size * (tried * served + u.size * (few.size - served)) + tried * u.size)])
     calm = few <= least
     places, gathered = _few_places(u, least)
     turn = 2j * np.pi * r

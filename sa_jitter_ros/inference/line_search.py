@@ -186,6 +186,13 @@ def prune(states: States, least: float) -> None:
     states.turning, states.single = states.turning[kept], states.single[kept]
 
 
+def nearest(lines: Array, declared: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return which `declared` order is nearest to each line (line,), and how far that is above."""
+    apart = lines[:, None] - declared
+    near = np.argmin(np.abs(apart), axis=1)
+    return near, apart[np.arange(near.size), near]
+
+
 def _turning(states: States) -> tuple[BoolArray, BoolArray]:
     """
     Tell which orders, and tones after them (line,), turn with the shafts, and which may.
@@ -201,8 +208,7 @@ def _turning(states: States) -> tuple[BoolArray, BoolArray]:
     exact = np.minimum(np.abs(others - np.rint(others)),
                        np.abs(others * r - np.rint(others * r)) / r) < least
     apart = others[:, None] - declared
-    near = np.argmin(np.abs(apart), axis=1)
-    offset = apart[np.arange(near.size), near]
+    near, offset = nearest(others, declared)
     distance = np.stack([np.abs(offset), others], axis=1)
     alike = np.abs(distance[:, None, :, None] - distance[:, None, :]).min(axis=(2, 3)) < least
     known = exact & (np.arange(others.size) < states.orders.size - states.declared)
@@ -256,19 +262,19 @@ def _both_ways(states: States) -> tuple[Array, Array, Array]:
     angle = states.cycle_length * (np.arange(states.times.size - 1) + 0.5)
     reach = math.ceil(1.0 / _FINE)
     step = _FINE / float(np.ptp(middle))
+    tried = np.exp(-2j * np.pi * step * np.arange(-reach, reach + 1)[:, None] * middle)
     count = states.orders.size - states.declared
     over_angle, over_time, tones = np.zeros((3, count))
-    sums = [states.sums(item) for item in residual]
+    sums = np.stack([states.sums(item) for item in residual])
     weights = states.weight / (states.whole.sum() * states.u.size)
     for k, i in enumerate(range(states.declared, states.orders.size)):
         wave, turn = states.wave[i], states.turn[:, i]
         part = states.amplitudes[:, i, None] * turn  # (channel, cycle)
         alone = 0.5 * turn * (part * np.sum(wave**2) + part.conj() * wave.size)
-        each = (np.stack([item[:, i] for item in sums]) + alone).conj()
+        each = (sums[:, :, i] + alone).conj()
         over_angle[k] = weights @ np.abs(each.sum(axis=1)) ** 2
         away = states.orders[i] * (angle - states.frequency * middle)
         beside = each * np.exp(2j * np.pi * away)
-        tried = np.exp(-2j * np.pi * step * np.arange(-reach, reach + 1)[:, None] * middle)
         found = np.abs(tried @ beside.T) ** 2 @ weights
         best = int(np.argmax(found))
         near = np.log(found[best - 1:best + 2])

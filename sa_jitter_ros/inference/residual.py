@@ -96,14 +96,14 @@ class Residual:
     @property
     def text(self) -> str:
         """Return the surest of what is not as predicted, in words."""
-        p_value, text = min(
+        _, text = min(
             (self.p_mean, 'the mean attenuation of the held-out acquisitions is not the '
              'predicted one'),
             (self.p_scatter, 'the attenuation scatters more among the held-out acquisitions than '
              'predicted'),
             (self.p_amplitude_scatter, 'the amplitudes scatter more among the held-out '
              'acquisitions than predicted'))
-        return f'{text} (p = {_one_of_three(p_value):.2g})'
+        return f'{text} (p = {self.p_value:.2g})'
 
 
 def _one_of_three(*p_values: float) -> float:

@@ -35,8 +35,8 @@ from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
-from sa_jitter_ros.inference.cycle_states import independent_power
-from sa_jitter_ros.inference.line_search import APART
+from sa_jitter_ros.inference.cycle_states import hann, independent_power
+from sa_jitter_ros.inference.line_search import APART, nearest
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RESOLVED
@@ -134,45 +134,49 @@ def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
     """
     Return how far sidebands of several lines are from these, in cycles a trigger cycle.
 
-    The bends (s) follow, as peak values, that they stand for if the shaft twists: upper and lower
-    ones then are opposite. What repeats with the revolution is no torsion, but gears; faster
-    ones are no acceleration of the band.
+    The bends (s) follow, as peak values, that they stand for if the shaft twists. What repeats
+    with the revolution is no torsion, but gears; faster ones are no acceleration of the band.
     """
     declared, others = np.split(fit.orders, [fit.declared])
-    apart = others[:, None] - declared
-    near = np.argmin(np.abs(apart), axis=1)
-    offset = apart[np.arange(near.size), near]
+    near, offset = nearest(others, declared)
     turns, least = np.abs(offset) * model.cycle_length, APART / fit.errors.size
     chosen = np.flatnonzero((turns > least) & (turns < ALIASES.max()))
     chosen = chosen[np.argsort(turns[chosen])]
     groups = [group for group in np.split(
         chosen, np.flatnonzero(np.diff(turns[chosen]) > least) + 1) if group.size > 1]
     places = np.array([turns[group].mean() for group in groups])
-    bends = np.zeros(places.size)
-    for k, group in enumerate(groups):
-        order = places[k] / model.cycle_length
-        turn = abs(places[k] - np.rint(places[k]))  # of the image that an even angle leaves
-        if abs(order - np.rint(order)) * model.cycle_length < least or (
-                turn > ACCELERATION_BAND[1] + least):
-            continue
-        swings = []
-        for line in np.unique(near[group]).tolist():
-            carrier = fit.amplitudes[:, line]
-            channel = int(np.argmax(np.abs(carrier)))
-            beside = group[near[group] == line]
-            size = fit.amplitudes[channel, fit.declared + beside] / carrier[channel]
-            swings.append(np.abs(size[offset[beside] > 0.0].sum() - np.conj(
-                size[offset[beside] < 0.0].sum())) / declared[line])
-        even = np.sinc(places[k]) ** 2  # share that an even angle between pulses makes there
-        share = even if places[k] > 0.5 else 1.0 - even
-        bends[k] = max(swings) / share * np.pi * turn**2 / model.fundamental_frequency
-    return places, bends
+    turn = np.abs(places - np.rint(places))  # of the images that an even angle leaves
+    order = places / model.cycle_length
+    twists = (np.abs(order - np.rint(order)) * model.cycle_length >= least) & (
+        turn <= ACCELERATION_BAND[1] + least)
+    even = np.sinc(places) ** 2  # share that an even angle between pulses makes there
+    swing = np.array([_swing(fit, group, near[group], offset[group]) if twisted else 0.0
+                      for group, twisted in zip(groups, twists)])
+    bends = swing / np.where(places > 0.5, even, 1.0 - even) * np.pi * turn**2
+    return places, np.asarray(bends / model.fundamental_frequency)
+
+
+def _swing(fit: RecordFit, group: Array, near: Array, offset: Array) -> float:
+    """
+    Return the largest angle (rad) that sidebands turn one of the lines near them by.
+
+    Upper and lower ones of a torsion are opposite, at equal distances `offset`.
+    """
+    swings = []
+    for line in np.unique(near).tolist():
+        carrier = fit.amplitudes[:, line]
+        channel, own = int(np.argmax(np.abs(carrier))), near == line
+        size = fit.amplitudes[channel, fit.declared + group[own]] / carrier[channel]
+        upper = offset[own] > 0.0
+        swings.append(float(np.abs(size[upper].sum() - np.conj(size[~upper].sum()))
+                            / fit.orders[line]))
+    return max(swings)
 
 
 def _bends_of_motion(times: Array, frequency: Array) -> Array:
     """Return the largest bends (s) of sinusoids of some frequencies that pulse times allow."""
     second = np.diff(times, 2)
-    window = np.hanning(second.size + 2)[1:-1]
+    window = hann(second.size)
     waves = np.exp(-2j * np.pi * np.outer(frequency, np.arange(second.size)))
     noise = ONE_SIDED * math.sqrt(0.5 * np.sum((window * second) ** 2))
     shown = 2.0 * (np.abs(waves @ (window * second)) + noise) / window.sum()

@@ -514,12 +514,9 @@ class IntervalJudge:
 
     def _lose(self) -> None:
         """Discard the trigger cycle and match the target again from the waiting pulses on."""
-        known = self._model.known
-        self._failed += 1
-        if self._model.taken < _KNOWN_WELL:  # what is lost so soon may have other intervals
-            known //= 2
-        else:
-            self._failed = 0
+        soon = self._model.taken < _KNOWN_WELL  # what is lost so may have other intervals
+        known = self._model.known // 2 if soon else self._model.known
+        self._failed = self._failed + 1 if soon else 0
         self._end = _End(self.confirmed, self._model.level, self._model.scatter, known)
         self._counter.stop()
         self._alternation = Alternation()

@@ -33,8 +33,9 @@ IntArray = npt.NDArray[np.int64]
 
 # Pulses from which the interval is learnt: those of this time (s), in these limits.
 _LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12
-# Pulses after which noise is tried again; the most that are waited for after locks lost soon.
-_SELDOM, _MORE = 64, 6
+# How often the pulses double after which noise is tried again, 2 of them at first; the most that
+# are waited for after locks that were lost soon.
+_DOUBLED, _MORE = 5, 6
 # A pulse after less than this fraction of the expected interval is a second one of the same tooth.
 _DOUBLE = 0.5
 # Sensors shift the pulses of teeth next to a gap by up to 2 degrees, a fifth of the pitch of 36
@@ -133,8 +134,8 @@ class EvenTarget:
         first = _FEWEST
         if not known and interval * _FEWEST < _LEARNING_TIME:
             first = int(_LEARNING_TIME / interval) if interval * _MOST > _LEARNING_TIME else _MOST
-        more = 2 << (failed // 2)
-        return first + min(more - 2, _MORE) if tried < first else tried + min(more, _SELDOM)
+        more = 2 << min(failed // 2, _DOUBLED)
+        return first + min(more - 2, _MORE) if tried < first else tried + more
 
     def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
         """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
