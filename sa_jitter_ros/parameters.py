@@ -105,7 +105,7 @@ class Parameter:
         elif self.maximum is not None and value > self.maximum:
             limit = f'at most {self.maximum}'
         if limit:
-            unit = f' {self.unit}' if self.unit else ''
+            unit = f' {self.unit}' if self.unit not in ('', '1') else ''
             raise ParameterError(f'{name} is {given}{unit}: give {limit}')
 
 

@@ -65,8 +65,9 @@ class ParameterRange:
                 limits = [f'at least {self.minimum:g}'] if math.isfinite(self.minimum) else []
                 limits += [f'more than {self.above:g}'] if math.isfinite(self.above) else []
                 limits += [f'at most {self.maximum:g}'] if math.isfinite(self.maximum) else []
-                raise ParameterError(f'{name} is {number} {self.unit}: give a finite number'
-                                     + ''.join(f', {limit}' for limit in limits))
+                unit = f' {self.unit}' if self.unit != '1' else ''
+                raise ParameterError(f'{name} is {number}{unit}: give a finite number' + ''.join(
+                    f', {limit}' for limit in limits))
 
 
 def parameter(default: Any, description: str, unit: str, **limits: Any) -> Any:

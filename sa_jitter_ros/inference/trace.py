@@ -270,17 +270,22 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         say(f'found noise of {noise[0]:.3g}, less than declared')
     bench = bench.with_moving_source(_effects(chosen))
     at_first = dependences(bench, (), ())
-    for finding in chosen:
-        say(f'found {finding.name}: {finding.evidence}')
+    known = {item.name for item in declared}
+
+    def tell(found: Sequence[Finding]) -> None:
+        for finding in found:
+            what = 'other numbers of ' if finding.name in known else ''
+            say(f'found {what}{finding.name}: {finding.evidence}')
+
+    tell(chosen)
     candidates = [Candidate(finding.name, 0, finding, None, '') for finding in chosen]
     candidates += [Candidate(finding.name, 0, finding, None, too_small(finding))
                    for finding in present]
     tried = candidates_of_lines(bench, chosen)
-    for item in tried:
-        if not item.rejected_because:
-            say(f'found {item.name}: {item.finding.evidence}')
     candidates += tried
-    chosen += [item.finding for item in tried if not item.rejected_because]
+    added = [item.finding for item in tried if not item.rejected_because]
+    tell(added)
+    chosen += added
     present += [item.finding for item in tried
                 if item.rejected_because and item.finding.effect is not None]
     evidence = bench.gather((), everything)
@@ -306,11 +311,11 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         moves = dependences(bench, effects, chosen)
     attenuation, _, amplitude = bench.observed(everything)
     rows = limits(timing, evidence, [item.name for item in (*chosen, *present)])
-    known = {item.name for item in candidates}
+    named = {item.name for item in candidates}
     for name in EFFECTS:
-        if name in known:
+        if name in named:
             continue
-        if name in {item.name for item in declared}:
+        if name in known:
             reason = _AS_DECLARED
         elif timing is not None and name in timing.probabilities:
             reason = ('the likelihood of the timing gains nothing by it: probability '
