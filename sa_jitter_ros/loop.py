@@ -52,7 +52,8 @@ class Loop:
     Result of `close_loop`; `str` makes a summary of it.
 
     `traces` are the arrays behind the report, by the name of the shaft. `unit` is that of the
-    vibration, '' where it is unknown or not that of all channels; `created` is the time (UTC).
+    vibration, '' where it is unknown or not that of all channels; `faults` are what is wrong with
+    the recordings, or doubtful; `created` is the time (UTC).
 
     A machine whose pulses have no other error than that of a keyphasor sampled at 5 kHz, as
     declared:
@@ -76,6 +77,7 @@ class Loop:
     traces: Mapping[str, Trace]
     recordings: tuple[str, ...]
     unit: str = ''
+    faults: tuple[str, ...] = ()
     created: str = field(default_factory=lambda: datetime.now(timezone.utc).isoformat(
         timespec='seconds'))
 
@@ -84,7 +86,7 @@ class Loop:
         """Return the report of each shaft by its name; undefined numbers are None."""
         models = {shaft: trace.observation.model for shaft, trace in self.traces.items()}
         return {shaft: report(trace, recordings=self.recordings, shaft=shaft, models=models,
-                              unit=self.unit, created=self.created)
+                              unit=self.unit, created=self.created, faults=self.faults)
                 for shaft, trace in self.traces.items()}
 
     @property
@@ -230,7 +232,8 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     for fault in dict.fromkeys(faults):
         warnings.warn(fault, DataWarning, stacklevel=2)
     units = {unit for recording in opened for unit in recording.units}
-    return Loop(traces, names, units.pop() if len(units) == 1 else '')
+    return Loop(traces, names, units.pop() if len(units) == 1 else '', tuple(
+        dict.fromkeys(faults)))
 
 
 def _usable(recordings: Sequence[Recording], names: Sequence[str]

@@ -259,6 +259,14 @@ def test_torsion_that_makes_sidebands_is_within_the_limit_of_the_speed(order):
     assert row.upper > 0.03 * (2.0 * np.pi * order * SPEED) ** 2 / np.sqrt(2.0)
 
 
+@pytest.mark.machines
+def test_steady_torsion_that_averages_lose_by_is_unexplained():
+    """Its lines are steady beside their sidebands: raw and corrected averages lose the same."""
+    found = traced(torsion=(Torsion(0.3, 0.05),), acquisitions=32)
+    assert found.verdict == 'unexplained'
+    assert 'twists steadily, 0.3 times a trigger cycle' in found.left.text
+
+
 def test_declared_effect_is_not_missing():
     recording = simulated(*make_effects({'clock_skew': {'skew': 4e-4}}))
     found = trace([observe(recording, MODEL)], [recording],
@@ -305,6 +313,63 @@ def test_declared_effect_that_is_not_there_is_named(name, declared, size):
     changed, = [item for item in content['declared_changes'] if item['parameter'] == size]
     assert changed['name'] == name
     assert abs(changed['value']) < max(0.2 * declared[size], 3.0 * changed['standard_error'])
+
+
+@pytest.mark.machines
+def test_declared_clock_that_did_not_time_the_pulses_is_named():
+    recording = simulated()
+
+    def of(rate):
+        declared = declared_effects({'keyphasor_quantisation': {'clock_rate': rate}})
+        return report(trace([observe(recording, MODEL)], [recording], declared=declared))
+
+    content = of(2.93e3)
+    assert (content['verdict'], content['missing_effects']) == ('traced', [])
+    changed, = content['declared_changes']
+    assert (changed['name'], changed['parameter']) == ('keyphasor_quantisation', 'clock_rate')
+    assert changed['value'] > 100.0 * RATE
+    assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+    assert of(changed['value'])['verdict'] == 'none'
+
+
+@pytest.mark.machines
+def test_declared_clock_of_another_rate_is_named_though_measured_pulses_tell_their_ticks():
+    recording = with_slower_clock(simulated(jitter=False), 3.91e3)
+    declared = declared_effects({'keyphasor_quantisation': {'clock_rate': 1.53e3}})
+    content = report(trace([observe(recording, MODEL)], [recording], declared=declared))
+    changed = {item['parameter']: item for item in content['declared_changes']}
+    assert changed['clock_rate']['value'] == pytest.approx(3.91e3)
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize(('near', 'where'), [(1e-3, 'declared_changes'), (0.03, 'present')])
+def test_declared_tone_that_is_not_there_is_named(near, where):
+    recording = simulated()
+    tone = (1.0 + near) * MODEL.orders[0] * MODEL.fundamental_frequency
+    declared = declared_effects({'interfering_tone': {'amplitude': 0.05, 'frequency': tone}})
+    content = report(trace([observe(recording, MODEL)], [recording], declared=declared))
+    found, = content[where]
+    assert found['name'] == 'interfering_tone'
+    assert content['missing_effects'] == []
+
+
+@pytest.mark.machines
+@pytest.mark.parametrize('seed', [4, 5, 6])
+def test_tone_beyond_its_limit_is_found(seed):
+    limit, = [row.effect for row in traced(seed=seed).limits if row.name == 'interfering_tone']
+    place = 8.0 + np.random.default_rng(seed).uniform(0.1, 7.9)
+    tone = {'amplitude': 1.2 * limit.amplitude, 'frequency': place * SPEED}
+    found = traced(*make_effects({'interfering_tone': tone}), seed=seed).evidence.lines.tone
+    assert found.frequency == pytest.approx(tone['frequency'], rel=1e-4)
+
+
+@pytest.mark.machines
+def test_declared_interpolator_that_no_beat_shows_is_taken_for_as_declared():
+    recording = simulated()
+    declared = declared_effects({'interpolation_loss': {'method': 'linear'}})
+    content = report(trace([observe(recording, MODEL)], [recording], declared=declared))
+    assert content['verdict'] == 'none'
+    assert 'interpolation_loss' in content['undecided']
 
 
 @pytest.mark.machines

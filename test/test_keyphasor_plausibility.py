@@ -192,7 +192,9 @@ def test_loop_uses_the_good_channels_and_warns(recording):
         found = loop(with_bad_channels(recording), DECLARED)
     with pytest.warns(DataWarning, match='clipped is saturated'):
         good = loop(usable_channels(with_bad_channels(recording))[0], DECLARED)
-    assert found.report == {**good.report, 'created': found.created}
+    same = {'created': found.created, 'remarks': found.report['remarks']}
+    assert found.report == {**good.report, **same}
+    assert found.report['remarks'] == [str(item.message) for item in caught]
     assert [str(item.message).split(': ', 1)[1][:12] for item in caught] == [
         'loose is NaN', 'dead is cons', 'clipped is s']
 
@@ -207,7 +209,9 @@ def test_loop_leaves_out_a_channel_with_gaps(recording):
                                          'is left out'):
         found = loop(gappy, DECLARED)
     good = loop(recording, DECLARED)
-    assert found.report == {**good.report, 'created': found.created}
+    same = {'created': found.created, 'remarks': found.report['remarks']}
+    assert found.report == {**good.report, **same}
+    assert 'gappy' in found.report['remarks'][0]
 
 
 def test_command_prints_a_warning_as_a_line(recording, tmp_path, capsys):

@@ -10,6 +10,7 @@
 
 """The loop off line as a function: its arguments, its result, its files."""
 
+import contextlib
 from dataclasses import replace
 import doctest
 import json
@@ -115,11 +116,35 @@ def test_gap_in_the_vibration_costs_the_trigger_cycles_that_it_touches(recording
     assert abs(std['value'] - whole['value']) < std['standard_error']  # nearly the same pulses
     remark, = (text for text in loop_found.report['remarks'] if 'NaN' in text)
     touched = 5 if second else 4
-    assert remark == ('1.2% of the samples are NaN or infinite: no acquisition contains any of '
-                      f'the {touched} trigger cycles that they touch')
+    assert remark == ('1.2% of the samples are NaN, infinite or stuck at one value: no '
+                      f'acquisition contains any of the {touched} trigger cycles that they touch')
     observation = loop_found.traces['shaft'].observation
     assert len(observation.channel_names) == len(samples)
     assert len(observation.acquisitions) >= 15
+
+
+def test_reference_that_is_the_pulse_times_is_none(recording, found):
+    twice = replace(recording, reference_pulse_times=recording.pulse_times)
+    content = close_loop(twice, KEYWORDS).report
+    assert content['missing_effects'] == found.report['missing_effects']
+    assert any('the pulse times themselves' in text for text in content['remarks'])
+
+
+@pytest.mark.parametrize('alone', [True, False])
+def test_channel_with_a_loose_contact_spoils_no_average(recording, found, alone):
+    """It costs the trigger cycles, or is left out beside another, and the report says so."""
+    samples = recording.read().copy()
+    whole = samples.copy()
+    for begin in (3_000, 9_000, 15_500, 21_000):
+        samples[0, begin:begin + 300] = 0.0
+    rows = samples if alone else np.concatenate([samples, whole])
+    with pytest.warns(DataWarning, match='stuck') if not alone else contextlib.nullcontext():
+        loop_found = close_loop(
+            Recording(ArraySource(rows), RATE, pulse_times=recording.pulse_times),
+            {**KEYWORDS, 'trigger_cycles': 10})
+    content = loop_found.report
+    assert [effect['name'] for effect in content['missing_effects']] == ['excess_jitter']
+    assert any('stuck at one value' in text for text in content['remarks'])
 
 
 @pytest.mark.parametrize('name', ['pulse_times', 'reference_pulse_times'])

@@ -23,6 +23,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.lattice import SAME_RATE
 from sa_jitter_ros.effects.timing import Pattern, Setting, Spectrum
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.amplitudes import scenario_cycles, SCENARIOS
@@ -253,12 +254,17 @@ def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evid
 
 
 def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles: int) -> bool:
-    """Return whether the numbers of a fitted effect, with their errors, are not the declared."""
+    """
+    Return whether the numbers of a fitted effect, with their errors, are not the declared.
+
+    A rate whose error is None counts as another one where a clock would.
+    """
     away: list[float] = []
     for name, error in errors.items():
         found, known = effect.values[name], declared.values[name]
-        if isinstance(found, str) or np.shape(found) != np.shape(known):
-            if found != known:
+        if error is None or np.shape(found) != np.shape(known):
+            if found != known and not (isinstance(found, float) and math.isclose(
+                    found, known, rel_tol=SAME_RATE)):
                 return True
             continue
         size = np.ravel(error)

@@ -77,8 +77,9 @@ class LineEvidence:
     (acquisition, line) the standard deviation per sample of white noise that makes the line's
     noise, in the units of the recording; `radial` (acquisition, cycle, line) each cycle's
     amplitude over `level`, less 1, and `radial_noise` (line,) its standard deviation by noise
-    alone. `tone` is what stands out most between the synchronous lines, `beat` the beat of an
-    interpolator, which `radial` is without.
+    alone. `tone` is what stands out most between the synchronous lines, `hidden_tone` the largest
+    amplitude that would not, with its standard error; `beat` is the beat of an interpolator, which
+    `radial` is without.
     """
 
     order: Array
@@ -88,6 +89,7 @@ class LineEvidence:
     radial: Array
     radial_noise: Array
     tone: Tone | None = None
+    hidden_tone: tuple[float, float] = (0.0, math.inf)
     beat: Beat = Beat()
 
 

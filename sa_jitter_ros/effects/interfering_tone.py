@@ -11,6 +11,7 @@
 """Interfering tone: a line that no shaft makes, of which the average's comb lets some through."""
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -45,11 +46,22 @@ class InterferingTone(DirectEffect):
 
     @classmethod
     def limit(cls, evidence: Evidence) -> Effect | None:
-        """Return the strongest line that may be no order of the shaft."""
-        tone = evidence.lines.tone
-        if tone is None or not tone.standard_error >= 0.0:
+        """
+        Return the strongest line that may be no order of the shaft.
+
+        Where none stands out, it is the strongest that noise hides, beside the weakest order.
+        """
+        lines = evidence.lines
+        if lines.tone is not None:
+            size, error = lines.tone.amplitude, lines.tone.standard_error
+            frequency = lines.tone.frequency
+        elif lines.order.size:
+            size, error = lines.hidden_tone
+            frequency = evidence.model.fundamental_frequency * float(
+                lines.order[np.argmin(lines.level)])
+        else:
             return None
-        return cls(tone.amplitude + ONE_SIDED * tone.standard_error, tone.frequency)
+        return cls(size + ONE_SIDED * error, frequency) if 0.0 <= error < math.inf else None
 
     @classmethod
     def fit(cls, evidence: Evidence) -> Finding:

@@ -96,7 +96,7 @@ class KeyphasorQuantisation(Effect):
         # a slow speed moves neighbouring periods together: parts of the recording count
         parts = [part.mean() for part in np.array_split(power, _PARTS)]
         std, error = root(float(power.mean()), float(np.std(parts, ddof=1) / np.sqrt(_PARTS)))
-        return cls(setting.clock_rate, std), {'period_std': error}
+        return cls(setting.clock_rate, std), {'clock_rate': None, 'period_std': error}
 
     def in_timing(self, setting: Setting) -> Array:
         """Return the slope of the errors over those that a grid imposes."""

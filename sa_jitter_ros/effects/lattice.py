@@ -93,6 +93,14 @@ def rounding(times: Array) -> float:
     return 4.0 * float(np.spacing(np.max(np.abs(times))))
 
 
+def coarsest_clock(times: Array) -> float | None:
+    """Return the rate of the coarsest clock whose grid pulse times could lie on."""
+    intervals = np.sort(np.diff(times))
+    steps = np.diff(intervals)
+    steps = steps[steps > rounding(times)]
+    return float(1.0 / steps.min()) if steps.size else None
+
+
 def smooth_on_grid(times: Array, clock_rate: float) -> Array:
     """
     Return the errors (n,) in s, less half a tick, of `times` rounded up to a clock.

@@ -28,7 +28,8 @@ from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
-_USUAL = 5e-3  # s: filters and converters seldom delay by more
+#: Filters and converters seldom delay by more (s).
+USUAL_DELAY = 5e-3
 #: Relative spread of speeds below which nothing follows the speed, and a delay is a phase.
 STEADY = 1e-4
 
@@ -55,7 +56,7 @@ class PathDelay(Effect):
         'changes')
     remedy: ClassVar[str] = 'give the delay to the averager (path_delay)'
     timing: ClassVar[Pattern] = Pattern(
-        _of_speed, show_in_times=False, usual=lambda setting: _USUAL / setting.unit)
+        _of_speed, show_in_times=False, usual=lambda setting: USUAL_DELAY / setting.unit)
     delay: float = parameter(0.0, 'time by which the pulses come late, relative to the vibration',
                              's', minimum=-1.0, maximum=1.0)
 

@@ -25,7 +25,7 @@ from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, ODDS, parameter, require_in_turn)
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -37,10 +37,15 @@ def own_marks(model: DeclaredModel) -> tuple[int, int]:
 
 
 def _marks(setting: Setting) -> Array:
-    """Return for each mark but the last that begins trigger cycles where it is late, alone."""
+    """
+    Return for each mark but the last that begins trigger cycles where it is late, alone.
+
+    An angle takes longer where the shaft is slow.
+    """
     own, _ = own_marks(setting.model)
     mark = np.asarray(setting.index) % own
-    return np.array([(mark == m) * 1.0 - (mark == own - 1) for m in range(own - 1)])
+    longer = trigger_periods(setting.true_times) / setting.model.trigger_period
+    return np.array([((mark == m) * 1.0 - (mark == own - 1)) * longer for m in range(own - 1)])
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.bordered import Solved
-from sa_jitter_ros.pulses.resampling import interpolate
+from sa_jitter_ros.inference.order_band import BEYOND_LINES, EDGE, OrderBand
+from sa_jitter_ros.prediction.influence import trigger_periods
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_solve
 
@@ -40,9 +41,6 @@ Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
-#: Lines of a trigger cycle beyond which nothing leaks into it; of the band, where the low pass
-#: ends.
-BEYOND_LINES, EDGE = 3.0, 1.15
 _MOST_TAKEN = 0.5  # of the noise near the lines, that states may take up
 # Bends in parts of the declared jitter, and gains: a first guess when they become free, and the
 # least that they keep always: a bend of nothing would be certain.
@@ -69,10 +67,9 @@ class States:
     are in fundamental cycles; lines are those in angle, then those in time.
     """
 
-    def __init__(self, samples: Array, rate: float, start_time: float, times: Array,
-                 measured: BoolArray, cycle_length: float, orders: Array, top: float,
-                 jitter_std: float) -> None:
-        self.samples, self.sample_rate, self.start_time = samples, rate, start_time
+    def __init__(self, band: OrderBand, times: Array, measured: BoolArray, cycle_length: float,
+                 orders: Array, top: float, jitter_std: float) -> None:
+        self.band = band
         self.times, self.measured, self.cycle_length = times, measured, cycle_length
         self.whole = measured[:-1] & measured[1:]
         self.frequency = cycle_length / float(np.diff(times).mean())
@@ -91,15 +88,17 @@ class States:
         self.size = np.append(jitter_std, self.least)
         self.all_free = self.settled = False
         self.told = np.zeros(self.width)
-        self.weight, self.around = np.ones(samples.shape[1]), np.ones(1)
+        self.weight, self.around = np.ones(band.samples.shape[1]), np.ones(1)
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
         self.most_power = independent_power(np.diff(times, 3)[even]) if even.any() else math.inf
-        # the straight line of the errors, which is no jitter, is `trend` times this
+        # the straight line of the errors, which is no jitter, is `trend` times this; beside it
+        # are those that a delay or a clock makes as the speed changes
+        self.by_speed: Array = np.zeros(times.size)
         self.ramp: Array = np.asarray(
             (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean()))
         self.trend = 0.0
-        self.amplitudes = np.zeros((samples.shape[1], orders.size), np.complex128)
+        self.amplitudes = np.zeros((band.samples.shape[1], orders.size), np.complex128)
         self.turning = self.single = np.ones(orders.size, np.bool_)
         self._made: tuple[bytes, bytes, Array] = b'', b'', np.zeros(0)
         self.read()
@@ -120,6 +119,17 @@ class States:
         return self.single & (np.arange(self.single.size) < self.orders.size)
 
     @property
+    def no_jitter(self) -> Array:
+        """Return the errors (pulse,) that are expected before any jitter."""
+        return self.trend * self.ramp + self.by_speed
+
+    @property
+    def common_turn(self) -> Array:
+        """Return the time that one turn of all lines takes at each pulse, 1 in the mean."""
+        period = trigger_periods(self.times - self.states[:, 0])
+        return np.asarray(period / period[self.measured].mean())
+
+    @property
     def transformed(self) -> int:
         """Return how many of the first cycles have a fast Fourier transform: nearly all."""
         return next(count for count in range(self.times.size - 1, 0, -1)
@@ -137,13 +147,7 @@ class States:
         self.slope = self.cycle_length / period
         self.place = (corrected[:-1, None] + period[:, None] * self.u
                       - self.states[:-1, 1:-1] @ self.shapes[1:-2])
-        self.vibration = np.moveaxis(self.vibration_at(self.place), 2, 0) * self.whole[:, None]
-
-    def vibration_at(self, place: Array) -> Array:
-        """Return the vibration (..., channel) at times (...) in s."""
-        position = np.clip((place - self.start_time) * self.sample_rate, 0.0,
-                           len(self.samples) - 1.0)
-        return interpolate(self.samples, position.ravel()).reshape(*place.shape, -1)
+        self.vibration = np.moveaxis(self.band.at(self.place), 2, 0) * self.whole[:, None]
 
     def make_tables(self) -> None:
         """
@@ -161,7 +165,7 @@ class States:
         self.wave = np.exp(2j * np.pi * self.cycle_length * self.orders[:, None] * self.u)
         self.reading = np.ascontiguousarray(self.wave.conj().T).view(np.float64).T
         # cosines and sines of the tones side by side (cycle, point, 2 tone)
-        turned = (self.place - self.start_time)[..., None] * (2.0 * np.pi * self.tones)
+        turned = (self.place - self.band.start)[..., None] * (2.0 * np.pi * self.tones)
         self.in_time = np.stack([np.cos(turned), np.sin(turned)], axis=-1).reshape(
             *self.place.shape, -1)
         self.in_time *= self.whole[:, None, None]
@@ -318,7 +322,7 @@ class States:
         size = self.size * np.append(weak, np.ones(width - 1))
         precision = np.tile(size**-2.0, (pulses, 1))
         expected = self.states.copy()
-        expected[:, 0] -= self.trend * self.ramp
+        expected[:, 0] -= self.no_jitter
         total = precision + np.einsum('kii->ki', cells)[:, :-1]
         total[1:, 0] += cells[:-1, -1, -1]
         down[1:, 0] += down[:-1, -1]
@@ -388,7 +392,7 @@ class States:
         """
         Return the posterior variance of a state at each pulse.
 
-        Those of pulse errors are about their mean, which nothing tells.
+        Those of pulse errors are about the turn that they have in common, which nothing tells.
         """
         solved = self.solved
         local, inner = solved.of_state(state)
@@ -401,13 +405,15 @@ class States:
             return np.asarray(variance)
         mean = solved.scale[:, 0] * self.measured / self.measured.sum()
         shared = solved.of_errors(mean)
-        return np.asarray(variance - 2.0 * shared * solved.scale[:, 0] + mean @ shared)
+        turn = self.common_turn
+        return np.asarray(variance - 2.0 * turn * shared * solved.scale[:, 0]
+                          + turn**2 * (mean @ shared))
 
     def _estimate_sizes(self) -> None:
         """Estimate how large the states are from their values and variances."""
         inner = np.arange(self.times.size)[2:-2]
         inner = inner[self.measured[2:-2]]
-        errors = (self.states[:, 0] - self.trend * self.ramp)[inner]
+        errors = (self.states[:, 0] - self.no_jitter)[inner]
         power, more = self._estimated(0, errors - errors.mean(),
                                       1.0 - 1.0 / np.count_nonzero(self.measured))
         power = max(power, min(more, self.most_power), (_LEAST_JITTER * self.jitter_std) ** 2)

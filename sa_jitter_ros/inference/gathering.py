@@ -25,6 +25,7 @@ from sa_jitter_ros.effects.lattice import (
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
+from sa_jitter_ros.inference.line_search import least_seen
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.residual import FALSE_ALARM
 from sa_jitter_ros.prediction.influence import known_errors, Pulses, without_gaps
@@ -247,7 +248,8 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
         order=order, channel=lines.channel, level=level, noise_density=density,
         radial=own + without_beat(
             (along - own).reshape(-1, order.size), beat).reshape(along.shape),
-        radial_noise=noise * np.sqrt(shortest) / level, tone=tone, beat=beat)
+        radial_noise=noise * np.sqrt(shortest) / level, tone=tone,
+        hidden_tone=_hidden_tone(observation, density), beat=beat)
 
 
 def _beside(observation: Observation, lines: Lines, tone: Tone, relative: Array) -> Array:
@@ -308,6 +310,17 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
     of_frequency = math.sqrt(12.0) * error / amplitude / (2.0 * np.pi * duration)
     return Tone(float(frequency[best]), amplitude, of_frequency, error, 0.5 * power,
                 len(amplitudes), 0.5 * observation.sample_rate * duration)
+
+
+def _hidden_tone(observation: Observation, density: Array) -> tuple[float, float]:
+    """Return the largest amplitude of a tone that noise (acquisition, line) hides; its error."""
+    if not observation.recoveries or not density.size:
+        return 0.0, math.inf
+    samples = observation.sample_rate * max(
+        float(np.ptp(item.bridged[part])) for item in observation.recoveries
+        for part in item.stretches)
+    error = math.sqrt(2.0 / samples) * float(np.median(density))
+    return least_seen(samples, len(observation.channel_names)) * error, error
 
 
 def cycle_amplitudes(observation: Observation) -> Array:

@@ -31,7 +31,7 @@ from sa_jitter_ros.effects.band import ACCELERATION_BAND, memory
 from sa_jitter_ros.effects.effect import (
     DirectEffect, largest_power, ONE_SIDED, parameter_ranges, possible, RARE, SEEN)
 from sa_jitter_ros.effects.evidence import Evidence
-from sa_jitter_ros.effects.lattice import rounding
+from sa_jitter_ros.effects.lattice import coarsest_clock
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, Pattern, Spectrum
@@ -81,7 +81,7 @@ def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
         elif name == SpeedFluctuation.name:
             effect = _of_speed(timing)
         elif isinstance(kind.timing, Pattern) and kind.timing.replaces_jitter:
-            lower = _coarsest_clock(np.concatenate([
+            lower = coarsest_clock(np.concatenate([
                 item.setting.times[item.measured] for item in timing.chooser.data.stretches]))
         else:
             effect = largest(timing, name)
@@ -194,11 +194,3 @@ def _of_speed(timing: Timing) -> Effect | None:
     power += max(item.twist for item in parts) ** 2
     return None if math.isinf(power) else SpeedFluctuation.of_ripple(
         math.sqrt(power), timing.choice.setting.model)
-
-
-def _coarsest_clock(times: Array) -> float | None:
-    """Return the rate of the coarsest clock whose grid the pulse times could lie on."""
-    intervals = np.sort(np.diff(times))
-    steps = np.diff(intervals)
-    steps = steps[steps > rounding(times)]
-    return float(1.0 / steps.min()) if steps.size else None

@@ -24,18 +24,22 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.noise import row_medians
 from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.effect import ODDS
+from sa_jitter_ros.effects.path_delay import USUAL_DELAY
 from sa_jitter_ros.inference.cycle_states import hann, States
+from sa_jitter_ros.prediction.influence import trigger_periods
 from sa_jitter_ros.pulses.resampling import interpolate
-from scipy.fft import rfft
+from scipy.fft import fft, next_fast_len, rfft
 from scipy.special import gammaincc, gammainccinv
 
 Array = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
 _MOST_LINES = 60  # undeclared ones, half of them before bends and gains are free
 # A peak is a line where noise exceeds it once in so many spectra, by some margin for its floor;
 # it must not be far below the strongest, which may leave images of itself.
 FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
+_HANN = 1.5  # bins of noise in one of the window
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
 _FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
@@ -74,9 +78,61 @@ def follow_trend(states: States, expected: float) -> int:
              and abs(best - expected) > 1.5 * step
              and np.mean(chance < FALSE / slope.size) > _SLOPE_LINES)
     states.trend = float(best) if clear else expected
-    states.states[:, 0] = states.trend * states.ramp
+    states.states[:, 0] = states.no_jitter
     states.read()
     return len(slope)
+
+
+def follow_speed(states: States) -> int:
+    """
+    Start from the delay, or clock skew, that keeps the declared lines together as speeds change.
+
+    It is 0 where no other is clearly better. How many were tried is returned.
+    """
+    period = trigger_periods(states.times)
+    pace, since = states.cycle_length / period, states.times - states.times[0]
+    if float(np.ptp(pace)) * states.orders.max() * USUAL_DELAY < _FINE:
+        return 1
+    states.make_tables()
+    each = np.stack([states.sums(row) for row in states.vibration]).conj()
+    count, best, errors = 1, _SLOPE_GAIN * states.declared, np.zeros(period.size)
+    for moved, most in ((np.ones(period.size), USUAL_DELAY), (since, USUAL_SKEW)):
+        turned = pace * moved
+        step = _FINE / (states.orders.max() * float(np.ptp(turned)))
+        if step > most:
+            continue
+        tried = step * np.arange(-int(most / step), int(most / step) + 1)
+        power = np.array([_coherence(each[:, :, g], order * turned[:-1], tried)
+                          for g, order in enumerate(states.orders)])
+        score = np.sum(np.log(1e-3 * power.max() + power), axis=0)
+        top = int(np.argmax(score))
+        chance = gammaincc(len(each), power[:, top])
+        gained = score[top] - score[tried.size // 2]
+        if gained > best and np.mean(chance < FALSE / tried.size) > _SLOPE_LINES:
+            best, errors = gained, tried[top] * moved
+        count += tried.size
+    states.by_speed = errors - period * (errors.mean() / period.mean())
+    states.states[:, 0] = states.by_speed
+    states.read()
+    return count
+
+
+def _coherence(each: ComplexArray, turns: Array, tried: Array) -> Array:
+    """
+    Return the power, over its mean, of a line in all cycles together for errors of sizes `tried`.
+
+    `each` (channel, cycle) are its amplitudes, which errors of size 1 turn by `turns` (cycle,).
+    """
+    cell = _FINE / float(tried[-1])
+    place = ((turns - turns.min()) / cell).astype(int)
+    size = next_fast_len(int((place.max() + 1) / _FINE) + 1)
+    at = np.rint(tried * cell * size).astype(int) % size
+    total = np.zeros(tried.size)
+    for row in each:
+        cells = np.bincount(place, row.real) + 1j * np.bincount(place, row.imag)
+        total += np.abs(fft(cells, size)[at]) ** 2 / max(
+            float(np.sum(np.abs(row) ** 2)), np.finfo(np.float64).tiny)
+    return total
 
 
 def new_lines(states: States) -> tuple[list[float], list[float]]:
@@ -123,6 +179,12 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
             (tones if tone else orders).append(float(place))
             least_power = least_power or _SHARE * size
     return orders, tones
+
+
+def least_seen(samples: float, channels: int) -> float:
+    """Return the least amplitude of a line on all channels that is found, over its error."""
+    power = _MARGIN * float(gammainccinv(channels, FALSE / samples)) / channels
+    return float(np.sqrt(2.0 * _HANN * power))
 
 
 def add_lines(states: States, orders: Sequence[float] | Array,

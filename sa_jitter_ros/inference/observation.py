@@ -33,13 +33,14 @@ from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
 from sa_jitter_ros.errors import ModelError, RecordingError
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
-from sa_jitter_ros.inference.record_fit import FULL_BAND
+from sa_jitter_ros.inference.order_band import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
-from sa_jitter_ros.prediction.influence import mean_period
+from sa_jitter_ros.prediction.influence import mean_period, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
+from sa_jitter_ros.recordings.channel_check import stuck
 from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -282,8 +283,11 @@ def recovered_again(recording: Recording, observation: Observation, channels: Se
 
 def _read(recording: Recording) -> tuple[FloatArray, BoolArray]:
     """Return the samples (sample, channel), their mean 0, and which are none: 0, too."""
-    samples = np.ascontiguousarray(recording.read().T)
-    gaps = np.asarray(~np.isfinite(samples).all(axis=1))
+    read = recording.read()
+    gaps = np.asarray(~np.isfinite(read).all(axis=0))
+    for channel in read:
+        gaps |= stuck(channel)
+    samples = np.ascontiguousarray(read.T)
     samples -= samples[~gaps].mean(axis=0) if not gaps.all() else 0.0
     samples[gaps] = 0.0
     return samples, gaps
@@ -347,7 +351,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     span = slice(pulses.number[first], pulses.number[first + count] + 1)
     bridged, measured = pulses.bridged[span], numbered(missing)
     late = recovery.bridged_errors[span]
-    late = late - late[measured].mean()
+    late = late - _common_turn(late[measured].mean(), bridged - late, measured)
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
     ripple = recovery.ripple[span.start + measured[:-1]]
     ripple_is_clear = np.mean(ripple**2) > _RIPPLE * (
@@ -360,8 +364,8 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     if pulses.reference is not None:
         corrected_law = law
         errors = times - pulses.reference[span][measured]
-        corrected_pulses = errors.mean() + pulses.reference[
-            span.start - law.before:span.stop + law.after]
+        better = pulses.reference[span.start - law.before:span.stop + law.after]
+        corrected_pulses = better + _common_turn(errors.mean(), better, law.before + measured)
     errors = errors - errors.mean()
     corrects_ripple = pulses.reference is None and ripple_is_clear and not reason
     corrected_ripple = ripple if corrects_ripple else None
@@ -376,6 +380,19 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
         radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,
         reason)
+
+
+def _common_turn(mean: float, times: FloatArray, measured: NDArray[np.int64]) -> FloatArray:
+    """
+    Return the turn that errors with a `mean` (s) have in common, in s at each of the true `times`.
+
+    It takes longer where the shaft is slow. Only the `measured` pulses count; NaN where any time
+    is unknown.
+    """
+    if not np.all(np.isfinite(times)):
+        return np.full(times.size, np.nan)
+    period = trigger_periods(times)
+    return np.asarray(period * (mean / period[measured].mean()))
 
 
 def _clean(cycles: ComplexArray, model: DeclaredModel, sources: FloatArray) -> ComplexArray:

@@ -23,24 +23,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import ROUNDING
-from sa_jitter_ros.inference.cycle_states import BEYOND_LINES, EDGE, States
+from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, FALSE, fit_lines, follow_trend, let_stand, new_lines, prune, refine)
+    add_lines, FALSE, fit_lines, follow_speed, follow_trend, let_stand, new_lines, prune, refine)
+from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
-from sa_jitter_ros.prediction.influence import trigger_periods
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import gammaincc
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 BoolArray = NDArray[np.bool_]
 
-# The band that is read ends so far above the highest declared order, or lines of a trigger cycle:
-# what lies further away does not leak into a cycle.
-_BEYOND = 6.0
-#: Of the sample rate: beyond it, filters may end.
-FULL_BAND = 0.4
-_SAMPLES = 3.7  # in a period of the band's end
 # Steps that a search may take; what its last one may change, in standard errors.
 _MOST_STEPS, _SETTLED = 20, 0.1
 _PRUNED_EARLY, _PRUNED = 25.0, 4.0  # mean power of a line in its variances that keeps it
@@ -88,17 +81,6 @@ class RecordFit:
     held: bool
 
 
-def band_end(times: Array, sample_rate: float, cycle_length: float, orders: Sequence[float],
-             wider: float) -> float:
-    """
-    Return the order at which the band of a fit ends.
-
-    It is little beyond the highest order, or `wider` by this factor.
-    """
-    return min(wider * (max(orders) + max(_BEYOND, BEYOND_LINES / cycle_length)), max(
-        max(orders), FULL_BAND * sample_rate * float(np.diff(times).mean()) / cycle_length))
-
-
 class OpenRecord:
     """What all fits of a stretch of a recording have in common: its band, and where they begin."""
 
@@ -114,11 +96,10 @@ class OpenRecord:
         expected to grow by `trend` s in a second, as elsewhere in the recording.
         """
         top = top or band_end(times, sample_rate, cycle_length, orders, 1.0)
-        band, rate = _low_passed(
-            samples, sample_rate, top * cycle_length / float(np.diff(times).mean()))
-        self._begin = States(band, rate, start_time, times, measured, cycle_length,
-                             np.array(orders), top, jitter_std)
-        self._false_alarm = FALSE / follow_trend(self._begin, trend)
+        band = OrderBand.below(top * cycle_length, samples, sample_rate, start_time, times)
+        self._begin = States(
+            band, times, measured, cycle_length, np.array(orders), top, jitter_std)
+        self._false_alarm = FALSE / follow_speed(self._begin) / follow_trend(self._begin, trend)
 
     def fit(self, known: tuple[Array, Array] | None = None) -> RecordFit:
         """
@@ -179,18 +160,6 @@ def _search(states: States, known: tuple[Array, Array] | None) -> None:
         fit_lines(states)
 
 
-def _low_passed(samples: Array, rate: float, top: float) -> tuple[Array, float]:
-    """Return the samples up to 1.15 `top` (Hz) at a rate that the interpolator reads exactly."""
-    count = len(samples)
-    padded = next_fast_len(count + 200, real=True)
-    spectrum = rfft(samples - samples.mean(axis=0), padded, axis=0)
-    spectrum[int(EDGE * top / rate * padded):] = 0.0
-    size = next_fast_len(min(round(padded * _SAMPLES * top / rate), padded), real=True)
-    size = min(size, padded)
-    found = irfft(spectrum[:size // 2 + 1], size, axis=0)[:int(count * size / padded)]
-    return np.ascontiguousarray(found * (size / padded)), rate * size / padded
-
-
 def _result(states: States, false_alarm: float) -> RecordFit:
     """
     Return the fit, pulse errors and bends as good as unshrunk.
@@ -202,9 +171,7 @@ def _result(states: States, false_alarm: float) -> RecordFit:
     states.step(weak=_WEAK)
     states.step(weak=weak, move=False)
     errors = states.states[:, 0] + states.change
-    # an angle that all lines turn by takes longer where the shaft is slow
-    period = trigger_periods(states.times - errors)
-    errors -= period * (errors[states.measured].mean() / period[states.measured].mean())
+    errors -= states.common_turn * errors[states.measured].mean()
     bends, bend_errors = states.states[:-1, 1:3].copy(), np.full(2, np.inf)
     for i in range(2):
         variance = states.variance(1 + i)

@@ -93,9 +93,9 @@ class RecordPulses:
         number, bridged = self.number, self.bridged.copy()
         for k in np.flatnonzero(broken & (self.missing > 0)).tolist():
             bridged[number[k] + 1:number[k + 1]] = np.nan
-        remark = (f'{100.0 * np.mean(gaps):.2g}% of the samples are NaN or infinite: no '
-                  f'acquisition contains any of the {np.count_nonzero(broken)} trigger cycles '
-                  'that they touch')
+        remark = (f'{100.0 * np.mean(gaps):.3g}% of the samples are NaN, infinite or stuck at one '
+                  f'value: no acquisition contains any of the {np.count_nonzero(broken)} trigger '
+                  'cycles that they touch')
         return replace(self, starts_run=self.starts_run | np.append(False, broken),
                        bridged=bridged, remarks=(*self.remarks, remark))
 
@@ -146,14 +146,18 @@ def record_pulses(recording: Recording, model: DeclaredModel) -> RecordPulses:
         raise ModelError(f'trigger_speed is declared as {model.trigger_speed:g} Hz but the tach '
                          f'shaft turns at {middle:.4g} Hz: declare the speed and '
                          'pulses_per_revolution of this recording')
-    reference = None
-    if recording.reference_pulse_times is not None:
-        better, _ = _validated(recording.reference_pulse_times, 1, recording.duration)
+    reference, other = None, recording.reference_pulse_times
+    itself = other is not None and np.array_equal(measured, other)
+    if other is not None and not itself:
+        better, _ = _validated(other, 1, recording.duration)
         # one pulse of the reference in each trigger cycle, or as many as there are of the other
         longer = np.median(np.diff(better.times)) / np.median(np.diff(pulses.times))
         reference = _matched(found, better.every(1), step if longer**2 < step else 1)
     remarks = [*_remarks(counts, measured.size, int(pulses.displaced.sum())),
                *_tach_rate_remark(recording, model)]
+    if itself and recording.pulse_times is not None:
+        remarks.append('reference_pulse_times are the pulse times themselves: they tell nothing '
+                       'of their errors and are not used')
     return RecordPulses(found.times, found.missing, found.starts_run, found.doubtful,
                         found.bridged, reference, tuple(remarks), found.displaced)
 

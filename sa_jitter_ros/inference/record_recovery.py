@@ -27,7 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.line_search import APART
-from sa_jitter_ros.inference.record_fit import band_end, OpenRecord, RecordFit
+from sa_jitter_ros.inference.order_band import band_end
+from sa_jitter_ros.inference.record_fit import OpenRecord, RecordFit
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.limits import LEAST_RANGE

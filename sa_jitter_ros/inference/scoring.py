@@ -29,6 +29,7 @@ from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memo
 from sa_jitter_ros.inference.gathering import gather
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import FALSE_ALARM, Residual, residual, Sensitivity
+from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import Pulses
 from scipy import special
 
@@ -88,6 +89,13 @@ class Bench:
         return replace(self, moving=moving,
                        fewer=self.fewer and self.fewer.with_moving_source(effects))
 
+    @property
+    def assumed(self) -> Sequence[Effect]:
+        """Return declared effects that no data can show: a loss without a beat that tells it."""
+        return [] if self.scatter.beat.method else [
+            item for item in self.declared if item.timing is None
+            and np.any(item.gain(self.observation.model) != 1.0)]
+
     def gather(self, effects: Sequence[Effect], chosen: Sequence[int]) -> Evidence:
         """Return the evidence of some acquisitions, less what effects explain."""
         return gather(self.observation, self.lines, chosen, self.pulses, self.clock,
@@ -145,7 +153,9 @@ class Bench:
         def of(name: str) -> Array:
             return self.lines.of(np.array([getattr(item, name)[:, :orders] for item in items]))
 
-        kept = self.scatter.beat.kept  # raw and corrected amplitude have both lost the rest
+        # raw and corrected amplitude have both lost the rest
+        kept = self.scatter.beat.kept * component_gain(
+            self.observation.model, self.assumed)[self.lines.order]
         if self.moving:
             kept = kept * self._without_jitter(self.moving, chosen).attenuation
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
@@ -239,9 +249,9 @@ def _shifted(finding: Finding) -> list[Effect]:
     if finding.effect is None:
         return found
     for name, error in finding.standard_errors.items():
-        value = finding.effect.values[name]
-        if isinstance(value, str):
+        if error is None:
             continue
+        value = finding.effect.values[name]
         for step in np.diag(np.where(np.isfinite(error), error, 0.0).reshape(-1)):
             shifted = tuple((np.ravel(value) + step).tolist())
             try:

@@ -50,7 +50,7 @@ def mend_slips(states: States) -> bool:
     loose = np.append(bad, False) | np.append(False, bad)
     edges = np.flatnonzero(np.diff(np.pad(loose.astype(int), 1)))
     expected = states.states.copy()
-    expected[:, 0] -= states.trend * states.ramp
+    expected[:, 0] -= states.no_jitter
     before = 0.5 * np.sum((expected / states.size) ** 2, axis=1)
     of_orders = np.arange(states.amplitudes.shape[1]) < states.orders.size
     signals, rate = states.signals(of_orders * states.amplitudes), states.rate()
@@ -87,9 +87,9 @@ def _misfits(states: States, cycle: int, one: Array, other: Array, signals: Arra
     begin = states.times[cycle] - states.states[cycle, 0] - one[:, None, None]
     end = states.times[cycle + 1] - states.states[cycle + 1, 0] - other[:, None]
     place = begin + (end - begin) * states.u
-    left = states.vibration_at(place) - signals.T
+    left = states.band.at(place) - signals.T
     for row, tone in zip(states.amplitudes[:, states.orders.size:].T, states.tones):
-        wave = np.exp(2j * np.pi * tone * (place - states.start_time))
+        wave = np.exp(2j * np.pi * tone * (place - states.band.start))
         left -= (row * wave[..., None]).real
     left *= np.sqrt(states.weight)
     left = left.reshape(one.size, other.size, -1)

@@ -32,19 +32,21 @@ from sa_jitter_ros.effects.effect import (
     beyond_chance, departs, Finding, ODDS, ONE_SIDED, parameter_ranges, possible)
 from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.jitter_scale import JitterScale
-from sa_jitter_ros.effects.lattice import Clock, ROOM, smooth_on_grid
+from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
+from sa_jitter_ros.effects.lattice import (
+    Clock, coarsest_clock, ROOM, SAME_RATE, smooth_on_grid)
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.cycle_states import hann, independent_power
 from sa_jitter_ros.inference.line_search import APART, nearest
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
-from sa_jitter_ros.inference.record_recovery import jitter_unit, RESOLVED
+from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
-    Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE)
-from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch
+    Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
+from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch, Torsion
 from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
@@ -55,6 +57,7 @@ Array = NDArray[Any]
 
 _SPEED, _CLOCK = 'speed_fluctuation', 'keyphasor_quantisation'
 _RESOLVED = 0.3  # of the declared jitter: standard errors of recovered errors that serve
+_BESIDE = 12  # ordinates on either side of a sinusoid, of which the noise is told
 _REFERENCE = 1e-3  # of the declared jitter: errors of a reference keyphasor
 
 
@@ -114,6 +117,7 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
         grid = _grid(observation.pulses.times, clock)
         return [_of_average(observation, observation.acquisitions[a], unit, grid, clock.rate)
                 for a in chosen]
+    grids = [_grid(recovery.times, clock) for recovery in observation.recoveries]
     for number, first, last in _runs(observation, chosen):
         recovery = observation.recoveries[number]
         start, stop = recovery.number[first], recovery.number[last] + 1
@@ -121,11 +125,17 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
                 continue
-            stretch = _stretch(observation, number, part, here, clock, unit)
+            stretch = _stretch(observation, recovery, part, here, grids[number], clock.rate, unit)
             sidebands, bends = _sidebands(fit, model)
-            bends = np.minimum(bends, _bends_of_motion(stretch.setting.times, sidebands))
-            found.append(replace(stretch, sidebands=sidebands,
-                                 twist=float(np.sqrt(0.5 * np.sum(bends**2))),
+            shown, most, p_value = _bends_of_motion(stretch.setting.times, sidebands)
+            # faster ones are no acceleration of the band
+            slow = _turn(sidebands) <= ACCELERATION_BAND[1] + APART / fit.errors.size
+            twist = np.sqrt(0.5 * np.sum(np.minimum(bends, most)[slow] ** 2))
+            torsion = [Torsion(*row) for row in zip(  # slower ones are no torsion, but a run-up
+                _turn(sidebands), np.minimum(bends, shown) / math.sqrt(2.0), p_value)
+                if row[0] > ACCELERATION_BAND[0]]
+            found.append(replace(stretch, sidebands=sidebands, twist=float(twist),
+                                 torsion=min(torsion, key=lambda item: item.p_value, default=None),
                                  held=fit.held or observation.against_reference))
     return found
 
@@ -135,7 +145,7 @@ def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
     Return how far sidebands of several lines are from these, in cycles a trigger cycle.
 
     The bends (s) follow, as peak values, that they stand for if the shaft twists. What repeats
-    with the revolution is no torsion, but gears; faster ones are no acceleration of the band.
+    with the revolution is no torsion, but gears.
     """
     declared, others = np.split(fit.orders, [fit.declared])
     near, offset = nearest(others, declared)
@@ -145,10 +155,8 @@ def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
     groups = [group for group in np.split(
         chosen, np.flatnonzero(np.diff(turns[chosen]) > least) + 1) if group.size > 1]
     places = np.array([turns[group].mean() for group in groups])
-    turn = np.abs(places - np.rint(places))  # of the images that an even angle leaves
-    order = places / model.cycle_length
-    twists = (np.abs(order - np.rint(order)) * model.cycle_length >= least) & (
-        turn <= ACCELERATION_BAND[1] + least)
+    turn, order = _turn(places), places / model.cycle_length
+    twists = np.abs(order - np.rint(order)) * model.cycle_length >= least
     even = np.sinc(places) ** 2  # share that an even angle between pulses makes there
     swing = np.array([_swing(fit, group, near[group], offset[group]) if twisted else 0.0
                       for group, twisted in zip(groups, twists)])
@@ -173,15 +181,28 @@ def _swing(fit: RecordFit, group: Array, near: Array, offset: Array) -> float:
     return max(swings)
 
 
-def _bends_of_motion(times: Array, frequency: Array) -> Array:
-    """Return the largest bends (s) of sinusoids of some frequencies that pulse times allow."""
+def _turn(places: Array) -> Array:
+    """Return the frequencies of the images that an even angle leaves."""
+    return np.asarray(np.abs(places - np.rint(places)))
+
+
+def _bends_of_motion(times: Array, frequency: Array) -> tuple[Array, Array, Array]:
+    """
+    Return the peak bends (s) of sinusoids of some frequencies that pulse times show.
+
+    The largest that they allow follow, and the chance of as much power as there is in one, beside
+    that of its neighbours.
+    """
     second = np.diff(times, 2)
-    window = hann(second.size)
-    waves = np.exp(-2j * np.pi * np.outer(frequency, np.arange(second.size)))
+    window, turns = hann(second.size), -2j * np.pi * np.arange(second.size)
+    beside = np.array([0, *range(-_BESIDE, -2), *range(3, _BESIDE + 1)]) / second.size
+    size = np.array([np.abs(np.exp(np.multiply.outer(place + beside, turns)) @ (window * second))
+                     for place in frequency]).reshape(-1, beside.size)
+    count = beside.size // 4  # neighbours in the window are not independent
+    ratio = size[:, 0] ** 2 / np.mean(size[:, 1:] ** 2, axis=1)
     noise = ONE_SIDED * math.sqrt(0.5 * np.sum((window * second) ** 2))
-    shown = 2.0 * (np.abs(waves @ (window * second)) + noise) / window.sum()
-    turn = np.abs(frequency - np.rint(frequency))
-    return np.asarray(0.5 * shown / np.sinc(turn) ** 2)
+    scale = 1.0 / window.sum() / np.sinc(_turn(frequency)) ** 2
+    return scale * size[:, 0], scale * (size[:, 0] + noise), (1.0 + ratio / count) ** -count
 
 
 def _of_average(observation: Observation, item: Acquisition, unit: float, grid: Array | None,
@@ -213,10 +234,14 @@ def _runs(observation: Observation, chosen: Sequence[int]) -> list[tuple[int, in
     return runs
 
 
-def _stretch(observation: Observation, number: int, part: slice, here: slice, clock: Clock,
-             unit: float) -> Stretch:
-    """Return the pulses `here` of a `part` of a recording that is unbroken, missing ones too."""
-    recovery, model = observation.recoveries[number], observation.model
+def _stretch(observation: Observation, recovery: RecordRecovery, part: slice, here: slice,
+             imposed: Array | None, rate: float, unit: float) -> Stretch:
+    """
+    Return the pulses `here` of a `part` of a recording that is unbroken, missing ones too.
+
+    `imposed` are the errors that a clock of some `rate` imposes on the measured pulses.
+    """
+    model = observation.model
     bridged, errors = recovery.bridged[here], recovery.bridged_errors[here]
     measured = np.zeros(recovery.bridged.size, np.bool_)
     measured[recovery.number] = True
@@ -236,13 +261,13 @@ def _stretch(observation: Observation, number: int, part: slice, here: slice, cl
         errors = errors - errors[measured].mean()
         error_std, prior = _REFERENCE * unit, math.inf
         bend_std = math.inf  # what shows no errors shows no bends
-    smooth, grid = _grid(recovery.times, clock), None
-    if smooth is not None:
+    grid = None
+    if imposed is not None:
         grid = np.zeros(recovery.bridged.size)
-        grid[recovery.number] = smooth
+        grid[recovery.number] = imposed
         grid = grid[here]
     setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
-                      float(recovery.bridged[0]), recovery.bridged[part], grid, clock.rate)
+                      float(recovery.bridged[0]), recovery.bridged[part], grid, rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
                    bend_std, bend_prior, referenced)
 
@@ -285,7 +310,9 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
     if timing.choice.ticked:
         return timing
     chooser, best = Chooser(parts, declared), timing.choice.best
-    fit = chooser.fit(best, timing.choice.fit.starts)
+    # other stretches may have other sidebands
+    starts = {name: start for name, start in timing.choice.fit.starts.items() if name != SIDEBANDS}
+    fit = chooser.fit(best, starts)
     choice = replace(timing.choice, fits={**timing.choice.fits, best: fit},
                      setting=chooser.setting)
     findings = tuple(_findings(chooser, choice, declared))
@@ -329,6 +356,8 @@ def _findings(chooser: Chooser, choice: Choice, declared: Sequence[Effect]) -> l
     if _CLOCK in choice.fit.columns and JITTER not in choice.best:
         beside = _beside_the_clock(chooser, choice)
         found += [beside] if beside else []
+    if other_clock := _other_clock(chooser):
+        found.append(other_clock)
     speed = _of_speed(choice, declared)
     return [*found, speed] if speed else found
 
@@ -423,6 +452,21 @@ def _beside_the_clock(chooser: Chooser, choice: Choice) -> Finding | None:
     effect, errors = found
     return Finding(EXCESS, effect, errors, float(special.chdtrc(1, 2.0 * gain)),
                    f'{effect.summary} beside those of the grid: {_sizes(effect, errors)}')
+
+
+def _other_clock(chooser: Chooser) -> Finding | None:
+    """Return the coarsest clock there may be where a declared one cannot have made the pulses."""
+    known = chooser.declared.get(_CLOCK)
+    if not isinstance(known, KeyphasorQuantisation) or _CLOCK in chooser.patterns:
+        return None
+    coarsest = coarsest_clock(np.concatenate([
+        item.setting.times[item.measured] for item in chooser.data.stretches]))
+    if coarsest is None or known.clock_rate > (1.0 - SAME_RATE) * coarsest:
+        return None
+    return Finding(
+        _CLOCK, replace(known, clock_rate=coarsest), {'clock_rate': None}, 0.0,
+        f'the pulse times are on no grid of {known.clock_rate:.6g} Hz, as it is declared; no '
+        f'clock slower than {coarsest:.3g} Hz could have made them', gain=-math.inf)
 
 
 def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.effects.timing import PULSES, SOURCE
+from sa_jitter_ros.effects.timing import MOTION, PULSES, SOURCE
 from sa_jitter_ros.inference.timing_choice import Choice, Chooser, SIDEBANDS
 from sa_jitter_ros.inference.timing_data import ALIASES, steering, Stretch, TimingData
 from sa_jitter_ros.inference.timing_fit import JITTER, TimingFit
@@ -55,9 +55,10 @@ class Check:
 
 
 def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
-    """Return all checks of the best fit; none where the ticks of a clock hide what is left."""
+    """Return all checks of the best fit; few where the ticks of a clock hide what is left."""
+    torsion = _torsion(chooser.data.stretches)
     if choice.ticked:
-        return ()
+        return torsion
     # of a motion of the source nothing is known but its bandwidth, and nothing by other pulses
     directions = [PULSES, *([] if chooser.data.referenced or any(
         EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
@@ -67,11 +68,11 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
                   for alias in range(ALIASES.size)), key=lambda item: item.p_value)
              for direction in directions for check in (_power, _sinusoid)]
     if chooser.on_ticks(fit):  # near the edges of ticks, jitter makes errors of a whole one
-        return tuple(found)
+        return (*found, *torsion)
     lasting = [name for name, item in fit.spectra.items()
                if name in EFFECTS and len(item.upper) > 1]
-    return (*found, _shape(chooser, choice), *(_events(chooser, choice, name) for name in lasting),
-            _steadiness(chooser, choice))
+    return (*found, *torsion, _shape(chooser, choice),
+            *(_events(chooser, choice, name) for name in lasting), _steadiness(chooser, choice))
 
 
 def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
@@ -116,6 +117,21 @@ def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     return Check(-math.expm1(count * math.log1p(-math.exp(-max(float(size[top]), 1e-9)))),
                  direction, data.unit * math.sqrt(2.0 * size[top] / known[top] / data.longest),
                  f'a sinusoid of the {direction} of {frequency[top]:.4g} cycles a trigger cycle')
+
+
+def _torsion(stretches: Sequence[Stretch]) -> tuple[Check, ...]:
+    """
+    Test whether the pulse times move as the sidebands say that the shaft twists.
+
+    The lines are steady beside their sidebands, so that no recovery shows what averages lose.
+    """
+    found = [(len(item.sidebands), item.torsion) for item in stretches if item.torsion]
+    return tuple(Check(
+        min(1.0, count * torsion.p_value), MOTION, torsion.bend / math.sqrt(30.0),  # of u (1 - u)
+        f'the shaft twists steadily, {torsion.frequency:.3g} times a trigger cycle or a whole '
+        'number more: the lines have sidebands there, the pulse times move with them, and '
+        'averages lose what the angle between the pulses misses of it')
+        for count, torsion in found)
 
 
 def _told(fit: TimingFit, inverse: Array) -> Array:

@@ -42,6 +42,20 @@ FEWEST = 12
 
 
 @dataclass(frozen=True)
+class Torsion:
+    """
+    A steady torsion of the shaft that sidebands and pulse times show alike.
+
+    It turns by `frequency` cycles a trigger cycle, or by whole ones more, and bends the cycles by
+    `bend` (s, RMS); `p_value` is the chance of the sinusoid in the pulse times.
+    """
+
+    frequency: float
+    bend: float
+    p_value: float
+
+
+@dataclass(frozen=True)
 class Stretch:
     """
     Consecutive trigger pulses and what was recovered at them.
@@ -52,8 +66,8 @@ class Stretch:
     shrunk, with the noise `bend_std` that a prior of `bend_prior_std` left. Against a reference
     keyphasor (`referenced`) no motion of the source shows. `sidebands` (k,) are those of several
     lines, in cycles a trigger cycle from them, `twist` (s) the RMS of the bends that they stand
-    for if the shaft twists. Without a line that holds the angle to the pulses
-    (`held`) any drift between them may be there.
+    for if the shaft twists, `torsion` the surest of these twists. Without a line that holds the
+    angle to the pulses (`held`) any drift between them may be there.
     """
 
     setting: Setting
@@ -67,6 +81,7 @@ class Stretch:
     referenced: bool = False
     sidebands: Array = field(default_factory=lambda: np.zeros(0))
     twist: float = 0.0
+    torsion: Torsion | None = None
     held: bool = True
 
 

@@ -33,7 +33,7 @@ from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
-from sa_jitter_ros.effects.timing import Pattern, SOURCE
+from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
@@ -66,6 +66,7 @@ _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
 _UNSEEN = 'nothing of it shows in this recording'
+_TAKEN = 'it is declared, and nothing tells whether it is there: it is taken as declared'
 _AS_DECLARED = 'it is declared, and shows no other numbers than these'
 _FEWEST = 4
 _HELD_OUT = 6
@@ -206,10 +207,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
                          names=frozenset())
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
-        without, with_it = (predict(observation.model, known) for known in (
-            others, [*others, effect]))
-        return float(max(np.abs(getattr(with_it, name) - getattr(without, name)).max()
-                         for name in ('mean_attenuation', 'standard_deviation')))
+        return _published_change(observation, others, [*others, effect])
 
     known = [item.name for item in declared]
     if bench is None:
@@ -239,6 +237,14 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         {**{row.name: absent(row.name, _UNSEEN).probability for row in rows},
          **_probabilities(None, tried), **{item.name: item.probability for item in found}},
         reason)
+
+
+def _published_change(observation: Observation, without: Sequence[Effect],
+                      with_them: Sequence[Effect]) -> float:
+    """Return the largest change by effects of what is published: mean and scatter of an order."""
+    before, after = (predict(observation.model, known) for known in (without, with_them))
+    return float(max(np.abs(getattr(after, name) - getattr(before, name)).max()
+                     for name in ('mean_attenuation', 'standard_deviation')))
 
 
 def require_acquisitions(observation: Observation) -> None:
@@ -312,11 +318,12 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     attenuation, _, amplitude = bench.observed(everything)
     rows = limits(timing, evidence, [item.name for item in (*chosen, *present)])
     named = {item.name for item in candidates}
+    assumed = [item.name for item in bench.assumed]
     for name in EFFECTS:
         if name in named:
             continue
         if name in known:
-            reason = _AS_DECLARED
+            reason = _TAKEN if name in assumed else _AS_DECLARED
         elif timing is not None and name in timing.probabilities:
             reason = ('the likelihood of the timing gains nothing by it: probability '
                       f'{timing.probabilities[name]:.2g}')
@@ -331,7 +338,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         as_declared.expect((), everything, unsteadiness=own),
         bench.expect(effects, everything, unsteadiness=own), evidence,
         'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
-        rows, _undecided(partial(bench.change, chosen=_few(bench)), effects, rows),
+        rows, (*_undecided(partial(bench.change, chosen=_few(bench)), effects, rows), *assumed),
         _probabilities(timing, candidates), noise=noise)
 
 
@@ -367,7 +374,11 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
                   and item.effect is not None and item.name != _SPEED]
         effect = finding.effect
         assert effect is not None
-        finding = replace(finding, largest_change=bench.change(others, effect))
+        change = bench.change(others, effect)
+        if known:  # measured pulses may tell what a prediction on line has to know
+            change = max(change, _published_change(
+                bench.observation, [*others, known], [*others, effect]))
+        finding = replace(finding, largest_change=change)
         matters = finding.largest_change >= least_change(effect)
         (chosen if matters else present).append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
@@ -484,7 +495,7 @@ def _unexplained(bench: Bench, timing: Timing | None, chosen: Sequence[Finding])
     chance = FALSE_ALARM / max(len(of_timing) + len(of_lines), 1)
     left = [check for check in (*of_timing, *of_lines) if check.p_value < chance and (
         check in of_lines or (0.5 * (rad * check.size) ** 2 > ACCURACY
-                              and not (check.direction == SOURCE and _SPEED in names)))]
+                              and not (check.direction != PULSES and _SPEED in names)))]
     return min(left, key=lambda check: check.p_value, default=None)
 
 

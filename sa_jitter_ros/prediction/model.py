@@ -102,7 +102,8 @@ class DeclaredModel:
             limit = 0.5 * self.sample_rate / self.fundamental_frequency
             raise ModelError(
                 f'order {highest:g} is above the Nyquist order {limit:g} of vibration sampled at '
-                f'{self.sample_rate:g} Hz: drop it, or raise sample_rate')
+                f'{self.sample_rate:g} Hz: drop it, or raise sample_rate, if trigger_speed, '
+                f'{self.trigger_speed:g}, is in Hz')
         width = self.distribution.width
         if not width < self.trigger_period:
             raise ModelError(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+_FEWEST = 3  # pulses that tell a unit
 _MUCH = 10.0  # pulses that span so many times the vibration are in another unit
 _FACTOR = 2.0  # by which spans may differ in the right unit
 # Spread of the logarithm of the spans: a tach is often shorter than the vibration, seldom longer.
@@ -67,7 +68,7 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
     ('unit_epoch', 1700000000.0)
     """
     times = pulses[np.isfinite(pulses)].astype(np.float64)
-    if times.size < 2 or end <= start:
+    if times.size < _FEWEST or end <= start:
         return ()
     backwards = int(np.count_nonzero(np.diff(times) < 0.0))
     if 2 * backwards >= times.size:

@@ -25,6 +25,9 @@ FloatArray = NDArray[np.float64]
 _MOST_LOST = 0.5  # of the samples
 _AT_END = 0.02  # of the samples, at the very same largest or smallest value
 _FEWEST = 16
+# Samples after a first one that repeat its value if a channel is stuck; of its smallest change,
+# what its samples change by at least where a contact, and not a coarse converter, makes them.
+_STUCK, _COARSE = 32, 8.0
 _FIRST_VALUES = 4_000_000  # of a recording, in which its channels are judged
 
 
@@ -40,10 +43,12 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
     """
     found: dict[int, str] = {}
     for channel, values in enumerate(samples):
-        finite = values[np.isfinite(values)]
+        held = stuck(values)
+        finite = values[np.isfinite(values) & ~held]
         if finite.size < (1.0 - most_lost) * values.size:
             share = 1.0 - finite.size / values.size
-            found[channel] = f'is NaN or infinite in {100.0 * share:.3g}% of its samples'
+            found[channel] = (f'is NaN or infinite{" or stuck at one value" if held.any() else ""}'
+                              f' in {100.0 * share:.3g}% of its samples')
         elif finite.size < _FEWEST:
             continue
         elif np.ptp(finite) < LEAST_RANGE:
@@ -56,6 +61,32 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
                     np.unique(finite[:4096]).size > 8):
                 found[channel] = f'is saturated in {top + bottom:.0%} of its samples'
     return found
+
+
+def stuck(values: FloatArray) -> NDArray[np.bool_]:
+    """
+    Return which samples (sample,) of a channel repeat one value, as a loose contact makes them.
+
+    Those at the ends of the range are saturated, not stuck. A signal of few values, or one that is
+    stuck for most of its time, has none.
+
+    >>> values = np.sin(0.7 * np.arange(200.0))
+    >>> values[50:90] = 0.0
+    >>> np.flatnonzero(stuck(values))[[0, -1]]
+    array([50, 89])
+    """
+    found = np.zeros(values.size, np.bool_)
+    with np.errstate(invalid='ignore'):  # of infinities
+        change = np.abs(np.diff(values))
+    moves = change[change > 0.0]
+    if moves.size < _FEWEST or np.median(moves) < _COARSE * moves.min():
+        return found
+    edges = np.flatnonzero(np.append(change, 1.0) != 0.0)  # last samples of runs; NaN is none
+    first = np.append(0, edges[:-1] + 1)
+    inside = (values[edges] > np.nanmin(values)) & (values[edges] < np.nanmax(values))
+    for begin, end in zip(*(side[inside & (edges - first >= _STUCK)] for side in (first, edges))):
+        found[begin:end + 1] = True
+    return found if np.mean(found) < _MOST_LOST else np.zeros(values.size, np.bool_)
 
 
 def channel_faults(recording: Recording, *, most_lost: float = _MOST_LOST) -> dict[int, str]:

@@ -37,12 +37,13 @@ Json = Any
 
 def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SHAFT,
            models: Mapping[str, DeclaredModel] = MappingProxyType({}), unit: str = '',
-           created: str = '') -> Mapping[str, Json]:
+           created: str = '', faults: Sequence[str] = ()) -> Mapping[str, Json]:
     """
     Return the content of `report.json`; undefined numbers are None.
 
     `shaft` is the name of the shaft, `models` are those of all shafts that are declared beside it;
-    `unit` is that of the vibration, `created` the time of the analysis.
+    `unit` is that of the vibration, `created` the time of the analysis; `faults` of the recordings
+    are the first remarks.
     """
     observation = trace.observation
     orders = observation.orders
@@ -63,7 +64,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'created': created,
         'version': __version__,
         'parameter_file': new_section(trace, models or {shaft: observation.model}),
-        'remarks': [*observation.pulses.remarks, *_not_compared(trace)],
+        'remarks': [*faults, *observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
         'against': 'reference keyphasor' if observation.against_reference else 'vibration',
