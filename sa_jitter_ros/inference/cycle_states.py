@@ -33,7 +33,7 @@ from sa_jitter_ros.effects.clock_skew import USUAL_SKEW
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.bordered import Solved
 from sa_jitter_ros.inference.order_band import BEYOND_LINES, EDGE, OrderBand
-from sa_jitter_ros.prediction.influence import trigger_periods
+from sa_jitter_ros.prediction.influence import common_turn
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_solve
 
@@ -125,9 +125,8 @@ class States:
 
     @property
     def common_turn(self) -> Array:
-        """Return the time that one turn of all lines takes at each pulse, 1 in the mean."""
-        period = trigger_periods(self.times - self.states[:, 0])
-        return np.asarray(period / period[self.measured].mean())
+        """Return how long a turn of all lines takes at each pulse, 1 in the mean."""
+        return common_turn(self.times - self.states[:, 0], self.measured)
 
     @property
     def transformed(self) -> int:

@@ -81,8 +81,7 @@ def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
         elif name == SpeedFluctuation.name:
             effect = _of_speed(timing)
         elif isinstance(kind.timing, Pattern) and kind.timing.replaces_jitter:
-            lower = coarsest_clock(np.concatenate([
-                item.setting.times[item.measured] for item in timing.chooser.data.stretches]))
+            lower = coarsest_clock(timing.chooser.data.pulse_times)
         else:
             effect = largest(timing, name)
         parameter, limit = next(iter(parameter_ranges(kind).items()))

@@ -95,7 +95,7 @@ def follow_speed(states: States) -> int:
         return 1
     states.make_tables()
     each = np.stack([states.sums(row) for row in states.vibration]).conj()
-    count, best, errors = 1, _SLOPE_GAIN * states.declared, np.zeros(period.size)
+    count, best = 1, _SLOPE_GAIN * states.declared
     for moved, most in ((np.ones(period.size), USUAL_DELAY), (since, USUAL_SKEW)):
         turned = pace * moved
         step = _FINE / (states.orders.max() * float(np.ptp(turned)))
@@ -110,10 +110,11 @@ def follow_speed(states: States) -> int:
         gained = score[top] - score[tried.size // 2]
         if gained > best and np.mean(chance < FALSE / tried.size) > _SLOPE_LINES:
             best, errors = gained, tried[top] * moved
+            states.by_speed = errors - errors.mean() * states.common_turn
         count += tried.size
-    states.by_speed = errors - period * (errors.mean() / period.mean())
-    states.states[:, 0] = states.by_speed
-    states.read()
+    if states.by_speed.any():
+        states.states[:, 0] = states.by_speed
+        states.read()
     return count
 
 

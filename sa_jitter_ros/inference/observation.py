@@ -37,7 +37,7 @@ from sa_jitter_ros.inference.order_band import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
-from sa_jitter_ros.prediction.influence import mean_period, trigger_periods
+from sa_jitter_ros.prediction.influence import common_turn, mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
 from sa_jitter_ros.recordings.channel_check import stuck
@@ -351,7 +351,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
     span = slice(pulses.number[first], pulses.number[first + count] + 1)
     bridged, measured = pulses.bridged[span], numbered(missing)
     late = recovery.bridged_errors[span]
-    late = late - _common_turn(late[measured].mean(), bridged - late, measured)
+    late = late - late[measured].mean() * common_turn(bridged - late, measured)
     errors, standard_errors = late[measured], recovery.bridged_standard_errors[span][measured]
     ripple = recovery.ripple[span.start + measured[:-1]]
     ripple_is_clear = np.mean(ripple**2) > _RIPPLE * (
@@ -365,7 +365,7 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         corrected_law = law
         errors = times - pulses.reference[span][measured]
         better = pulses.reference[span.start - law.before:span.stop + law.after]
-        corrected_pulses = better + _common_turn(errors.mean(), better, law.before + measured)
+        corrected_pulses = better + errors.mean() * common_turn(better, law.before + measured)
     errors = errors - errors.mean()
     corrects_ripple = pulses.reference is None and ripple_is_clear and not reason
     corrected_ripple = ripple if corrects_ripple else None
@@ -380,19 +380,6 @@ def _acquire(reader: CycleReader, pulses: RecordPulses, recovery: RecordRecovery
         first, times, missing, bridged, errors, standard_errors, raw, clean_cycles,
         radial_noise(clean_cycles), floor, ripple, recovery.ripple_standard_error, not reason,
         reason)
-
-
-def _common_turn(mean: float, times: FloatArray, measured: NDArray[np.int64]) -> FloatArray:
-    """
-    Return the turn that errors with a `mean` (s) have in common, in s at each of the true `times`.
-
-    It takes longer where the shaft is slow. Only the `measured` pulses count; NaN where any time
-    is unknown.
-    """
-    if not np.all(np.isfinite(times)):
-        return np.full(times.size, np.nan)
-    period = trigger_periods(times)
-    return np.asarray(period * (mean / period[measured].mean()))
 
 
 def _clean(cycles: ComplexArray, model: DeclaredModel, sources: FloatArray) -> ComplexArray:

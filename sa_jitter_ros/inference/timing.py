@@ -459,8 +459,7 @@ def _other_clock(chooser: Chooser) -> Finding | None:
     known = chooser.declared.get(_CLOCK)
     if not isinstance(known, KeyphasorQuantisation) or _CLOCK in chooser.patterns:
         return None
-    coarsest = coarsest_clock(np.concatenate([
-        item.setting.times[item.measured] for item in chooser.data.stretches]))
+    coarsest = coarsest_clock(chooser.data.pulse_times)
     if coarsest is None or known.clock_rate > (1.0 - SAME_RATE) * coarsest:
         return None
     return Finding(

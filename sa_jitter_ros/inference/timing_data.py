@@ -135,6 +135,11 @@ class TimingData:
         """Return whether the errors are those against a reference keyphasor."""
         return self.stretches[0].referenced
 
+    @property
+    def pulse_times(self) -> Array:
+        """Return when the pulses of all stretches were measured (pulse,), in s."""
+        return np.concatenate([item.setting.times[item.measured] for item in self.stretches])
+
     def _series(self, item: Stretch) -> Array:
         """Return the series (pulse - 2, 3) of a stretch; a missing pulse has no error."""
         n = item.errors.size - 2

@@ -205,6 +205,19 @@ def trigger_periods(times: Array) -> Array:
     return np.asarray(savgol_filter(times, window, min(3, window - 1), deriv=1))
 
 
+def common_turn(times: Array, counted: Array) -> Array:
+    """
+    Return how long a turn of all takes at each of the true `times` (s), 1 in the mean.
+
+    It takes longer where the shaft is slow. The mean is that of the `counted` pulses; all is NaN
+    where a time is unknown.
+    """
+    if not np.all(np.isfinite(times)):
+        return np.full(times.size, np.nan)
+    period = trigger_periods(times)
+    return np.asarray(period / period[counted].mean())
+
+
 def mean_period(times: Array, missing: Array | None) -> float:
     """Return the mean trigger period in s of pulses of which `missing` (interval,) lack."""
     lost = 0 if missing is None else missing.sum()

@@ -47,8 +47,8 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
         finite = values[np.isfinite(values) & ~held]
         if finite.size < (1.0 - most_lost) * values.size:
             share = 1.0 - finite.size / values.size
-            found[channel] = (f'is NaN or infinite{" or stuck at one value" if held.any() else ""}'
-                              f' in {100.0 * share:.3g}% of its samples')
+            none = 'NaN, infinite or stuck at one value' if held.any() else 'NaN or infinite'
+            found[channel] = f'is {none} in {100.0 * share:.3g}% of its samples'
         elif finite.size < _FEWEST:
             continue
         elif np.ptp(finite) < LEAST_RANGE:
@@ -78,14 +78,16 @@ def stuck(values: FloatArray) -> NDArray[np.bool_]:
     found = np.zeros(values.size, np.bool_)
     with np.errstate(invalid='ignore'):  # of infinities
         change = np.abs(np.diff(values))
-    moves = change[change > 0.0]
+    ends = np.flatnonzero(np.append(change, 1.0) != 0.0)  # last samples of runs; NaN is none
+    long = np.flatnonzero(np.diff(ends, prepend=-1) > _STUCK)
+    moves = change[change > 0.0] if long.size else np.zeros(0)
     if moves.size < _FEWEST or np.median(moves) < _COARSE * moves.min():
         return found
-    edges = np.flatnonzero(np.append(change, 1.0) != 0.0)  # last samples of runs; NaN is none
-    first = np.append(0, edges[:-1] + 1)
-    inside = (values[edges] > np.nanmin(values)) & (values[edges] < np.nanmax(values))
-    for begin, end in zip(*(side[inside & (edges - first >= _STUCK)] for side in (first, edges))):
-        found[begin:end + 1] = True
+    low, high = np.nanmin(values), np.nanmax(values)
+    for run in long.tolist():
+        begin = int(ends[run - 1]) + 1 if run else 0
+        if low < values[begin] < high:
+            found[begin:int(ends[run]) + 1] = True
     return found if np.mean(found) < _MOST_LOST else np.zeros(values.size, np.bool_)
 
 
