@@ -49,6 +49,29 @@ def test_speed_that_rises_and_falls_turns_no_line_but_a_resonance_does(rng, turn
         assert turned.p_value > 0.01
 
 
+@pytest.mark.parametrize('share', [0.0, 0.2, 1.0])
+def test_order_that_turns_by_itself_from_cycle_to_cycle_is_no_common_motion(rng, share):
+    """The highest order turns by 0.5 rad, the others by a `share` of what turns with it."""
+    time = np.arange(int((ACQUISITIONS * CYCLES + 4) / SPEED * RATE)) / RATE
+    waves = np.fft.rfft(rng.standard_normal(time.size))
+    turn = np.fft.irfft(np.where(
+        np.arange(waves.size) < 0.15 * SPEED * time[-1], waves, 0.0), time.size)
+    turn *= 0.5 / turn.std()
+    vibration = sum(
+        size * np.cos(2.0 * np.pi * order * SPEED * time + phase + own * order / 60.0 * turn)
+        for order, size, phase, own in (
+            (20, 1.0, 1.0, share), (40, 1.0, 2.0, share), (60, 0.4, 0.5, 1.0)))
+    vibration += 0.3 * rng.standard_normal(time.size)
+    pulses = np.arange(0.5, SPEED * time[-1]) / SPEED
+    pulses += rng.uniform(-0.5, 0.5, pulses.size) / 20000.0
+    model = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycles=CYCLES,
+                          orders=(20.0, 40.0, 60.0), sample_rate=RATE)
+    observation = observe(Recording(ArraySource(vibration[None]), RATE, pulse_times=pulses), model)
+    found = check_lines(observation, choose_lines(observation), np.zeros(3))[1]
+    assert 'from cycle to cycle' in found.text
+    assert found.p_value > 0.01 if share == 1.0 else found.p_value < 1e-6
+
+
 @pytest.mark.parametrize('event', ['none', 'step', 'loss'])
 def test_gain_of_single_events_is_no_modulation(rng, event):
     """A band of noise is one; a step of the gain, or a signal that is lost for a while, is not."""
@@ -96,6 +119,6 @@ def test_amplitudes_that_share_the_noise_of_the_errors_follow_nothing(noise, see
     model = DeclaredModel(keyphasor_rate=1024.0, trigger_speed=speed, trigger_cycles=10,
                           orders=(1.0, 2.0, 3.0), sample_rate=rate)
     observation = observe(Recording(ArraySource(vibration[None]), rate, pulse_times=pulses), model)
-    # of the first check, that of the turns, another test holds
-    for check in check_lines(observation, choose_lines(observation), np.zeros(3))[1:]:
+    # of the first checks, those of the turns, other tests hold
+    for check in check_lines(observation, choose_lines(observation), np.zeros(3))[2:]:
         assert check.p_value > 0.01

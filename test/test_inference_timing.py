@@ -188,6 +188,62 @@ def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
     assert min(steady) > 0.05 / 6 / 5
 
 
+def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
+    for seed in range(4):
+        parts = [machine([seed, k], count=163, excess=1.0, skew=9.5e-5) for k in range(2)]
+        timing = read_timing(parts)
+        assert timing.choice.best == {'clock_skew', 'jitter_scale'}, seed
+        skew, error = value_of(timing, 'clock_skew', 'skew')
+        assert abs(skew - 9.5e-5) < 4.0 * error
+
+
+def test_declared_bandwidth_that_is_too_small_is_another_number():
+    for seed in range(4):
+        part = machine(seed, wander=2.0, band=(0.0, 0.3))
+        rad = 2.0 * np.pi * MODEL.fundamental_frequency
+        timing = read_timing([part], [EFFECTS['phase_wander'](2.0 * rad * UNIT, 0.09)])
+        assert names_of(timing) == {'phase_wander'}, seed
+        bandwidth, error = value_of(timing, 'phase_wander', 'bandwidth')
+        assert abs(bandwidth - 0.3) < 4.0 * error
+
+
+def test_declared_speed_fluctuation_that_is_not_there_has_size_0():
+    declared = EFFECTS['speed_fluctuation'].of_ripple(2.0 * UNIT, MODEL)
+    for seed in range(4):
+        timing = read_timing([machine(seed, walk=0.0)], [declared])
+        size, error = value_of(timing, 'speed_fluctuation', 'acceleration_std')
+        assert max(size, 2.0 * error) < 0.06 * declared.acceleration_std
+        assert not read_timing([machine(seed, walk=0.0)]).findings
+
+
+def surest(checks, text):
+    return min((check.p_value for check in checks if text in check.text), default=1.0)
+
+
+def test_source_that_moves_as_a_sine_does_is_no_random_motion():
+    text = 'a sinusoid of the source'
+    random = [surest(read_timing([machine(40 + seed, wander=3.0, band=band)]).checks, text)
+              for seed in range(6) for band in ((0.0, 0.3), (0.1, 0.15))]
+    assert min(random) > 0.05 / len(random)
+    for seed in (1, 3, 4):
+        timing = read_timing([machine(seed, wander=6.0, band=(0.2, 0.2001))])
+        assert names_of(timing) == {'phase_wander'}
+        assert surest(timing.checks, text) < 1e-6
+
+
+def test_motion_of_a_few_swings_is_a_drift():
+    for band, few in (((0.0, 0.005), True), ((0.0, 0.1), False)):
+        timing = read_timing([machine(3, wander=4.0, band=band, count=600)])
+        assert 'phase_wander' in names_of(timing)
+        assert (surest(timing.checks, 'a drift of the source') == 0.0) == few
+
+
+def test_memory_is_no_longer_than_a_third_of_a_stretch():
+    parts = [machine([7, k], count=21, excess=3.0, rho=0.8) for k in range(20)]
+    fit = Chooser(parts).fit(frozenset({'correlated_jitter'}))
+    assert 0.6 < np.tanh(fit.starts['correlated_jitter'][1]) <= np.exp(-3.0 / 19.0) + 1e-9
+
+
 @pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])
 def test_effect_that_nobody_knows_is_seen(effect):
     for seed in range(3):

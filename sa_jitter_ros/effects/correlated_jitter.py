@@ -38,7 +38,7 @@ class CorrelatedJitter(Effect):
         'the sensor')
     timing: ClassVar[Spectrum] = Spectrum(
         PULSES, autoregressive, ((0.5, 0.8), (0.5, -0.5), (-1.5, 0.6)), (FAINT, -2.0),
-        (LARGE, 2.6))
+        (LARGE, None))
     std: float = parameter(0.0, 'standard deviation of correlated pulse errors', 's', minimum=0.0)
     correlation: float = parameter(
         0.5, 'correlation of the errors of neighbouring trigger pulses', '1', minimum=-0.999,

@@ -72,15 +72,16 @@ class Spectrum:
 
     `starts` are values of its parameters from which a fit begins, one after the other: the first
     parameter is the logarithm of its power. `lower` and `upper` are bounds; `lower` None stands
-    for the lowest frequency that a recording resolves, as a logarithm. `limited` are those from
-    which on limits are stated, where they are others than `lower`.
+    for the lowest frequency that a recording resolves, as a logarithm, and `upper` None for the
+    longest memory, as artanh of a correlation. `limited` are those from which on limits are
+    stated, where they are others than `lower`.
     """
 
     direction: str
     density: Callable[[Array, Array], Array]
     starts: tuple[tuple[float, ...], ...]
     lower: tuple[float | None, ...]
-    upper: tuple[float, ...]
+    upper: tuple[float | None, ...]
     limited: tuple[float | None, ...] = ()
 
 

@@ -237,17 +237,13 @@ def line_evidence(observation: Observation, lines: Lines) -> LineEvidence:
     floor = lines.of(observation.stacked('noise_floor'))
     density = floor * np.sqrt(0.5 * observation.sample_rate * shortest * model.trigger_period)
     order = observation.orders[lines.order]
-    # What changes from acquisition to acquisition is the machine's own.
     beating = cycles + lines.of(_sidebands(observation, shortest))
     steady = np.abs(beating) / level  # what turns a line is no beat
-    steady -= steady.mean(axis=1, keepdims=True)
     beat = find_beat(steady.reshape(-1, order.size), order,
                      order * model.fundamental_frequency / observation.sample_rate)
-    own = along.mean(axis=1, keepdims=True)
     return LineEvidence(
         order=order, channel=lines.channel, level=level, noise_density=density,
-        radial=own + without_beat(
-            (along - own).reshape(-1, order.size), beat).reshape(along.shape),
+        radial=without_beat(along.reshape(-1, order.size), beat).reshape(along.shape),
         radial_noise=noise * np.sqrt(shortest) / level, tone=tone,
         hidden_tone=_hidden_tone(observation, density), beat=beat)
 

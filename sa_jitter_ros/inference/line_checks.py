@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.evidence import LineEvidence
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.inference.expectation import Lines
-from sa_jitter_ros.inference.gathering import cycle_amplitudes
+from sa_jitter_ros.inference.gathering import cycle_amplitudes, hidden_lines
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing_checks import chance, Check, DRAWS, SEED
 from sa_jitter_ros.inference.timing_data import TAPER, taper
@@ -35,6 +35,7 @@ Array = NDArray[Any]
 
 LINES = 'lines'
 _TURN = 0.03  # rad, or of its amplitude, by which a line of steady machines changes by itself
+_LOSS = 0.14  # rad by which a line that turns in each cycle loses 1 % of its average
 _NEAR = 1.5  # ratio of frequencies whose power is alike
 _EVENTS = 4.5  # kurtosis; a gain that swings by a third loses cycles, which makes 4
 _FOLLOWS = 0.8  # share of the scatter of the amplitudes that a parabola over the speed explains
@@ -128,6 +129,7 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
     return (_turns(ratio, noise, order, run.size - int(run.max()) - 1),
+            _turns_in_cycles(observation, lines),
             *_follows(observation, np.abs(ratio), noise),
             *_beside_errors(observation, lines, noise))
 
@@ -186,6 +188,32 @@ def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
                  f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
                  'average to average, relative to the other orders')
+
+
+def _turns_in_cycles(observation: Observation, lines: Lines) -> Check:
+    """
+    Test whether a line turns by itself from cycle to cycle, beside what turns all of them.
+
+    One that turns much is not worth comparing and is looked at, too. Noise turns a line as much as
+    it makes it longer and shorter.
+    """
+    hidden = hidden_lines(observation, lines)
+    every = Lines(*(np.append(*both) for both in zip(
+        (lines.channel, lines.order), (hidden.channel, hidden.order))))
+    order = observation.orders[every.order]
+    cycles = every.of(cycle_amplitudes(observation))
+    ratio = cycles / cycles.mean(axis=1, keepdims=True) - 1.0
+    noise = np.mean(ratio.real**2, axis=(0, 1))
+    weight = order / noise
+    turn = ratio.imag - np.multiply.outer(ratio.imag @ weight / (weight @ order), order)
+    power = np.mean(turn**2, axis=(0, 1))
+    freedom = len(cycles) * (cycles.shape[1] - 1)
+    own = np.sqrt(np.maximum(power - noise, 0.0))
+    chance = special.fdtrc(freedom, freedom, power / (noise + _LOSS**2))
+    worst = int(np.argmin(chance))
+    return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
+                 f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
+                 'cycle to cycle, relative to the other orders')
 
 
 def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check, ...]:

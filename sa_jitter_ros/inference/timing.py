@@ -472,7 +472,8 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     """
     Return the acceleration of the shaft that bends the angle inside the cycles, if it shows.
 
-    It is part of the `declared` model already where that one is as likely.
+    It is part of the `declared` model already where that one is as likely; where less or nothing
+    of it shows, that is returned.
     """
     fit, setting = choice.fit, choice.setting
     data = fit.data
@@ -500,23 +501,28 @@ def _of_speed(choice: Choice, declared: Sequence[Effect]) -> Finding | None:
     noise = passed * float(np.mean([item.bend_std**2 for item in data.stretches]))
     certainty = power / (noise * math.sqrt(2.0 / count) + 1e-300)
     gain = beyond_chance(0.5 * certainty**2, 1, data.cycles)
-    if power <= 0.0 or gain < ODDS:
-        return None
+    known = next((item for item in declared if isinstance(item, SpeedFluctuation)), None)
     size, size_error = root(power, error)
-    together = float(np.mean(next_)) / power  # correlation of neighbours
-    wrong = _mean(np.array(next_) - together * np.array(parts))[1] / power
-    below = max(ripple_correlation(slow_band(WIDEST, ACCELERATION_BAND)) - together, 0.0)
-    if beyond_chance(0.5 * (below / wrong) ** 2, 1, data.cycles) > ODDS:  # a line that comes by
-        return None
-    low, bandwidth, high = band_of_ripple(together + wrong * np.array([1.0, 0.0, -1.0])).tolist()
-    effect = SpeedFluctuation.of_ripple(size, setting.model, bandwidth)
-    if not possible(effect, setting.model):
-        return None
-    errors = {'acceleration_std': effect.acceleration_std * size_error / size}
-    if low < high:  # not the widest band
-        errors['bandwidth'] = 0.5 * (high - low)
-    if any(known.name == _SPEED and not departs(effect, errors, known, data.cycles)
-           for known in declared):
+    if power <= 0.0 or gain < ODDS:
+        if known is None:
+            return None
+        effect, wrong = (SpeedFluctuation.of_ripple(value, setting.model, known.bandwidth)
+                         for value in (size, size_error))
+        errors = {'acceleration_std': wrong.acceleration_std}
+    else:
+        together = float(np.mean(next_)) / power  # correlation of neighbours
+        off = _mean(np.array(next_) - together * np.array(parts))[1] / power
+        below = max(ripple_correlation(slow_band(WIDEST, ACCELERATION_BAND)) - together, 0.0)
+        if beyond_chance(0.5 * (below / off) ** 2, 1, data.cycles) > ODDS:  # a line that comes by
+            return None
+        low, bandwidth, high = band_of_ripple(together + off * np.array([1.0, 0.0, -1.0])).tolist()
+        effect = SpeedFluctuation.of_ripple(size, setting.model, bandwidth)
+        if not possible(effect, setting.model):
+            return None
+        errors = {'acceleration_std': effect.acceleration_std * size_error / size}
+        if low < high:  # not the widest band
+            errors['bandwidth'] = 0.5 * (high - low)
+    if known is not None and not departs(effect, errors, known, data.cycles):
         return None
     return Finding(
         _SPEED, effect, errors, float(special.ndtr(-certainty)),

@@ -35,7 +35,9 @@ _DECLARED, _SCALED, _TICKS = 'declared', 'scaled', 'ticks'
 DRAWS, SEED = 400, 11
 _BINS = 5  # of frequency, whose excess power is taken together
 _SLOWEST = 2.5  # cycles in a stretch: slower sinusoids are drift
+_BESIDE = 8  # frequencies on either side of a sinusoid that show what is there without it
 _FEWEST = 40  # pulses whose distribution is looked at
+_FEW_VALUES = 12.0  # six swings, below which a random motion is not told from a drift
 _TAIL = 0.1  # share of the draws that are their tail
 
 
@@ -59,20 +61,23 @@ def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     torsion = _torsion(chooser.data.stretches)
     if choice.ticked:
         return torsion
-    # of a motion of the source nothing is known but its bandwidth, and nothing by other pulses
-    directions = [PULSES, *([] if chooser.data.referenced or any(
-        EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys()) else [SOURCE])]
+    tests = [(_power, PULSES), (_sinusoid, PULSES)]
+    if not chooser.data.referenced:  # other pulses show nothing of the source
+        # of a motion of the source nothing is known but its bandwidth, and that it has one
+        moves = any(EFFECTS[name].pulse_times_correct for name in choice.best & EFFECTS.keys())
+        tests += [(_narrow, SOURCE)] if moves else [(_power, SOURCE), (_sinusoid, SOURCE)]
     fit = choice.fit
     # where a smooth motion does not end, nothing is known: it may leave out any frequency
     found = [max((check(fit, fit.beside_motion(alias), direction)
                   for alias in range(ALIASES.size)), key=lambda item: item.p_value)
-             for direction in directions for check in (_power, _sinusoid)]
+             for check, direction in tests]
     if chooser.on_ticks(fit):  # near the edges of ticks, jitter makes errors of a whole one
         return (*found, *torsion)
     lasting = [name for name, item in fit.spectra.items()
                if name in EFFECTS and len(item.upper) > 1]
     return (*found, *torsion, _shape(chooser, choice),
-            *(_events(chooser, choice, name) for name in lasting), _steadiness(chooser, choice))
+            *(_events(chooser, choice, name) for name in lasting),
+            *(_drift(choice, name) for name in lasting), _steadiness(chooser, choice))
 
 
 def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
@@ -104,18 +109,42 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
 
 def _sinusoid(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid in a direction stands out; `inverse` is as in `_power`."""
+    size, unit = _waves(fit, inverse, direction)
+    return _highest(fit, inverse, direction, size, unit, np.exp(-size))
+
+
+def _narrow(fit: TimingFit, inverse: Array, direction: str) -> Check:
+    """Test whether a sinusoid stands out of a random motion whose spectrum nobody knows."""
+    size, unit = _waves(fit, inverse, direction)
+    count = len(fit.data.lengths)  # ordinates of each frequency
+    apart = np.arange(3 * count, (3 + _BESIDE) * count)
+    apart = np.arange(size.size)[:, None] + np.concatenate([-apart, apart])
+    inside = (apart >= 0) & (apart < size.size)
+    beside = np.sum(inside * size[apart.clip(0, size.size - 1)], axis=1)
+    known = np.count_nonzero(inside, axis=1)
+    ratio = size / np.maximum(known, beside)
+    return _highest(fit, inverse, direction, size, unit, (1.0 + ratio) ** -known)
+
+
+def _waves(fit: TimingFit, inverse: Array, direction: str) -> tuple[Array, Array]:
+    """Return the power of sinusoids (ordinate,) over the expected one, and that of a unit one."""
     data = fit.data
-    frequency = data.each
-    tried = (frequency > _SLOWEST / data.longest) & _told(fit, inverse)[data.bin]
     inverse = inverse[data.bin]
     wave = np.einsum('fij,fj->fi', data.passed, steering(direction, data.frequency, data.frequency)
                      )[data.bin]
     known = np.einsum('fi,fij,fj->f', wave.conj(), inverse, wave).real
-    size = np.abs(np.einsum('fi,fij,fj->f', wave.conj(), inverse, fit.left)) ** 2 / known
-    top = int(np.argmax(np.where(tried, size, 0.0)))
+    return np.abs(np.einsum('fi,fij,fj->f', wave.conj(), inverse, fit.left)) ** 2 / known, known
+
+
+def _highest(fit: TimingFit, inverse: Array, direction: str, size: Array, unit: Array,
+             by_chance: Array) -> Check:
+    """Return the test of the sinusoid that is there least `by_chance` (ordinate,)."""
+    data, frequency = fit.data, fit.data.each
+    tried = (frequency > _SLOWEST / data.longest) & _told(fit, inverse)[data.bin]
+    top = int(np.argmin(np.where(tried, by_chance, 2.0)))
     count = int(np.count_nonzero(tried))
-    return Check(-math.expm1(count * math.log1p(-math.exp(-max(float(size[top]), 1e-9)))),
-                 direction, data.unit * math.sqrt(2.0 * size[top] / known[top] / data.longest),
+    return Check(-math.expm1(count * math.log1p(-min(float(by_chance[top]), 1.0 - 1e-9))),
+                 direction, data.unit * math.sqrt(2.0 * size[top] / unit[top] / data.longest),
                  f'a sinusoid of the {direction} of {frequency[top]:.4g} cycles a trigger cycle')
 
 
@@ -176,6 +205,23 @@ def _events(chooser: Chooser, choice: Choice, name: str) -> Check:
                  data.unit * math.sqrt(float(np.average(made, weights=data.size))),
                  f'the pulse errors have the memory of {name}, but come from single events, each '
                  'of which fades (skewness, kurtosis)')
+
+
+def _drift(choice: Choice, name: str) -> Check:
+    """
+    Test whether an effect is so slow that the recording holds few independent values of it.
+
+    Those are the cycles times the bandwidth of a flat spectrum whose power scatters as much. Of a
+    few swings nobody can tell a random motion from any other drift.
+    """
+    fit, data = choice.fit, choice.fit.data
+    made = fit.density(name, fit.parameters)[0]
+    power = float(np.average(made, weights=data.size))
+    values = data.cycles * power**2 / float(np.average(made**2, weights=data.size))
+    return Check(0.0 if values < _FEW_VALUES else 1.0, fit.moves(name),
+                 data.unit * math.sqrt(power),
+                 f'a drift of the {fit.moves(name)}, of which the recording holds about '
+                 f'{values:.2g} independent values: too few to tell {name} from any other one')
 
 
 def _minimum_phase(log_power: Array) -> Array:

@@ -295,8 +295,12 @@ class Chooser:
         return density
 
     def fit(self, names: frozenset[str], start: Mapping[str, Array] | None = None, *,
-            held: Mapping[tuple[str, int], float] | None = None) -> TimingFit:
-        """Return the fit of a set; `held` maps (name, number) to a parameter that stays."""
+            anew: bool = False, held: Mapping[tuple[str, int], float] | None = None) -> TimingFit:
+        """
+        Return the fit of a set, from where it may `start`, and also `anew`.
+
+        `held` maps (name, number) to a parameter that stays.
+        """
         if not held and names in self.fits:
             return self.fits[names]
         fixed: list[tuple[str, Callable[[Array], Array]]] = []
@@ -306,6 +310,7 @@ class Chooser:
             sizes = effect.in_timing(self.setting)
             if isinstance(effect.timing, Spectrum):
                 if name in names:
+                    anew |= name not in start
                     start.setdefault(name, sizes)
                 else:
                     fixed.append((effect.timing.direction,
@@ -317,8 +322,9 @@ class Chooser:
             if name in spectra and spectra[name].limited:
                 spectra[name] = replace(spectra[name], lower=spectra[name].limited)
         patterns = {name: self.patterns[name] for name in sorted(names) if name in self.patterns}
-        new = [[(name, np.array(first)) for first in item.starts] for name, item in spectra.items()
-               if name not in start]
+        new = [[*([(name, start[name])] if name in start else []),
+                *((name, np.array(first)) for first in item.starts)]
+               for name, item in spectra.items() if anew or name not in start]
         found = max((TimingFit(
             self.data, spectra, patterns, scaled=JITTER in names, fixed=fixed,
             known=known, start={**start, **dict(some)}, held=held) for some in product(*new)),
@@ -343,8 +349,10 @@ class Chooser:
             moves += [best - {name} for name in best]
             moves += [(best - {name}) | {other} for name in best for other in pool
                       if other not in best]
-            scores = {move: self.score(move, self.fit(move, self._start(best, move)))
-                      for move in moves}
+            # what a pattern explains leaves random errors of another kind
+            scores = {move: self.score(move, self.fit(
+                move, self._start(best, move), anew=bool(move - best & self.patterns.keys())))
+                for move in moves}
             better = max(scores, key=lambda move: scores[move])
             if scores[better] <= top:
                 break

@@ -17,7 +17,7 @@ is smooth, of the declared jitter, of the noise of the recovery, and of random e
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import count
 import math
 from typing import Any
@@ -39,21 +39,30 @@ _KNOTS = 5
 _EDGE_SLOPE = 1.4, 0.4  # of the motion beyond half the trigger rate, and how surely
 _SMOOTH = 3.0  # change of the slope of a free spectrum between knots
 _NOISE_KNOWN = 0.5  # what the logarithm of the noise power is known to
+_MEMORIES = 3.0  # least number of memories in a stretch: longer ones look like a drift
 _CURVED = float(np.sqrt(ROUNDING))  # step of a parameter by which a curvature is measured
 
 
-def shaft_density(parameters: Array, frequency: Array, lowest: float) -> Array:
-    """Return a density of motion that is free at some frequencies of a trigger cycle."""
-    knots, place = _knots(lowest), np.log(frequency)
-    level = np.interp(place, knots, parameters[:_KNOTS])
-    level = np.where(frequency > 0.5, parameters[_KNOTS - 1] - np.exp(parameters[_KNOTS]) * (
-        place - knots[-1]), level)
-    return np.asarray(np.exp(level) / (2.0 * np.pi * frequency) ** 4)
+class ShaftSpectrum:
+    """A density of motion that is free at some frequencies of a trigger cycle."""
 
+    def __init__(self, frequency: Array, lowest: float) -> None:
+        """Take the frequencies (...), in cycles a trigger cycle; the first knot is `lowest`."""
+        knots, place = np.linspace(math.log(lowest), math.log(0.5), _KNOTS), np.log(frequency)
+        self._knots = np.stack([np.interp(place, knots, unit) for unit in np.eye(_KNOTS)])
+        self._beyond = np.maximum(place - knots[-1], 0.0)
+        self._motion = (2.0 * np.pi * frequency) ** -4
 
-@lru_cache(maxsize=16)
-def _knots(lowest: float) -> Array:
-    return np.linspace(math.log(lowest), math.log(0.5), _KNOTS)
+    def density(self, parameters: Array) -> Array:
+        """Return the density: its logarithm at the knots, and that of the slope beyond them."""
+        level = np.tensordot(parameters[:_KNOTS], self._knots, 1)
+        return np.asarray(self._motion * np.exp(
+            level - np.exp(parameters[_KNOTS]) * self._beyond))
+
+    def slopes(self, parameters: Array, density: Array) -> Array:
+        """Return by how much a `density` grows with each of its parameters (parameter, ...)."""
+        steeper = -np.exp(parameters[_KNOTS]) * self._beyond
+        return np.asarray(density * np.concatenate([self._knots, steeper[None]]))
 
 
 class TimingFit:
@@ -74,7 +83,7 @@ class TimingFit:
                  held: Mapping[tuple[str, int], float] | None = None) -> None:
         self.data, self.spectra, self.patterns = data, spectra, patterns
         self.free_jitter = scaled or any(item.replaces_jitter for item, _ in patterns.values())
-        self.lowest = APART / data.longest
+        self._shaft = ShaftSpectrum(data.alias, APART / data.longest)
         self.columns, total = {}, 0
         stack = []
         for name, (_, columns) in patterns.items():
@@ -116,7 +125,9 @@ class TimingFit:
         for name, item in self.spectra.items():
             lower = tuple(np.log(1.0 / self.data.longest) if low is None else low
                           for low in item.lower)
-            blocks[name] = item.starts[0], lower, item.upper
+            upper = tuple(math.atanh(math.exp(-_MEMORIES / self.data.longest))
+                          if high is None else high for high in item.upper)
+            blocks[name] = item.starts[0], lower, upper
         self.place, begin = {}, 0
         for name, (first, _, _) in blocks.items():
             self.place[name] = slice(begin, begin + len(first))
@@ -158,7 +169,7 @@ class TimingFit:
         """Return the power of a random component at each frequency (alias, bin), in unit^2."""
         values, alias = parameters[self.place[name]], self.data.alias
         if name == SHAFT:
-            return shaft_density(values, alias, self.lowest)
+            return self._shaft.density(values)
         if name == JITTER:
             return white(values, alias)
         return self.spectra[name].density(values, alias)
@@ -215,15 +226,21 @@ class TimingFit:
                 along[direction] = np.einsum('fij,afji->af', change, data.steer[direction]).real
                 if direction == PULSES:
                     along[direction] = along[direction] * data.measured
-            base = self.density(name, parameters)
-            for i in range(place.start, place.stop):
-                moved = parameters.copy()
-                moved[i] += ROUNDING
-                step = (self.density(name, moved) - base) / ROUNDING
-                if direction == PULSES:
-                    step = step[:1]
-                slope[i] += np.sum(step * along[direction])
+            slopes = self._slopes(name, parameters)
+            if direction == PULSES:
+                slopes = slopes[:, :1]
+            slope[place] += np.einsum('paf,af->p', slopes, along[direction])
         return value, slope
+
+    def _slopes(self, name: str, parameters: Array) -> Array:
+        """Return the slopes (parameter, alias, bin) of the density of a random component."""
+        place, base = self.place[name], self.density(name, parameters)
+        if name == SHAFT:
+            return self._shaft.slopes(parameters[place], base)
+        if name == JITTER:
+            return base[None]
+        moved = parameters + ROUNDING * np.eye(parameters.size)[place]
+        return np.stack([(self.density(name, row) - base) / ROUNDING for row in moved])
 
     def _patterns(self, spectrum: Array) -> tuple[Array, Array, Array]:
         """Return sizes of the patterns, their covariance, and the ordinates without them."""

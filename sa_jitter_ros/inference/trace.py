@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
 from sa_jitter_ros.effects.additive_noise import less_noise
-from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding
+from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding, RARE
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
@@ -358,7 +358,8 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
     """
     Return the effects that change an average, the most important first, and others.
 
-    One that is as declared on the `whole` recording is none, whatever a part of it shows.
+    One that is as declared on the `whole` recording is none, whatever a part of it shows, and one
+    that is small in a part is none unless the whole shows it, too.
     """
     chosen: list[Finding] = []
     present: list[Finding] = []
@@ -375,12 +376,17 @@ def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None
         effect = finding.effect
         assert effect is not None
         change = bench.change(others, effect)
-        if known:  # measured pulses may tell what a prediction on line has to know
+        if known:  # measured pulses tell the ticks, which a prediction on line has to know
+            certain = {name: effect.values[name]
+                       for name, error in finding.standard_errors.items() if error is None}
             change = max(change, _published_change(
-                bench.observation, [*others, known], [*others, effect]))
+                bench.observation, [*others, known], [*others, make_effect(
+                    known.name, **{**known.values, **certain})]))
         finding = replace(finding, largest_change=change)
-        matters = finding.largest_change >= least_change(effect)
-        (chosen if matters else present).append(finding)
+        if finding.largest_change >= least_change(effect):
+            chosen.append(finding)
+        elif known or again is None or again.p_value < RARE:
+            present.append(finding)
     chosen.sort(key=lambda item: -item.largest_change)
     return chosen, [item for item in present if item.name != _SPEED]
 

@@ -116,8 +116,10 @@ class TriggerCounter:
             number = tooth - self._teeth if tooth else 0  # trigger cycles begin at tooth 0
         else:
             number = self._last + passed
-        self._times, self._steps = [time], [number]
-        self._target = max(-(-number // self._per_trigger) * self._per_trigger, 0)
+        target = max(-(-number // self._per_trigger) * self._per_trigger, 0)
+        if passed is not None and self._last is not None:  # beside the cycle that did not end
+            self.discarded += max(target - self._target, 0) // self._per_trigger
+        self._times, self._steps, self._target = [time], [number], target
         self._starting = True
 
     def extend(self, times: list[float], steps: list[int]) -> None:

@@ -170,7 +170,9 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
     model, found = trace.observation.model, []
     jitter = math.sqrt(model.distribution.variance)
     declared = {effect.name: effect for effect in trace.declared}
-    for item in trace.findings:
+    small = [item for item in trace.present if item.name in declared
+             or (isinstance(item.effect, AdditiveNoise) and model.noise_std)]
+    for item in (*trace.findings, *small):
         effect = item.effect
         if effect is None:
             continue
