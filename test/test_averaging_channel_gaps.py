@@ -13,6 +13,7 @@
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.results import ShaftResults
 
 pytestmark = [pytest.mark.filterwarnings('error::RuntimeWarning'),
               pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')]
@@ -49,8 +50,13 @@ def test_a_channel_that_tells_nothing_changes_no_other_one(machine, value):
     expected, _ = averages_of(vibration[OTHERS], pulses, **options)
     found, averager = averages_of(bad, pulses, **options)
     assert len(found) == len(expected) == 4
+    results, without = ShaftResults(), ShaftResults()
     for one, other in zip(found, expected):
         assert one.correction.accepted
+        messages, others = results.of(one), without.of(other)
+        for name in ('condition_indicator', 'condition_indicator_error'):
+            np.testing.assert_allclose(
+                messages[name].values[OTHERS], others[name].values, rtol=1e-6)
         np.testing.assert_allclose(one.amplitudes[OTHERS], other.amplitudes, rtol=1e-12)
         np.testing.assert_allclose(one.waveform[OTHERS], other.waveform, rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(one.correction.amplitudes[OTHERS],

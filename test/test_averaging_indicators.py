@@ -276,6 +276,20 @@ class TestHistory:
             assert running.get().values == pytest.approx(batch.values[count - 1], rel=1e-13)
         assert batch.averages == 7
 
+    def test_channel_without_samples_costs_the_others_nothing(self, rng):
+        history = rng.normal(size=(12, 3, 100))
+        running, clean, other = (RunningIndicators(self.settings) for _ in range(3))
+        for number, average in enumerate(history):
+            lost = number % 4 == 1
+            clean.update(average[:2])
+            if not lost:
+                other.update(average[2:])
+            running.update(np.where([[False], [False], [lost]], np.nan, average))
+            values = running.get().values
+            assert values[:2] == pytest.approx(clean.get().values, rel=1e-12)
+            assert np.isnan(values[2]).all() if lost else values[2:] == pytest.approx(
+                other.get().values, rel=1e-12)
+
     def test_before_the_first_average_there_is_no_channel(self):
         latest = RunningIndicators().get()
         assert latest.values.shape == (0, len(INDICATORS))

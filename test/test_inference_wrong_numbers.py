@@ -29,15 +29,17 @@ MODEL = DeclaredModel(keyphasor_rate=20000.0, trigger_speed=SPEED, trigger_cycle
                       orders=ORDERS, sample_rate=RATE, noise_std=NOISE)
 
 
-def machine(*, swing=0.02, late=0.0, tone=(0.0, 0.0), wander=(0.0, 0.0), scale=1.0, rise=0.0):
+def machine(*, swing=0.02, late=0.0, tone=(0.0, 0.0), wander=(0.0, 0.0), scale=1.0, rise=0.0,
+            clock=0.0, source_rate=RATE):
     """
     Return a recording of a shaft whose speed swings by a part of it, and rises by another.
 
     Pulses are `late` (s), a `tone` has a frequency in Hz and an amplitude, a `wander` a standard
-    deviation in rad and a highest frequency in cycles a trigger cycle.
+    deviation in rad and a highest frequency in cycles a trigger cycle. A `clock` in Hz rounds the
+    pulses; samples of another `source_rate` are interpolated linearly.
     """
     rng = np.random.default_rng(7)
-    time = np.arange(round(SECONDS * RATE)) / RATE
+    time = np.arange(round(SECONDS * source_rate) + 1) / source_rate
     swings = 2.0 * np.pi * 0.15
     turns = SPEED * (time - swing * np.cos(swings * time) / swings
                      + 0.5 * rise * time**2 / SECONDS)
@@ -48,9 +50,13 @@ def machine(*, swing=0.02, late=0.0, tone=(0.0, 0.0), wander=(0.0, 0.0), scale=1
     vibration = sum(size * np.cos(2.0 * np.pi * order * (turns + angle) + order)
                     for order, size in zip(ORDERS, SIZES))
     vibration += tone[1] * np.cos(2.0 * np.pi * tone[0] * time)
-    vibration += NOISE * rng.standard_normal(time.size)
+    even = np.arange(round(SECONDS * RATE)) / RATE
+    vibration = np.interp(even, time, vibration)
+    vibration += NOISE * rng.standard_normal(even.size)
     pulses = np.interp(np.arange(0.5, turns[-1]), turns, time)
     pulses += late + rng.uniform(-0.5, 0.5, pulses.size) / MODEL.keyphasor_rate
+    if clock:
+        pulses = np.ceil(pulses * clock) / clock
     return Recording(ArraySource(scale * vibration[None]), RATE, pulse_times=pulses)
 
 
@@ -119,6 +125,40 @@ def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
     section, = yaml.safe_load(content['parameter_file']).values()
     model = replace(MODEL, noise_std=section['ros__parameters']['noise_std'])
     assert told(recording, model)['declared_changes'] == []
+
+
+def test_noise_above_the_declared_is_another_number_where_it_matters_little(recording):
+    content = told(recording, replace(MODEL, noise_std=0.9 * NOISE))
+    assert content['verdict'] == 'none'
+    assert [item['name'] for item in content['present']] == ['additive_noise']
+    change, = content['declared_changes']
+    assert change['name'] == 'noise' and change['declared'] == 0.9 * NOISE
+    assert abs(change['value'] - NOISE) < 4.0 * change['standard_error']
+
+
+def test_declared_noise_that_is_not_there_is_another_number(recording):
+    content = told(recording, declared=[make_effect('additive_noise', std=NOISE)])
+    change, = content['declared_changes']
+    assert change['name'] == 'additive_noise' and change['value'] < 0.5 * NOISE
+
+
+def test_period_of_a_declared_clock_need_not_be_declared():
+    rounded = machine(clock=3e3)
+    model = replace(MODEL, keyphasor_rate=3e3)
+    clock = make_effect('keyphasor_quantisation', clock_rate=3e3)
+    content = told(rounded, model, declared=[clock])
+    assert content['verdict'] == 'none' and not content['missing_effects']
+    assert {item['parameter'] for item in content['declared_changes']} == {'period_std'}
+    other = told(rounded, model, declared=[make_effect(
+        'keyphasor_quantisation', clock_rate=3.3e3)])
+    assert other['verdict'] == 'traced'
+    assert 'clock_rate' in {item['parameter'] for item in other['declared_changes']}
+
+
+def test_beat_slower_than_an_average_is_that_of_an_interpolator():
+    content = told(machine(source_rate=RATE - 0.23))  # nine beats, an average takes 1 s
+    assert names(content) == ['interpolation_loss']
+    assert content['missing_effects'][0]['parameters']['method']['value'] == 'linear'
 
 
 def test_noise_that_is_declared_in_another_unit_ends_in_no_error():

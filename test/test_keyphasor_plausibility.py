@@ -164,6 +164,13 @@ def test_counts_of_a_converter_are_not_saturated(rng):
     assert bad_channels(np.vstack([counts, switch])) == {}
 
 
+def test_signal_that_reaches_one_end_of_a_symmetric_range_more_often_is_saturated(rng):
+    skewed = rng.gamma(1.0, 1.0, 20_000) - 1.0
+    symmetric = np.where(rng.random(skewed.size) < 1e-3, -2.0, np.clip(skewed, -2.0, 2.0))
+    assert bad_channels(symmetric[None])[0].startswith('is saturated in 5%')
+    assert bad_channels(np.maximum(skewed, -0.9)[None]) == {}  # it rests at one end
+
+
 # --- where users meet it ------------------------------------------------------------------------
 
 def test_demo_plans_with_the_good_channels_and_says_what_is_doubtful(recording, tmp_path):

@@ -90,6 +90,15 @@ def test_doubles_at_the_start_poison_nothing(delay, which):
     assert found.size >= STEADY.size - 3
 
 
+@pytest.mark.parametrize('ticks', [5.9, 7.03, 8.4])
+def test_clock_of_a_few_ticks_from_mark_to_mark_costs_no_pulse(ticks):
+    """On so steady a shaft an interval that is a tick shorter, or longer, is rare."""
+    marks = np.cumsum(0.002 * (1.0 + 1e-3 * np.sin(np.arange(6000) / 500.0)))
+    clock = ticks / 0.002
+    *_, counts = validate(np.ceil(clock * marks) / clock, pulses_per_revolution=60)
+    assert counts.accepted == marks.size and counts.cycles_discarded == 0
+
+
 def test_missing_pulses_break_or_are_bridged():
     gappy = np.delete(STEADY, [7, 20, 21])
     _, runs, _, counts = validate(gappy)

@@ -290,6 +290,8 @@ class RunningIndicators:
         """
         Take the next average, (channels, n), and the `parts` of its cycles for standard errors.
 
+        Channels that are not finite have no indicators; their history waits for the next average.
+
         Raises SignalError and ParameterError as `condition_indicators` does, and SignalError if
         the number of channels changes. After an error the history is unchanged.
         """
@@ -300,7 +302,10 @@ class RunningIndicators:
             raise SignalError(f'average of shape {samples.shape}: expected {expected} channels x '
                               'points; make new RunningIndicators when the channels change')
         replicates = () if parts is None else parts.without_one(samples)
-        moments = _moments(np.stack((samples, *replicates)), self._settings)
+        together = np.stack((samples, *replicates))
+        lost = np.isnan(samples).any(axis=1) & ~np.isnan(samples).any(axis=1).all()
+        together[:, lost] = 0.0
+        moments = _moments(together, self._settings).without(lost)
         if parts is not None:
             moments = moments.levelled(parts.counts).with_extents(parts, self._settings)
         values = self._history.take(moments, self._settings)
@@ -399,6 +404,13 @@ class _Moments(NamedTuple):
     def part(self, index: int) -> '_Moments':
         """Return those of one average."""
         return _Moments(*(item[index:index + 1] for item in self))
+
+    def without(self, lost: Array) -> '_Moments':
+        """Return the moments with NaN for `lost` channels (channel,)."""
+        if lost.any():
+            for item in self:
+                item[:, lost] = np.nan
+        return self
 
     def levelled(self, counts: Array) -> '_Moments':
         """
@@ -558,15 +570,15 @@ class _Reference:
         `variance` (replicate, channel) is that of the average and of replicates of it, for each of
         which the reference is returned; the first counts.
         """
-        counts = np.ones(variance.shape[1:], bool)
+        counts = np.isfinite(variance[0])
         if self._nominal:
             scatter = np.sqrt(self._squares / np.maximum(self._count - 1.0, 1.0))
-            counts = (self._count < _FIRST_NOMINAL) | (
+            counts &= (self._count < _FIRST_NOMINAL) | (
                 variance[0] <= self._mean + _NOMINAL * scatter)
         count = self._count + counts
         step = np.where(counts, variance - self._mean, 0.0)
         mean = self._mean + step / np.maximum(count, 1.0)
-        self._squares = self._squares + step[0] * (variance[0] - mean[0])
+        self._squares = self._squares + np.where(counts, step[0] * (variance[0] - mean[0]), 0.0)
         self._count, self._mean = count, mean[0]
         return np.asarray(mean)
 

@@ -87,8 +87,8 @@ class ShaftResults:
         Return the arrays of the next average by the names of their topics.
 
         `corrected_average` and `pulse_error` are there if the correction was accepted,
-        `condition_indicator` and `condition_indicator_error` if the waveform is finite and the
-        mesh orders are in it, `envelope_amplitude` and `envelope_spectrum` with bearing orders.
+        `condition_indicator` and `condition_indicator_error` if the waveform of a channel is
+        finite and the mesh orders are in it, `envelope_amplitude` and `envelope_spectrum` with bearing orders.
         """
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,
@@ -109,7 +109,7 @@ class ShaftResults:
             found |= {name: AverageMessage(header, *content)
                       for name, content in envelope_tables(envelope).items()}
         self.problem = ''
-        if np.isfinite(source.waveform).all():
+        if np.isfinite(source.waveform).all(axis=1).any():
             found |= self._indicate(header, source.waveform, source.parts)
         return found
 

@@ -253,6 +253,12 @@ def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evid
         f'{found.probability:.2g}', p_value=found.p_value, gain=gain)
 
 
+def same(found: Any, known: Any) -> bool:
+    """Return whether two values of a parameter are the same; rates are that where clocks are."""
+    return bool(found == known) or (isinstance(found, float) and math.isclose(
+        found, known, rel_tol=SAME_RATE))
+
+
 def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles: int) -> bool:
     """
     Return whether the numbers of a fitted effect, with their errors, are not the declared.
@@ -263,8 +269,7 @@ def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles:
     for name, error in errors.items():
         found, known = effect.values[name], declared.values[name]
         if error is None or np.shape(found) != np.shape(known):
-            if found != known and not (isinstance(found, float) and math.isclose(
-                    found, known, rel_tol=SAME_RATE)):
+            if not same(found, known):
                 return True
             continue
         size = np.ravel(error)

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 
 _FEWEST = 6  # intervals
 _DIFFERENT = 0.5  # most of the intervals that differ from all others
-LONGEST_TICK = 0.125  # of the median interval; what differs by more is no tick
+LONGEST_TICK = 0.2  # of the median interval; what differs by more is no tick
 _WHOLE = 0.02  # ticks by which an interval may differ from a whole number of them
 _PARTS = 3  # of the smallest difference seen, that a tick may be
 _STAMP = 2.5e-9  # s, rounding of time stamps

@@ -25,6 +25,7 @@ FloatArray = NDArray[np.float64]
 _MOST_LOST = 0.5  # of the samples
 _AT_END = 0.02  # of the samples, at the very same largest or smallest value
 _FEWEST = 16
+_SYMMETRIC = 1e-3  # of a range: middle of one that is symmetric, but for a code of a converter
 # Samples after a first one that repeat its value if a channel is stuck; of its smallest change,
 # what its samples change by at least where a contact, and not a coarse converter, makes them.
 _STUCK, _COARSE = 32, 8.0
@@ -56,8 +57,11 @@ def bad_channels(samples: FloatArray, *, most_lost: float = _MOST_LOST) -> dict[
         else:
             low, high = finite.min(), finite.max()
             top, bottom = float(np.mean(finite == high)), float(np.mean(finite == low))
-            # A switch has two values, a saturated signal has others between its ends.
-            if top + bottom > _AT_END and min(top, bottom) > 0.25 * _AT_END and (
+            # A switch has two values, a saturated signal has others between its ends, which are
+            # reached alike, or are those of a symmetric range.
+            alike = 0.25 * _AT_END if abs(low + high) > _SYMMETRIC * (high - low) else (
+                1.0 / finite.size)
+            if top + bottom > _AT_END and min(top, bottom) > alike and (
                     np.unique(finite[:4096]).size > 8):
                 found[channel] = f'is saturated in {top + bottom:.0%} of its samples'
     return found

@@ -20,7 +20,7 @@ import numpy as np
 from sa_jitter_ros.effects import parameter_ranges
 from sa_jitter_ros.effects.additive_noise import AdditiveNoise
 from sa_jitter_ros.effects.clock_skew import ClockSkew
-from sa_jitter_ros.effects.effect import Finding
+from sa_jitter_ros.effects.effect import departs, Finding, same
 from sa_jitter_ros.effects.jitter_scale import JitterScale
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence, moving
@@ -170,8 +170,11 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
     model, found = trace.observation.model, []
     jitter = math.sqrt(model.distribution.variance)
     declared = {effect.name: effect for effect in trace.declared}
-    small = [item for item in trace.present if item.name in declared
-             or (isinstance(item.effect, AdditiveNoise) and model.noise_std)]
+    cycles = len(trace.observation.acquisitions) * model.trigger_cycles
+    small = [item for item in trace.present if item.effect is not None and (
+        departs(item.effect, item.standard_errors, declared[item.name], cycles)
+        if item.name in declared
+        else isinstance(item.effect, AdditiveNoise) and model.noise_std > 0.0)]
     for item in (*trace.findings, *small):
         effect = item.effect
         if effect is None:
@@ -185,9 +188,9 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
                           model.ratio * error['skew'], '1'))
         elif item.name in declared:
             for name, limits in parameter_ranges(type(effect)).items():
-                if name in error or effect.values[name] != declared[item.name].values[name]:
-                    found.append((item.name, name, declared[item.name].values[name],
-                                  effect.values[name], error.get(name), limits.unit))
+                before, value = declared[item.name].values[name], effect.values[name]
+                if error.get(name) is not None or not same(before, value):
+                    found.append((item.name, name, before, value, error.get(name), limits.unit))
         elif isinstance(effect, AdditiveNoise):
             total = math.hypot(model.noise_std, effect.std)
             found.append(('noise', 'noise_std', model.noise_std, total,
