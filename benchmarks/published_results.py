@@ -62,7 +62,8 @@ CASES = (
     'none 1009 weak_order', 'none 1009 fading', 'none 1009 fast_clock', 'none 1009 displaced',
     'clock_skew 1000 lost', 'none 52619 dithered', 'interfering_tone 1005 again',
     'interpolation_loss 1005 again', 'none 1009 run_up', 'none 52619 late_run_up',
-    'none 1009 twisting', 'late_recovery 78203')
+    'none 1009 twisting', 'late_recovery 78203', 'none 1011 slow_torsion', 'none 1003 drifting',
+    'none 1011 one_order', 'none 1003 slow_beat')
 # A result on another computer differs by rounding, which the searches of the fit enlarge.
 _RELATIVE, _PROBABILITY, _TINY = 0.02, 0.02, 1e-9
 #: What rounding decides: limits of an even likelihood, and changes near the bound of `undecided`.
@@ -159,12 +160,43 @@ def _lost(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
     return np.delete(times, np.arange(20, times.size - 20, 60))
 
 
-def _torsion(made: Measurement) -> None:
-    """Let the source turn to and fro, faster than half the trigger rate."""
-    rate = float(made.fields['sample_rate'])
-    time = np.arange(made.fields['vibration'].shape[-1]) / rate
-    moved = time + 4e-3 * made.interval * np.sin(2.0 * np.pi * 0.73 * time / made.interval)
-    made.fields['vibration'] = CubicSpline(time, made.fields['vibration'], axis=-1)(moved)
+def _torsion(frequency: float, size: float) -> Callable[[Measurement], None]:
+    """Let the source turn to and fro, so many times an interval and by a part of it."""
+    def damage(made: Measurement) -> None:
+        vibration, rate = made.fields['vibration'], float(made.fields['sample_rate'])
+        time = np.arange(vibration.shape[-1]) / rate
+        turn = 2.0 * np.pi * frequency / made.interval
+        made.fields['vibration'] = CubicSpline(time, vibration, axis=-1)(
+            time + size * made.interval * np.sin(turn * time))
+    return damage
+
+
+def _drifting(times: NDArray[np.float64], made: Measurement) -> NDArray[np.float64]:
+    """Return pulse times that come later and later, by less and less."""
+    return times - 1e-3 * made.interval * np.exp(-4.0 * times / times[-1])
+
+
+def _one_order(made: Measurement) -> None:
+    """Let the highest declared order turn by itself by 0.8 rad, slower than the trigger rate."""
+    vibration, rate = made.fields['vibration'], float(made.fields['sample_rate'])
+    order = max(map(float, made.text.split(' orders: [')[1].split(']')[0].split(',')))
+    place = float(made.fields['ratio']) * order / made.interval
+    frequency = np.fft.fftfreq(vibration.shape[-1], 1.0 / rate)
+    line = 2.0 * np.fft.ifft(np.fft.fft(vibration) * (
+        np.abs(frequency - place) < 0.2 / made.interval))
+    slow = np.abs(frequency) < 0.1 / made.interval
+    turn = np.fft.ifft(np.fft.fft(made.rng.standard_normal(frequency.size)) * slow).real
+    made.fields['vibration'] = vibration + np.real(
+        line * np.expm1(0.8j * turn / np.std(turn)))
+
+
+def _slow_beat(made: Measurement) -> None:
+    """Interpolate samples of a clock that is slower by seven samples in the recording."""
+    vibration = made.fields['vibration']
+    index = np.arange(vibration.shape[-1])
+    other = np.linspace(0.0, index[-1], index.size - 7)
+    found = CubicSpline(index, vibration, axis=-1)(other)
+    made.fields['vibration'] = np.stack([np.interp(index, other, row) for row in found])
 
 
 def _move(made: Measurement, when: Callable[[NDArray[np.float64]], NDArray[np.float64]],
@@ -289,7 +321,11 @@ DAMAGES: Mapping[str, Callable[[Measurement], Any]] = {
     'fast_clock': _replace_pulses(_fast_clock),
     'displaced': _replace_pulses(_displaced),
     'lost': _replace_pulses(_lost),
-    'torsion': _torsion,
+    'torsion': _torsion(0.73, 4e-3),
+    'slow_torsion': _torsion(0.11, 6e-4),
+    'drifting': _replace_pulses(_drifting),
+    'one_order': _one_order,
+    'slow_beat': _slow_beat,
     'run_up': _run_up(0.0),
     'twisting': _twisting,
     'late_run_up': _run_up(0.3),

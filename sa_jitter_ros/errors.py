@@ -103,7 +103,7 @@ class DataWarning(UserWarning):
     ...     warnings.simplefilter('always')
     ...     averages = sa.average(np.zeros(10_000), 5e3, pulses)
     >>> print(caught[0].category.__name__, '-', caught[0].message)
-    DataWarning - 2 trigger cycles were discarded and 45 averaged; 2 missing pulses
+    DataWarning - 4 trigger cycles were discarded and 45 averaged; 2 missing pulses
     >>> [average.trigger_cycles for average in averages]
     [19, 9, 17]
     """

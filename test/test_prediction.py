@@ -220,6 +220,7 @@ def test_effects_can_take_the_place_of_the_declared_jitter():
     ({'orders': ('first',)}, 'orders hold a value that is no number'),
     ({'pulses_per_revolution': 1.5}, 'pulses_per_revolution is 1.5: it must be finite and whole'),
     ({'jitter_table': None}, 'jitter_table is None: give a list of pulse errors in s'),
+    ({'jitter_distribution': 'table'}, 'jitter_distribution is table and jitter_table is empty'),
     ({'keyphasor_rate': float('nan')}, 'keyphasor_rate is nan'),
     ({'trigger_speed': -3.0}, 'trigger_speed is -3.0'),
     ({'ratio': float('inf')}, 'ratio is inf'),

@@ -88,7 +88,8 @@ class ShaftResults:
 
         `corrected_average` and `pulse_error` are there if the correction was accepted,
         `condition_indicator` and `condition_indicator_error` if the waveform of a channel is
-        finite and the mesh orders are in it, `envelope_amplitude` and `envelope_spectrum` with bearing orders.
+        finite and the mesh orders are in it, `envelope_amplitude` and `envelope_spectrum` with
+        bearing orders.
         """
         header = AverageHeader(
             average.start_time, average.end_time, average.sequence, average.trigger_cycles,

@@ -203,7 +203,7 @@ def _turns_in_cycles(observation: Observation, lines: Lines) -> Check:
     order = observation.orders[every.order]
     cycles = every.of(cycle_amplitudes(observation))
     ratio = cycles / cycles.mean(axis=1, keepdims=True) - 1.0
-    noise = np.mean(ratio.real**2, axis=(0, 1))
+    noise = np.maximum(np.mean(ratio.real**2, axis=(0, 1)), np.finfo(np.float64).tiny)
     weight = order / noise
     turn = ratio.imag - np.multiply.outer(ratio.imag @ weight / (weight @ order), order)
     power = np.mean(turn**2, axis=(0, 1))

@@ -117,12 +117,12 @@ def _narrow(fit: TimingFit, inverse: Array, direction: str) -> Check:
     """Test whether a sinusoid stands out of a random motion whose spectrum nobody knows."""
     size, unit = _waves(fit, inverse, direction)
     count = len(fit.data.lengths)  # ordinates of each frequency
-    apart = np.arange(3 * count, (3 + _BESIDE) * count)
-    apart = np.arange(size.size)[:, None] + np.concatenate([-apart, apart])
-    inside = (apart >= 0) & (apart < size.size)
-    beside = np.sum(inside * size[apart.clip(0, size.size - 1)], axis=1)
-    known = np.count_nonzero(inside, axis=1)
-    ratio = size / np.maximum(known, beside)
+    near, far = 3 * count, (3 + _BESIDE) * count
+    place, sums = np.arange(size.size), np.append(0.0, np.cumsum(size))
+    ends = np.clip([place - far + 1, place - near + 1, place + near, place + far], 0, size.size)
+    beside = sums[ends[1]] - sums[ends[0]] + sums[ends[3]] - sums[ends[2]]
+    known = ends[1] - ends[0] + ends[3] - ends[2]
+    ratio = size / np.maximum(np.maximum(known, beside), 1.0)
     return _highest(fit, inverse, direction, size, unit, (1.0 + ratio) ** -known)
 
 

@@ -45,7 +45,8 @@ PARAMETERS = (
     Parameter('false_alarms_per_year', 1.0, 'false alarms in a year of operation, of all shafts, '
               'channels, orders and indicators together', above=0.0, maximum=1e4),
     Parameter('learning_averages', 200, 'averages in a bin of speed that are learnt before new '
-              'ones are tested', minimum=LEAST_LEARNED, maximum=10000000, read_only=True),
+              f'ones are tested, at least {LEAST_LEARNED} groups', minimum=LEAST_LEARNED,
+              maximum=10000000, read_only=True),
     Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
               maximum=10000, read_only=True),
     Parameter('allow_uncorrected', False, 'take raw amplitudes and indicators where an average '

@@ -88,6 +88,9 @@ class DeclaredModel:
             raise ModelError(f'jitter_table is {self.jitter_table}: give a list of pulse errors '
                              'in s')
         object.__setattr__(self, 'jitter_table', tuple(self.jitter_table))
+        if self.jitter_distribution == 'table' and not self.jitter_table:
+            raise ModelError('jitter_distribution is table and jitter_table is empty: give at '
+                             'least one pulse error in s')
         if self.jitter_distribution not in DISTRIBUTIONS:
             raise ModelError(f'jitter_distribution is {self.jitter_distribution!r}: choose one of '
                              f'{", ".join(DISTRIBUTIONS)}')
