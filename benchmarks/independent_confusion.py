@@ -220,11 +220,13 @@ def scores(runs: Sequence[Run]) -> str:
     """
     Return how well held-out acquisitions were predicted, in Markdown.
 
-    Only machines of which a line is compared count: medians of RMS, means of chi2, with the
-    standard error of that of the oracle, and of coverage.
+    Only machines of which a line is compared count: medians of RMS, and of those that are not
+    unexplained, of which nothing is corrected, means of chi2, with the standard error of that of
+    the loop, and of coverage.
     """
-    lines = ['| undeclared | machines | RMS before, after, oracle | near | chi2 per degree of '
-             'freedom before, after, oracle | coverage of 95 % before, after, oracle |',
+    lines = ['| undeclared | machines (not unexplained) | RMS before, after, oracle | near | chi2 '
+             'per degree of freedom before, after, oracle | coverage of 95 % before, after, '
+             'oracle |',
              '|---|---|---|---|---|---|']
     for effects, rows in _by_effects(runs).items():
         rows = [run for run in rows if np.isfinite(run.oracle.rms)]
@@ -232,12 +234,15 @@ def scores(runs: Sequence[Run]) -> str:
             continue
         found = np.array([[astuple(score) for score in (run.before, run.after, run.oracle)]
                           for run in rows])
-        rms, (chi2, coverage) = np.median(found[..., 0], axis=0), found[..., 1:].mean(axis=0).T
-        error = found[:, -1, 1].std(ddof=1) / np.sqrt(len(rows)) if len(rows) > 1 else np.nan
+        rms, told = np.median(found[..., 0], axis=0), found[[
+            run.verdict != 'unexplained' for run in rows], :, 1:]
+        (before, after, oracle), coverage = (
+            told.mean(axis=0) if len(told) else np.full((3, 2), np.nan)).T
+        error = told[:, 1, 0].std(ddof=1) / np.sqrt(len(told)) if len(told) > 1 else np.nan
         lines.append(
-            f'| {effects} | {len(rows)} | {", ".join(f"{value:.4f}" for value in rms)} | '
-            f'{sum(run.near for run in rows)} | {", ".join(f"{value:.3g}" for value in chi2)} +- '
-            f'{error:.2g} | '
+            f'| {effects} | {len(rows)} ({len(told)}) | '
+            f'{", ".join(f"{value:.4f}" for value in rms)} | {sum(run.near for run in rows)} | '
+            f'{before:.3g}, {after:.3g} +- {error:.2g}, {oracle:.3g} | '
             f'{", ".join(f"{value:.1%}" for value in coverage)} |')
     return '\n'.join(lines)
 
