@@ -35,10 +35,13 @@ REMARKS = {
 EFFECTS = {
     'much_jitter': 'jitter_scale', 'little_jitter': 'excess_jitter',
     'coarse_clock': 'keyphasor_quantisation', 'late': 'path_delay',
-    'foreign_shaft': 'interfering_tone', 'fast_clock': 'clock_skew', 'late_run_up': 'path_delay'}
+    'foreign_shaft': 'interfering_tone', 'fast_clock': 'clock_skew', 'late_run_up': 'path_delay',
+    'slow_beat': 'interpolation_loss'}
 # What remains of damages that are no effect.
 REMAINS = {'swaying': 'a sinusoid of the pulses', 'twisting': 'the shaft twists steadily',
-           'fading': 'by single events', 'displaced': 'distributed as no effect makes them'}
+           'fading': 'by single events', 'displaced': 'distributed as no effect makes them',
+           'slow_torsion': 'a sinusoid of the source', 'drifting': 'a drift of the source',
+           'one_order': 'from cycle to cycle'}
 AGAINST = {'late_reference': 'reference keyphasor', 'poor_reference': 'vibration'}
 
 
