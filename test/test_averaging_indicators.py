@@ -276,7 +276,8 @@ class TestHistory:
             assert running.get().values == pytest.approx(batch.values[count - 1], rel=1e-13)
         assert batch.averages == 7
 
-    def test_channel_without_samples_costs_the_others_nothing(self, rng):
+    @pytest.mark.parametrize('value', [np.nan, np.inf])
+    def test_channel_without_samples_costs_the_others_nothing(self, rng, value):
         history = rng.normal(size=(12, 3, 100))
         running, clean, other = (RunningIndicators(self.settings) for _ in range(3))
         for number, average in enumerate(history):
@@ -284,7 +285,7 @@ class TestHistory:
             clean.update(average[:2])
             if not lost:
                 other.update(average[2:])
-            running.update(np.where([[False], [False], [lost]], np.nan, average))
+            running.update(np.where([[False], [False], [lost]], value, average))
             values = running.get().values
             assert values[:2] == pytest.approx(clean.get().values, rel=1e-12)
             assert np.isnan(values[2]).all() if lost else values[2:] == pytest.approx(

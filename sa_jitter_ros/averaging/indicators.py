@@ -303,9 +303,12 @@ class RunningIndicators:
                               'points; make new RunningIndicators when the channels change')
         replicates = () if parts is None else parts.without_one(samples)
         together = np.stack((samples, *replicates))
-        lost = np.isnan(samples).any(axis=1) & ~np.isnan(samples).any(axis=1).all()
-        together[:, lost] = 0.0
-        moments = _moments(together, self._settings).without(lost)
+        lost = ~np.isfinite(samples).all(axis=1)
+        if not lost.all():
+            together[:, lost] = 0.0
+        moments = _moments(together, self._settings)
+        for item in moments if lost.any() else ():
+            item[:, lost] = np.nan
         if parts is not None:
             moments = moments.levelled(parts.counts).with_extents(parts, self._settings)
         values = self._history.take(moments, self._settings)
@@ -404,13 +407,6 @@ class _Moments(NamedTuple):
     def part(self, index: int) -> '_Moments':
         """Return those of one average."""
         return _Moments(*(item[index:index + 1] for item in self))
-
-    def without(self, lost: Array) -> '_Moments':
-        """Return the moments with NaN for `lost` channels (channel,)."""
-        if lost.any():
-            for item in self:
-                item[:, lost] = np.nan
-        return self
 
     def levelled(self, counts: Array) -> '_Moments':
         """
