@@ -46,8 +46,8 @@ _STEPS, _STEP = 400, 1.1
 _CORRELATION, _BEAT, _OFF, _WANDER = 0.8, 0.2, 1.5, 0.2
 _HUM = 59.8  # Hz
 _HIT, _KEPT = 0.04, 0.75  # share of pulses at which a sensor drops out, and what stays of it
-_UNSURE = {'bandwidth'}  # parameters whose errors are not looked at
-_IN_UNITS = {'additive_noise': {'std'}, 'interfering_tone': {'amplitude'}}  # of the vibration
+UNSURE = {'bandwidth'}  # parameters whose errors are not looked at
+IN_UNITS = {'additive_noise': {'std'}, 'interfering_tone': {'amplitude'}}  # of the vibration
 _WAVES, _POINTS = 300, 20  # of a slow process, and its points in a trigger cycle
 
 
@@ -245,7 +245,7 @@ def target_geometry(bench: Bench, rng: Generator, size: float) -> Bench:
 _SHORTER: Mapping[str, Mapping[str, Any]] = {
     'motor, 10 V': {'pulses_per_trigger': 4}, 'motor, 30 V': {'trigger_cycles': 5}}
 #: Width (s) of the uniform pulse errors that are added, as declared.
-_JITTER: Mapping[str, float] = {'gearbox': 5e-5, 'motor, 30 V': 1e-5}
+JITTER: Mapping[str, float] = {'gearbox': 5e-5, 'motor, 30 V': 1e-5}
 MACHINES: Mapping[str, Case] = {case.title: replace(
     case, model={**case.model, **_SHORTER.get(case.title, {})}) for case in (
         Case('gearbox', [stored('gear0_gearbox.npz')], {
@@ -309,7 +309,7 @@ def size_of(name: str, bench: Bench, change: float) -> float | None:
 
 def opened(title: str, data: Path) -> list[Bench]:
     """Return the recordings of a machine, with uniform errors of the pulses where wanted."""
-    case, jitter = MACHINES[title], _JITTER.get(title, 0.0)
+    case, jitter = MACHINES[title], JITTER.get(title, 0.0)
     rng = np.random.default_rng(7)
     return [_bench(make(data), case.model, jitter, rng) for make in case.recordings]
 
@@ -361,7 +361,7 @@ def outcome(report: Mapping[str, Any], name: str, parameters: Mapping[str, Any])
     elif name in found:
         rest = [abs(item['value'] - parameters[key]) / item['standard_error']
                 for key, item in found[name]['parameters'].items()
-                if isinstance(parameters.get(key), float) and key not in _UNSURE
+                if isinstance(parameters.get(key), float) and key not in UNSURE
                 and item['standard_error']]
         text = 'F' + (f'{max(rest):.1f}' if rest else '')
     elif rivals := {key for key, item in found.items()
@@ -396,7 +396,7 @@ def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: 
     like = 'correlated_jitter' if name in UNKNOWN else name
     size = size_of(like, bench, change)
     row = {'machine': title, 'effect': name, 'change': change, 'size': size}
-    if size is None or (name == 'jitter_scale' and title not in _JITTER):
+    if size is None or (name == 'jitter_scale' and title not in JITTER):
         return {**row, 'outcome': '-'}
     rng = np.random.default_rng([round(1e3 * change), *name.encode()])
     make = UNKNOWN[name] if name in UNKNOWN else KNOWN[name][0]
@@ -406,7 +406,7 @@ def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: 
     except SaJitterError as error:
         return {**row, 'outcome': 'refused', 'error': str(error)}
     parameters = {} if name in UNKNOWN else dict(KNOWN[name][1](bench, size))
-    for key in parameters.keys() & _IN_UNITS.get(name, set()):
+    for key in parameters.keys() & IN_UNITS.get(name, set()):
         parameters[key] *= bench.level
     return {**row, 'outcome': outcome(report, name, parameters), 'verdict': report['verdict'],
             'found': {item['name']: {key: (value['value'], value['standard_error'])
