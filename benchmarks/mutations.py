@@ -9,12 +9,12 @@
 # the License.
 
 """
-Which numbers of the inference no published result depends on.
+Which numbers of the inference no published decision depends on.
 
 `python benchmarks/mutations.py` moves each number in the constants of `inference` and `effects` by
-a factor of ten, up or else down, in a copy of the package, and looks whether one of the published
-results (`published_results.py`) notices. What noticed is kept in `mutations.json` beside this
-file, so that the next run asks it first, and the tests ask some of it.
+a factor of ten, up or else down, in a copy of the package, and looks whether the decision on one
+of the open rows (`decisions.py`) becomes another. What noticed is kept in `mutations.json` beside
+this file, so that the next run asks it first, and the tests ask some of it.
 """
 
 import argparse
@@ -32,14 +32,15 @@ import subprocess
 import sys
 import tempfile
 
-from published_results import CASES
+from decision_machines import BROKEN, INDEPENDENT, LOOP, OWN, rows
+from decisions import published
 
 NOTICED = Path(__file__).with_suffix('.json')
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGE = 'sa_jitter_ros'
 _ROOMS = 'inference', 'effects'
 _FACTOR = 10
-_LONGEST = 600.0  # s, of a case: a search that does not end is noticed
+_LONGEST = 600.0  # s, of a row: a search that does not end is noticed
 
 
 @dataclass(frozen=True)
@@ -94,8 +95,15 @@ def numbers() -> Iterator[Number]:
                                 leaf.end_col_offset, leaf.value)
 
 
-def noticed(number: Number, up: bool, cases: Sequence[str]) -> str:
-    """Return the first case whose result differs with the moved number; '' if none does."""
+def cases() -> list[str]:
+    """Return the open rows that need nothing from outside."""
+    known = published()
+    return [row.name for row in rows() if not row.reserved and row.name in known
+            and row.source in (OWN, INDEPENDENT, BROKEN, LOOP)]
+
+
+def noticed(number: Number, up: bool, asked: Sequence[str]) -> str:
+    """Return the first row that is decided otherwise with the moved number; '' if none is."""
     moved = number.moved(up)
     if moved is None:
         return ''
@@ -106,7 +114,7 @@ def noticed(number: Number, up: bool, cases: Sequence[str]) -> str:
     lines[number.line - 1] = line[:number.start] + moved + line[number.end:]
     path.write_text(''.join(lines))
     try:
-        return differs(cases)
+        return differs(asked)
     finally:
         path.write_text(before)
 
@@ -120,33 +128,33 @@ def _copy() -> 'tempfile.TemporaryDirectory[str]':
     return copy
 
 
-def differs(cases: Sequence[str]) -> str:
+def differs(asked: Sequence[str]) -> str:
     """
-    Return the first case that has another result in the copy; '' if none has.
+    Return the first row whose decision is another in the copy; '' if none is.
 
     A search that does not end is another result, too.
     """
-    command = [sys.executable, str(_ROOT / 'benchmarks' / 'published_results.py'), '--first',
-               '--cases', *cases]
+    command = [sys.executable, str(_ROOT / 'benchmarks' / 'decisions.py'), 'check', '--first',
+               *asked]
     environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONDONTWRITEBYTECODE': '1'}
-    with tempfile.TemporaryFile('w+') as asked:
+    with tempfile.TemporaryFile('w+') as names:
         try:
-            if not subprocess.run(command, stdout=subprocess.DEVNULL, stderr=asked,
+            if not subprocess.run(command, stdout=subprocess.DEVNULL, stderr=names,
                                   timeout=_LONGEST, env=environment).returncode:
                 return ''
         except subprocess.TimeoutExpired:
             pass
-        asked.seek(0)
-        return [line.strip() for line in asked if line.strip() in cases][-1]
+        names.seek(0)
+        return [line.strip() for line in names if line.strip() in asked][-1]
 
 
 def kept() -> dict[str, list[str]]:
-    """Return which way each number was moved before, and the case that noticed it, '' for none."""
+    """Return which way each number was moved before, and the row that noticed it, '' for none."""
     return json.loads(NOTICED.read_text()) if NOTICED.exists() else {}
 
 
 def sample(count: int, seed: int) -> list[tuple[Number, str, str]]:
-    """Draw numbers that a result noticed before: the number, which way it moved, and the case."""
+    """Draw numbers that a row noticed before: the number, which way it moved, and the row."""
     known = kept()
     every = [(number, *known[number.name]) for number in numbers()
              if known.get(number.name, ['', ''])[1]]
@@ -159,8 +167,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--only', default='', help='only names with this text')
     parser.add_argument('--new', action='store_true', help='only numbers that nothing noticed yet')
     parser.add_argument('--stale', action='store_true',
-                        help='only numbers that the case which noticed them no longer notices')
-    parser.add_argument('--cases', nargs='+', default=CASES, help='the results that are asked')
+                        help='only numbers that the row which noticed them no longer notices')
+    parser.add_argument('--rows', nargs='*', default=cases(), help='the rows that are asked')
     options = parser.parse_args(arguments)
     known = kept()
     for number in numbers():
@@ -171,10 +179,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         found = ['', '']
         for way in sorted(('up', 'down'), key=lambda item: item != last):
-            case = noticed(number, way == 'up', sorted(
-                options.cases, key=lambda item: item != before))
-            if case:
-                found = [way, case]
+            name = noticed(number, way == 'up', sorted(
+                options.rows, key=lambda item: item != before)) if options.rows else ''
+            if name:
+                found = [way, name]
                 break
         known[number.name] = found
         print(f'{number.name} {number.value}: {" ".join(found)}', flush=True)

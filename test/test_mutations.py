@@ -8,9 +8,10 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Published results of the loop depend on the numbers in its constants."""
+"""Published decisions of the loop depend on the numbers in its constants."""
 
-from mutations import differs, noticed, numbers, sample
+from decisions import published
+from mutations import cases, differs, kept, noticed, numbers, sample
 import pytest
 
 
@@ -20,13 +21,18 @@ def test_numbers_of_constants_are_found():
     assert 'effects.effect.ODDS' in names
 
 
+def test_rows_that_noticed_are_published_and_open():
+    names = {name for _, name in kept().values() if name}
+    assert names <= set(cases()) <= published().keys()
+
+
 @pytest.mark.machines
 def test_without_a_move_nothing_changes():
-    assert not differs(['clock_skew 1000'])
+    assert not differs(['independent clock_skew 0'])
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize(('number', 'way', 'case'), [
+@pytest.mark.parametrize(('number', 'way', 'name'), [
     pytest.param(*item, id=item[0].name) for item in sample(20, seed=1)])
-def test_moving_a_number_tenfold_changes_a_published_result(number, way, case):
-    assert noticed(number, way == 'up', [case])
+def test_moving_a_number_tenfold_changes_a_published_decision(number, way, name):
+    assert noticed(number, way == 'up', [name])
