@@ -12,8 +12,10 @@
 
 import math
 
+from decision_independent import independent
+from decision_worker import answer
+from decisions import stored
 import numpy as np
-from published_results import result
 import pytest
 from sa_jitter_ros.averaging.noise import noise_floor
 from sa_jitter_ros.effects.lattice import on_grid, placed_on_grid, ticks_leave_room
@@ -124,7 +126,8 @@ def test_a_sideband_of_one_order_is_no_beat(rng):
 
 @pytest.mark.machines
 def test_the_beat_is_found_among_lines_that_the_fit_takes_for_others():
-    found = result('interpolation_loss 11506')
+    with stored(independent(11506, 'interpolation_loss')) as job:
+        found = answer(**job)['report']
     assert [item['name'] for item in found['missing_effects']] == ['interpolation_loss']
     assert found['error_after']['rms'] < 0.2 * found['error_before']['rms']
 
