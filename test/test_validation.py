@@ -165,7 +165,7 @@ def test_the_command_writes_page_numbers_and_figures(quick):
     numbers = json.loads((quick / 'validation.json').read_text(encoding='utf-8'))
     text = (quick / 'validation.md').read_text(encoding='utf-8')
     assert numbers['effort']['iterations'] == QUICK.iterations
-    assert len(numbers['groups']) == 6
+    assert len(numbers['groups']) == len(reproduce.GROUPS)
     simulations = numbers['groups']['Single harmonic: Tables 1 to 3, Figs. 4 to 6']['simulations']
     assert len(simulations) == len(TABLE_3) == 12
     figures = sorted(path.name for path in (quick / 'figures').iterdir())
@@ -242,4 +242,4 @@ def test_progress_goes_to_stderr(capsys):
     captured = capsys.readouterr()
     assert captured.out == ''
     assert captured.err.splitlines() == [
-        f'reproduce: 2/6 title: {percent} %' for percent in (50, 70, 100)]
+        f'reproduce: 2/{len(reproduce.GROUPS)} title: {percent} %' for percent in (50, 70, 100)]
