@@ -170,7 +170,7 @@ def test_the_command_writes_page_numbers_and_figures(quick):
     assert len(simulations) == len(TABLE_3) == 12
     figures = sorted(path.name for path in (quick / 'figures').iterdir())
     for name in ('fig03', 'fig04', 'fig05-06', 'fig07', 'fig08', 'fig09', 'fig10', 'fig11',
-                 'fig16', 'fig17', 'fig18-19'):
+                 'fig16', 'fig17', 'fig18-19', 'fig21'):
         assert f'validation-{name}.png' in figures
         assert f'](figures/validation-{name}.png)' in text
         image = imread(quick / 'figures' / f'validation-{name}.png')

@@ -32,17 +32,19 @@ class Effort:
     How much is computed.
 
     `iterations` of a numerical model, full `simulations` of each case, `acquisitions` of the bench
-    and in each of them `realisations` of the pulse errors.
+    and in each of them `realisations` of the pulse errors, `flights` of the whole fleet.
     """
 
     iterations: int
     simulations: int
     acquisitions: int
     realisations: int
+    flights: int
 
 
-FULL = Effort(iterations=100_000, simulations=300, acquisitions=36, realisations=50)
-QUICK = Effort(iterations=3_000, simulations=3, acquisitions=3, realisations=3)
+FULL = Effort(iterations=100_000, simulations=300, acquisitions=36, realisations=50,
+              flights=4546)
+QUICK = Effort(iterations=3_000, simulations=3, acquisitions=3, realisations=3, flights=56)
 
 
 @dataclass(frozen=True)
