@@ -26,12 +26,12 @@ from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from validation import (
     analytic_approximation, angle_laws, fleet, multi_harmonic, parametric_study,
-    printed_equations, residual_kurtosis, single_harmonic)
+    printed_equations, pulse_acceptance, residual_kurtosis, single_harmonic)
 from validation.report import write
 from validation.results import Effort, FULL, Progress, QUICK
 
-GROUPS = (printed_equations, single_harmonic, multi_harmonic, analytic_approximation,
-          parametric_study, angle_laws, residual_kurtosis, fleet)
+GROUPS = (printed_equations, single_harmonic, pulse_acceptance, multi_harmonic,
+          analytic_approximation, parametric_study, angle_laws, residual_kurtosis, fleet)
 _FEWEST = {'iterations': 1000, 'simulations': 2}
 
 
