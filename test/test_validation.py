@@ -23,6 +23,7 @@ from scipy.special import ndtr
 from validation import angle_laws, bench, reproduce, residual_kurtosis
 from validation.monte_carlo import AveragedSignal
 from validation.order_tracking import as_in_table_1, HarmonicCase, simulate, synchronous_average
+from validation.paper import ITEMS
 from validation.report import page
 from validation.results import agreement, compare, Finding, one_distribution, QUICK, Results, stage
 from validation.single_harmonic import TABLE_3
@@ -140,6 +141,14 @@ def test_predicted_ratio_of_two_clocks_with_common_ticks():
     assert np.all(np.abs(ratios.mean(axis=0) - expected) < 6e-4 + 4.0 * errors)
 
 
+def test_noise_widens_the_ratio_with_the_smaller_scatter_from_jitter_more(rng):
+    # scatter 1 and 4 from jitter, noise of 1: log of sqrt(2) over sqrt(17/16)
+    jitter = rng.normal(size=(400, 1, 2)) * np.array([1.0, 4.0])
+    found, error = angle_laws.excess_factor(jitter + rng.normal(size=(400, 4, 2)), [1.0, 4.0])
+    assert 0.01 < error < 0.1  # of independent values 1 / sqrt(400) for each sensor
+    assert found == pytest.approx(0.5 * np.log(2.0 * 16.0 / 17.0), abs=4.0 * error)
+
+
 def test_the_bench_is_that_of_table_4():
     vibration, pulses = bench.acquire(bench.machine(sample_rate=9375.0, seed=1))
     assert pulses.size > bench.TRIGGER_CYCLES + 8
@@ -170,7 +179,7 @@ def test_the_command_writes_page_numbers_and_figures(quick):
     assert len(simulations) == len(TABLE_3) == 12
     figures = sorted(path.name for path in (quick / 'figures').iterdir())
     for name in ('fig03', 'fig04', 'fig05-06', 'fig07', 'fig08', 'fig09', 'fig10', 'fig11',
-                 'fig16', 'fig17', 'fig18-19', 'fig21'):
+                 'fig15', 'fig16', 'fig17', 'fig18-19', 'fig21'):
         assert f'validation-{name}.png' in figures
         assert f'](figures/validation-{name}.png)' in text
         image = imread(quick / 'figures' / f'validation-{name}.png')
@@ -209,9 +218,21 @@ def test_the_published_page_is_one_run_of_the_full_command():
         assert f'| {ours} | {finding["agreement"]} |' in text
 
 
+def test_every_table_and_figure_of_the_paper_is_on_the_page():
+    kinds = {'Fig.': set(), 'Table': set()}
+    for item in ITEMS:
+        kind, numbers = item.name.replace('Figs.', 'Fig.').split()
+        first, _, last = numbers.partition('-')
+        kinds[kind].update(range(int(first), int(last or first) + 1))
+    assert kinds == {'Fig.': set(range(1, 22)), 'Table': set(range(1, 6))}
+    modules = {group.__name__.rpartition('.')[2] for group in reproduce.GROUPS}
+    assert {item.module for item in ITEMS} == modules - {'printed_equations'} | {''}
+
+
 def test_a_page_tells_what_disagrees():
     group = Results('Group', {}, (Finding('Fig. 0', 'a|b', 'c', 'no', 'd'),), {}, ('A choice.',))
-    text = page([group], 'reproduce --output docs')
+    text = page({'single_harmonic': group}, 'reproduce --output docs')
+    assert '| Fig. 4 | amplitude over N_t | Group | simulation |' in text
     assert '0 are reproduced, 0 partly, 1 not' in text
     assert '| Fig. 0 | a\\|b | c | no | d |' in text
     assert '* A choice.' in text

@@ -8,11 +8,12 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""Eqs. 5 to 18: what is printed, what holds, what the package does."""
+"""Eqs. 5 to 18 and the bench's spectrum: what is printed, what holds, what the package does."""
 
 import numpy as np
 import pytest
-from validation import printed_equations
+from validation import bench_spectrum, printed_equations
+from validation.bench import FAST
 
 
 @pytest.mark.parametrize('erratum', [
@@ -42,3 +43,15 @@ def test_averages_are_a_comb_filter_that_leaves_a_root_of_the_noise():
     assert printed_equations.comb_error() < 1e-6
     left, standard_error = printed_equations.noise_left()
     assert abs(left - 1.0) < 4.0 * standard_error
+
+
+def test_the_peak_of_a_modulated_tone_has_its_place_and_width(rng):
+    # a speed that wanders slowly by 0.2 %: RMS width 7.6 Hz, beside the 2.5 Hz of the window
+    time = np.arange(round(2.0 * FAST)) / FAST
+    wander = 7.6 * np.sqrt(2.0) * np.sin(2.0 * np.pi * 1.5 * time)
+    tone = np.cos(2.0 * np.pi * np.cumsum(3800.0 + wander) / FAST)
+    density = bench_spectrum.spectrum(tone + 0.01 * rng.normal(size=time.size))
+    centre, height, width = bench_spectrum.peak(*density, 2)
+    assert centre == pytest.approx(3800.0, abs=0.5)
+    assert height > 40.0
+    assert width == pytest.approx(np.hypot(7.6, 2.5), rel=0.1)

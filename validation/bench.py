@@ -35,7 +35,7 @@ TRIGGER_CYCLES = 41
 #: Sampling rates of the keyphasor, Hz; the slow clock has every fourth tick of the fast one.
 FAST, SLOW = 93750.0, 23437.5
 
-_SPEED_STD, _SPEED_BAND = 2e-3, (0.2, 4.0)  # relative; Hz
+SPEED_STD, _SPEED_BAND = 2e-3, (0.2, 4.0)  # relative; Hz
 _MARGIN = 10  # trigger cycles recorded beyond the average, which a spline law reads
 
 
@@ -59,7 +59,7 @@ def machine(
     return Gearbox(
         components=(*pinion, *others), faults=(tooth,) if chip else (), sample_rate=sample_rate,
         shafts={'pinion': RATIO, 'bevel': 1.0}, speed=((0.0, TRIGGER_SPEED),),
-        fluctuation=band_limited(std=_SPEED_STD, band=_SPEED_BAND, seed=seed, name='bench speed'),
+        fluctuation=band_limited(std=SPEED_STD, band=_SPEED_BAND, seed=seed, name='bench speed'),
         effects=(AdditiveNoise(noise_std),), seed=seed)
 
 

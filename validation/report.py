@@ -11,13 +11,14 @@
 """The validation report: figures, a file of numbers, and the page that compares with the paper."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 import json
 import math
 from pathlib import Path
 from typing import Any
 
+from validation.paper import ITEMS
 from validation.results import Effort, Results
 
 _INTRODUCTION = """# Validation against the paper
@@ -40,28 +41,34 @@ pulse errors, which is stricter than any test of distributions.
 """
 
 
-def write(results: Sequence[Results], effort: Effort, command: str, folder: Path) -> None:
-    """Write `validation.md`, `validation.json` and `figures/validation-*.png` into a folder."""
-    figures = folder / 'figures'
+def write(results: Mapping[str, Results], effort: Effort, command: str, folder: Path) -> None:
+    """
+    Write `validation.md`, `validation.json` and `figures/validation-*.png` into a folder.
+
+    `results` are by the name of their module.
+    """
+    figures, groups = folder / 'figures', results.values()
     figures.mkdir(parents=True, exist_ok=True)
-    for group in results:
+    for group in groups:
         for stem, figure in group.figures.items():
             figure.savefig(figures / f'validation-{stem}.png', metadata={'Software': None})
     document = {'command': command, 'effort': asdict(effort),
-                'groups': {group.title: group.numbers for group in results},
-                'findings': [asdict(finding) for group in results for finding in group.findings]}
+                'groups': {group.title: group.numbers for group in groups},
+                'findings': [asdict(finding) for group in groups for finding in group.findings]}
     (folder / 'validation.json').write_text(
         json.dumps(_as_json(document), indent=1, allow_nan=False) + '\n', encoding='utf-8')
     (folder / 'validation.md').write_text(page(results, command), encoding='utf-8')
 
 
-def page(results: Sequence[Results], command: str) -> str:
+def page(results: Mapping[str, Results], command: str) -> str:
     """Return the page in Markdown."""
-    count = Counter(finding.agreement for group in results for finding in group.findings)
+    groups = results.values()
+    count = Counter(finding.agreement for group in groups for finding in group.findings)
     lines = [_INTRODUCTION.format(command=command)
              + f'Of {sum(count.values())} findings {count["yes"]} are reproduced, '
-             f'{count["partly"]} partly, {count["no"]} not.\n']
-    for group in results:
+             f'{count["partly"]} partly, {count["no"]} not.\n',
+             '\n## Tables and figures of the paper\n', _items(results)]
+    for group in groups:
         lines.append(f'\n## {group.title}\n')
         lines.append(_table(
             (('', 'what the paper finds', 'what we find', 'agreement', 'why'),
@@ -75,6 +82,14 @@ def page(results: Sequence[Results], command: str) -> str:
         lines += [f'![{stem} of: {group.title}](figures/validation-{stem}.png)\n'
                   for stem in group.figures]
     return '\n'.join(lines)
+
+
+def _items(results: Mapping[str, Results]) -> str:
+    """Return the table of what the paper shows, and in which part of the page it is."""
+    titles = {name: group.title for name, group in results.items()}
+    return _table((('', 'what it shows', 'part of this page', 'on what'),
+                   *((item.name, item.shows, titles.get(item.module, 'none'), item.basis)
+                     for item in ITEMS)))
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

@@ -25,13 +25,14 @@ import time
 from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from validation import (
-    analytic_approximation, angle_laws, fleet, multi_harmonic, parametric_study,
+    analytic_approximation, angle_laws, bench_spectrum, fleet, multi_harmonic, parametric_study,
     printed_equations, pulse_acceptance, residual_kurtosis, single_harmonic)
 from validation.report import write
 from validation.results import Effort, FULL, Progress, QUICK
 
 GROUPS = (printed_equations, single_harmonic, pulse_acceptance, multi_harmonic,
-          analytic_approximation, parametric_study, angle_laws, residual_kurtosis, fleet)
+          analytic_approximation, parametric_study, bench_spectrum, angle_laws, residual_kurtosis,
+          fleet)
 _FEWEST = {'iterations': 1000, 'simulations': 2}
 
 
@@ -84,16 +85,16 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         effort = chosen_effort(options)
         options.output.mkdir(parents=True, exist_ok=True)
-        results = []
+        results = {}
         for number, group in enumerate(GROUPS, start=1):
-            title = group.__name__.rpartition('.')[2].replace('_', ' ')
-            results.append(group.run(effort, show(number, title)))
+            name = group.__name__.rpartition('.')[2]
+            results[name] = group.run(effort, show(number, name.replace('_', ' ')))
         write(results, effort, shlex.join(['python', '-m', 'validation.reproduce',
                                            *arguments]), options.output)
     except (SaJitterError, OSError) as error:
         print(f'reproduce: {error}', file=sys.stderr)
         return 2
-    for group in results:
+    for group in results.values():
         for finding in group.findings:
             print(f'{finding.agreement:7} {finding.item}: {finding.paper}')
     print(f'\n{options.output / "validation.md"}, made in {time.monotonic() - begin:.0f} s')
