@@ -150,7 +150,7 @@ def normal_distribution(moments: AverageMoments) -> AmplitudeDistribution:
     zero = np.zeros(mean.size)
     small = np.maximum(0.5 * (moments.variance - gap), 0.0)
     return AmplitudeDistribution(mean.real, mean.imag, np.sqrt(small),
-                                 np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero)
+                                 np.sqrt(0.5 * (moments.variance + gap)), zero, zero, zero, zero)
 
 
 def squared_amplitude_cumulants(moments: AverageMoments, count: int) -> Array:

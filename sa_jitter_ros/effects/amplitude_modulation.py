@@ -61,8 +61,9 @@ class SlowGain:
 
     def draw_gain(self, rng: np.random.Generator, cycles: int, u: Array, count: int) -> Array:
         """Return `count` gains (cycle, u, draw)."""
-        return np.asarray(1.0 + drawn_normal(rng, self.covariance, min(
-            self.correlation_length, cycles - 1), cycles, u, count))
+        drawn = drawn_normal(rng, self.covariance, min(self.correlation_length, cycles - 1),
+                             cycles, u, count)
+        return np.asarray(1.0 + drawn.astype(float))  # single precision loses a small one
 
 
 @dataclass(frozen=True)

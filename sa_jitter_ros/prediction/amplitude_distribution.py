@@ -20,27 +20,31 @@ of a normal X is up to 0.06 off, the curved one 0.006 (symmetric jitter).
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.prediction.angle_error import unit_nodes
 from sa_jitter_ros.prediction.moments import AverageMoments
+from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.prediction.sampled_distribution import require_probabilities
 from scipy.special import ndtr, ndtri
 
 Array = NDArray[Any]
 
 _REACH = 8.5  # standard deviations; 2e-17 of a normal distribution lies outside
-_AXIS, _AXIS_WEIGHTS = np.polynomial.legendre.leggauss(48)  # 1e-9 of a distribution function
+_NODES, _MOST_STEEP = 48, 8  # 1e-9 of a distribution function; times as many where it is steep
 _HERMITE, _HERMITE_WEIGHTS = np.polynomial.hermite_e.hermegauss(32)  # 1e-5 of Var|X|, kinks apart
 _HERMITE_PAIRS = (np.multiply.outer(_HERMITE_WEIGHTS, _HERMITE_WEIGHTS)
                   / _HERMITE_WEIGHTS.sum() ** 2)
 _UNIT, _UNIT_WEIGHTS = unit_nodes(64)  # of amplitudes from 0 to the largest
 _MAXIMAL_SKEW = 2.0  # that of an exponential variable
+_MOST_BENT = 0.9  # of the variance along that the part across does not explain
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)  # the step that spreads points most evenly
 _ROOT_STEPS = 60  # bisection alone takes 50 to the last digit
-_ROOT_TOLERANCE = 1e-9  # of probability
+_ROOT_TOLERANCE, _ROOT_WIDTH = 1e-9, 1e-12  # of probability; of where the root may be
+_LARGEST = 1e100  # amplitude, whose square is a number
 
 
 @dataclass(frozen=True)
@@ -48,10 +52,12 @@ class AmplitudeDistribution:
     """
     The distribution of |X|, X = along + j across, one entry per order.
 
-    across = mean_across + std_across Z and along = mean_along + slope (across - mean_across) +
-    bend ((across - mean_across)^2 - std_across^2) + std_along T, with Z normal and T of unit
-    variance and skewness `skew`: Wilson and Hilferty's cube of a normal variable, a gamma variable
-    to 1e-3. X is normal, exactly, where bend and skew are 0.
+    across = mean_across + A and along = mean_along + slope A + bend Q + std_along T. A has the
+    standard deviation `std_across` and the skewness `skew_across`, T the standard deviation 1 and
+    the skewness `skew`: Wilson and Hilferty's cubes of normal variables, gamma variables to 1e-3.
+    Q is A^2 less its mean and what of it a multiple of A explains. X is normal, exactly, where
+    bend and skewness are 0. Everything is computed about abs(mean), so that a scatter far below
+    the last digit of the amplitude keeps its own digits.
     """
 
     mean_along: Array
@@ -61,28 +67,35 @@ class AmplitudeDistribution:
     slope: Array
     bend: Array
     skew: Array
+    skew_across: Array
 
     @property
     def mean_square(self) -> Array:
         """Return E|X|^2, exact."""
-        return np.asarray(self.mean_along**2 + self.mean_across**2 + self._swing**2
-                          + self.std_across**2)
+        return np.asarray(self.center**2 + self._swing**2 + self.std_across**2)
+
+    @property
+    def center(self) -> Array:
+        """Return |E X|, from which offsets count."""
+        return np.hypot(self.mean_along, self.mean_across)
 
     @property
     def _swing(self) -> Array:
         """Return the standard deviation of the part along."""
-        return np.asarray(np.sqrt(self.std_along**2 + (self.slope * self.std_across) ** 2
-                                  + 2.0 * (self.bend * self.std_across**2) ** 2))
+        bent = self.bend * self.std_across**2
+        return np.asarray(np.sqrt(
+            self.std_along**2 + (self.slope * self.std_across) ** 2
+            + bent**2 * _of_square(self.skew_across)[0]))
 
     @cached_property
     def variance(self) -> Array:
         """Return Var|X|."""
-        across = self.mean_across[:, None] + self.std_across[:, None] * _HERMITE
+        off = self.std_across[:, None] * _lopsided(_HERMITE, self.skew_across[:, None])
         along = self.std_along[:, None] * _lopsided(_HERMITE, self.skew[:, None])
-        amplitude = np.hypot(self._ridge(across)[:, :, None] + along[:, None, :],
-                             across[:, :, None])
-        mean = np.sum(amplitude * _HERMITE_PAIRS, axis=(1, 2))
-        variance = np.sum((amplitude - mean[:, None, None]) ** 2 * _HERMITE_PAIRS, axis=(1, 2))
+        offset = self._offset((self._ridge(off)[:, :, None] + along[:, None, :]),
+                              off[:, :, None])
+        mean = np.sum(offset * _HERMITE_PAIRS, axis=(1, 2))
+        variance = np.sum((offset - mean[:, None, None]) ** 2 * _HERMITE_PAIRS, axis=(1, 2))
         cusp = ((np.abs(self.mean_along) < 6.0 * self._swing)  # the kink at 0 needs more
                 & (np.abs(self.mean_across) < 6.0 * self.std_across))
         if np.any(cusp):
@@ -100,11 +113,8 @@ class AmplitudeDistribution:
 
     def cdf(self, amplitude: ArrayLike) -> Array:
         """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
-        y = np.maximum(np.atleast_2d(np.asarray(amplitude, float)), 0.0)
-        y = np.broadcast_to(y, (self.mean_along.size, y.shape[-1]))
-        if np.any(self.slope) or np.any(self.bend) or np.any(self.skew):
-            return self._curved_cdf(y)
-        return self._normal_cdf(y)
+        y = np.clip(np.atleast_2d(np.asarray(amplitude, float)), 0.0, _LARGEST)
+        return self._below(y - self.center[:, None])
 
     def ppf(self, probability: ArrayLike) -> Array:
         """
@@ -112,42 +122,62 @@ class AmplitudeDistribution:
 
         Raises ParameterError for a probability outside (0, 1).
         """
-        p, low, high = quantile_bracket(self.mean, self.variance, probability)
-        return increasing_root(lambda y: self.cdf(y) - p, low, high)
+        excess = self._swing**2 + self.std_across**2 - self.variance
+        p, low, high = _quantile_bracket(_ratio(excess, self.mean + self.center), self.variance,
+                                         probability)
+        offset = _increasing_root(lambda y: self._below(y) - p,
+                                  np.maximum(low, -self.center[:, None]), high)
+        return np.asarray(self.center[:, None] + offset)
 
     def spread(self, count: int) -> Array:
-        """Return evenly spread, equally likely values of |X|, shape (orders, count)."""
+        """Return evenly spread, equally likely values of |X| - `center`, (orders, count)."""
         index = np.arange(count)  # a lattice of the golden ratio
         z = ndtri(np.array([(index + 0.5) / count, (0.5 + index * _GOLDEN) % 1.0]))
-        across = self.mean_across[:, None] + self.std_across[:, None] * z[0]
+        off = self.std_across[:, None] * _lopsided(z[0], self.skew_across[:, None])
         along = self.std_along[:, None] * _lopsided(z[1], self.skew[:, None])
-        return np.asarray(np.hypot(self._ridge(across) + along, across))
+        return self._offset(self._ridge(off) + along, off)
 
     def _rows(self, mask: Array) -> 'AmplitudeDistribution':
         """Return the distribution of some of the orders."""
         return AmplitudeDistribution(*(getattr(self, item.name)[mask] for item in fields(self)))
 
-    def _ridge(self, across: Array) -> Array:
-        """Return the mean of the part along for given parts across."""
-        off = across - self.mean_across[:, None]
-        return np.asarray(self.mean_along[:, None] + self.slope[:, None] * off
-                          + self.bend[:, None] * (off**2 - self.std_across[:, None] ** 2))
+    def _ridge(self, off: Array) -> Array:
+        """Return the mean of along - mean_along for given across - mean_across."""
+        each = (slice(None), *[None] * (off.ndim - 1))
+        std = self.std_across[each]
+        return np.asarray(self.slope[each] * off + self.bend[each] * (
+            off * (off - self.skew_across[each] * std) - std**2))
 
-    def _normal_cdf(self, y: Array) -> Array:
+    def _offset(self, along: Array, across: Array) -> Array:
+        """Return |X| - `center` of parts off their means."""
+        each = (slice(None), *[None] * (along.ndim - 1))
+        return offset_of(self.center[each], self.mean_along[each], self.mean_across[each], along,
+                         across)
+
+    def _below(self, offset: Array) -> Array:
+        """Return P(|X| - center <= offset) for offsets (orders, k)."""
+        if any(np.any(item) for item in (self.slope, self.bend, self.skew, self.skew_across)):
+            return self._curved_cdf(offset)
+        return self._normal_cdf(offset)
+
+    def _normal_cdf(self, offset: Array) -> Array:
         """Integrate over the part along; the part across has a closed distribution function."""
-        along, weight = _chord(y, self.mean_along[:, None], self.std_along[:, None])
-        half = np.sqrt(np.maximum(y[..., None] ** 2 - along**2, 0.0))
-        mean, std = self.mean_across[:, None, None], self.std_across[:, None, None]
+        off, weight = _chord(offset, self.center, self.mean_along, self.std_along)
+        std = self.std_across[:, None, None]
+        high, low = _ends(offset, self.center, self.mean_along, self.mean_across, off)
         return np.asarray(np.sum(
-            weight * (ndtr(_ratio(half - mean, std)) - ndtr(_ratio(-half - mean, std))), axis=-1))
+            weight * (ndtr(_ratio(high, std)) - ndtr(_ratio(low, std))), axis=-1))
 
-    def _curved_cdf(self, y: Array) -> Array:
+    def _curved_cdf(self, offset: Array) -> Array:
         """Integrate over the part across; the part along has a closed distribution function."""
-        across, weight = _chord(y, self.mean_across[:, None], self.std_across[:, None])
-        half = np.sqrt(np.maximum(y[..., None] ** 2 - across**2, 0.0))
-        ridge = self._ridge(across.reshape(y.shape[0], -1)).reshape(across.shape)
+        steep = np.max(_ratio(self._swing, self.std_along), initial=1.0, where=self._swing > 0.0)
+        nodes = _NODES * min(math.ceil(0.5 * steep), _MOST_STEEP)
+        off, weight = _chord(offset, self.center, self.mean_across, self.std_across,
+                             self.skew_across, nodes)
+        ridge = self._ridge(off)
+        high, low = _ends(offset, self.center, self.mean_across, self.mean_along, off)
         return np.asarray(np.sum(
-            weight * (self._along(half - ridge) - self._along(-half - ridge)), axis=-1))
+            weight * (self._along(high - ridge) - self._along(low - ridge)), axis=-1))
 
     def _along(self, x: Array) -> Array:
         """Return P(std_along T <= x)."""
@@ -162,31 +192,58 @@ def curved_distribution(moments: AverageMoments, unmixed: Array, mixed: Array
 
     `unmixed` is k(X, X, X), `mixed` is k(X, X, conj X).
     """
-    size = np.abs(moments.mean)
-    turn = np.where(size > 0.0, moments.mean / np.where(size > 0.0, size, 1.0), 1.0).conj()
-    pseudo = moments.pseudo_variance * turn**2
-    along = np.maximum(0.5 * (moments.variance + pseudo.real), 0.0)
-    across = np.maximum(0.5 * (moments.variance - pseudo.real), 0.0)
-    unmixed = unmixed * turn**3
-    mixed = mixed * turn
-    along_cubed = 0.25 * (3.0 * mixed.real + unmixed.real)
-    along_across_squared = 0.25 * (mixed.real - unmixed.real)
-    slope = _ratio(0.5 * pseudo.imag, across)
-    bend = _ratio(along_across_squared, 2.0 * across**2)
-    free = np.maximum(along - slope**2 * across, 0.0)
-    limit = _ratio(np.sqrt(0.45 * free), across)
+    return curved_along(Parts.about(moments.mean, moments, unmixed, mixed))
+
+
+def curved_along(parts: Parts) -> AmplitudeDistribution:
+    """Return the distribution of |X| from its parts along and across its mean, the base."""
+    across, slope = parts.ii, _ratio(parts.ri, parts.ii)
+    lopsided = np.clip(_ratio(parts.iii, across**1.5), -_MAXIMAL_SKEW, _MAXIMAL_SKEW)
+    square, mixed, cube = _of_square(lopsided)
+    third = lopsided * across**1.5
+    bend = _ratio(parts.rii - slope * third, square * across**2)
+    free = np.maximum(parts.rr - slope**2 * across, 0.0)
+    limit = _ratio(np.sqrt(_MOST_BENT * free / square), across)
     bend = np.clip(bend, -limit, limit)
-    rest = free - 2.0 * (bend * across) ** 2
-    third = along_cubed - 6.0 * slope**2 * bend * across**2 - 8.0 * (bend * across) ** 3
-    skew = np.clip(_ratio(third, rest**1.5), -_MAXIMAL_SKEW, _MAXIMAL_SKEW)
+    bent = bend * across
+    rest = free - square * bent**2
+    skew = (parts.rrr - slope**3 * third - 3.0 * slope**2 * bent * square * across
+            - 3.0 * slope * bent**2 * mixed * np.sqrt(across) - bent**3 * cube)
+    skew = np.clip(_ratio(skew, rest**1.5), -_MAXIMAL_SKEW, _MAXIMAL_SKEW)
+    size = parts.size
     return AmplitudeDistribution(size, np.zeros(size.size), np.sqrt(rest), np.sqrt(across), slope,
-                                 bend, skew)
+                                 bend, skew, lopsided)
+
+
+def _of_square(skew: Array) -> tuple[Array, Array, Array]:
+    """Return E Q^2, E A Q^2 and E Q^3 of an A of unit variance."""
+    a = _lopsided(_HERMITE, skew[..., None])
+    q = a * (a - skew[..., None]) - 1.0
+    weight = _HERMITE_WEIGHTS / _HERMITE_WEIGHTS.sum()
+    return (q**2) @ weight, (a * q**2) @ weight, (q**3) @ weight
 
 
 def _ratio(value: Array, scale: Array) -> Array:
     """Return value / scale, and value's sign times a large number, or 0, where scale is 0."""
     safe = np.where(scale > 0.0, scale, 1.0)
     return np.where(scale > 0.0, value / safe, 1e9 * np.sign(value))
+
+
+def _ends(offset: Array, center: Array, mean: Array, other: Array, off: Array
+          ) -> tuple[Array, Array]:
+    """
+    Return both ends (..., node) of chords of a circle, off the mean `other` on their own axis.
+
+    The radius is center + offset; chords stand `off` (..., node) the `mean` of the other axis.
+    The half length less the mean is a difference of squares, which keeps its digits.
+    """
+    c, m, o = center[:, None, None], mean[:, None, None], other[:, None, None]
+    d = offset[..., None]
+    gain = np.maximum(2.0 * (c * d - m * off) + d**2 - off**2, -o**2)
+    size = np.abs(o)
+    total = np.sqrt(o**2 + gain) + size
+    longer = gain / np.where(total > 0.0, total, 1.0)
+    return longer + (size - o), -longer - (size + o)
 
 
 def _cube(skew: Array) -> tuple[Array, Array, Array, Array]:
@@ -208,26 +265,32 @@ def _straight(t: Array, skew: Array) -> Array:
     return np.asarray((np.cbrt(mean + scale * t) - a) / b)
 
 
-def _chord(y: Array, mean: Array, std: Array) -> tuple[Array, Array]:
+def _chord(offset: Array, center: Array, mean: Array, std: Array, skew: Array | None = None,
+           nodes: int = _NODES) -> tuple[Array, Array]:
     """
-    Return nodes inside [-y, y] on one axis and their normal probabilities, shape y + (nodes,).
+    Return nodes on one axis, off its mean and inside a circle, and their probabilities.
 
-    The sine substitution takes the root singularities off both ends of the chord.
+    Both have the shape offset + (nodes,); the radius is center + offset. The sine substitution
+    takes the root singularities off both ends of the chord.
     """
-    low = np.clip(mean - _REACH * std, -y, y)[..., None]
-    high = np.clip(mean + _REACH * std, -y, y)[..., None]
-    angle = 0.5 * np.pi * _AXIS
-    nodes = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(angle)
-    jacobian = 0.25 * np.pi * (high - low) * np.cos(angle) * _AXIS_WEIGHTS
-    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-        z = (nodes - mean[..., None]) / std[..., None]
-        weight = jacobian * np.exp(-0.5 * z**2) / (np.sqrt(2.0 * np.pi) * std[..., None])
-    point = (np.abs(mean) <= y)[..., None] / _AXIS.size  # all the probability where std is 0
-    return (np.where(std[..., None] > 0.0, nodes, mean[..., None]),
-            np.where(std[..., None] > 0.0, weight, point))
+    c, m = center[:, None], mean[:, None]
+    first, last = -(c + m) - offset, (c - m) + offset
+    some = (std > 0.0)[:, None, None]
+    scale = np.where(some, std[:, None, None], 1.0)
+    low, high = (end[..., None] / scale for end in (first, last))
+    if skew is not None:
+        low, high = (_straight(end, skew[:, None, None]) for end in (low, high))
+    low, high = (np.clip(end, -_REACH, _REACH) for end in (low, high))
+    x, w = unit_nodes(nodes)
+    angle = np.pi * (x - 0.5)
+    z = 0.5 * (low + high) + 0.5 * (high - low) * np.sin(angle)
+    weight = (np.sqrt(0.125 * np.pi) * (high - low) * np.cos(angle) * w * np.exp(-0.5 * z**2))
+    off = scale * (z if skew is None else _lopsided(z, skew[:, None, None]))
+    point = ((first <= 0.0) & (last >= 0.0))[..., None] / nodes  # all of it where std is 0
+    return np.where(some, off, 0.0), np.where(some, weight, point)
 
 
-def quantile_bracket(
+def _quantile_bracket(
     mean: Array, variance: Array, probability: ArrayLike,
 ) -> tuple[Array, Array, Array]:
     """
@@ -237,19 +300,20 @@ def quantile_bracket(
     """
     p = require_probabilities(probability)
     reach = 1.02 * np.sqrt(variance)[:, None] * np.sqrt(np.maximum(p / (1.0 - p), (1.0 - p) / p))
-    return p, np.maximum(mean[:, None] - reach, 0.0), mean[:, None] + reach
+    return p, mean[:, None] - reach, mean[:, None] + reach
 
 
-def increasing_root(function: Callable[[Array], Array], low: Array, high: Array) -> Array:
+def _increasing_root(function: Callable[[Array], Array], low: Array, high: Array) -> Array:
     """Return the bracketed roots of an increasing vectorised function by the Illinois rule."""
     f_low, f_high = function(low), function(high)
+    enough = _ROOT_WIDTH * (high - low)
     root, last = 0.5 * (low + high), np.zeros(low.shape)
     for _ in range(_ROOT_STEPS):
         with np.errstate(divide='ignore', invalid='ignore'):
             chord = high - f_high * (high - low) / (f_high - f_low)
         root = np.where(f_high - f_low > 0.0, np.clip(chord, low, high), 0.5 * (low + high))
         value = function(root)
-        if np.all((np.abs(value) < _ROOT_TOLERANCE) | (high - low <= 1e-12 * high)):
+        if np.all((np.abs(value) < _ROOT_TOLERANCE) | (high - low <= enough)):
             break
         side = np.sign(value)
         f_low = np.where(side < 0.0, value, np.where(last > 0.0, 0.5 * f_low, f_low))

@@ -22,31 +22,39 @@ moments are then exact for lost pulses alone, and those of the draws elsewhere.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
-from sa_jitter_ros.prediction.amplitude_distribution import (
-    AmplitudeDistribution, curved_distribution)
-from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, IndependentPulseJitter
+from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution, curved_along
+from sa_jitter_ros.prediction.angle_error import (
+    angle_spread, AngleErrorProcess, IndependentPulseJitter, only_angles)
 from sa_jitter_ros.prediction.cumulants import average_cumulants
+from sa_jitter_ros.prediction.distributions import Empirical, PulseErrorDistribution
 from sa_jitter_ros.prediction.influence import Influence, random_processes, require_modelled
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import (
     AverageMoments, correlation_length, cycle_moments, CycleMoments, noise_line_variance)
+from sa_jitter_ros.prediction.parts import Parts
 from sa_jitter_ros.prediction.sampled_distribution import (
-    can_be_sampled, drawn_averages, LONGEST, moments_of, MOST_PHASORS, SampledDistribution)
+    affordable_draws, can_be_sampled, distribution_of, drawn_averages, LONGEST, moments_of,
+    MOST_PHASORS, places, SampledDistribution)
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
+from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
 Array = NDArray[Any]
 
-# Up to here the distribution is sampled; with one more cycle the curved one is up to 0.015 off in
-# its CDF, and 0.04 off for jitter as skewed as an exponential distribution.
-_FEW_CYCLES, _FEW_LOPSIDED_CYCLES, _LOPSIDED = 9, 20, 1.2
+# Cycles up to which the distribution is sampled under effects. Of independent pulse errors, as
+# many as leave the curved one 0.005 off in its CDF: more under a bent law, as many again for each
+# unit of a table's squared skewness, and more where few values of a table make few of an average.
+_FEW_CYCLES, _FEW_INDEPENDENT, _FEW_BENT, _FEW_OF_VALUES, _VALUES = 9, 20, 30, 100, 8
+_FEW_LEFT = 7.0  # cycles over the share of its power that one keeps, all of it in a few of them
+_MOST_FEW, _ENOUGH = 400, 4096  # draws, in which a median is uncertain by 0.005
 # With scenarios: those of a pattern turn the cycles apart.
 _FEW_CYCLES_OF_SCENARIOS = 20
+# Radians of an order. There 1e-8 is left of the scatter along, and 1e-13 of its third power.
+_SMALL, _MOST_GROWN = 0.02, 1e3  # beyond, digits of the mean are left of what is missing from 1
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
 #: Scenarios of an influence, and of several together.
@@ -62,16 +70,17 @@ class Amplitudes:
     """
     Complex amplitudes of unit components with the gain of the influences, without noise.
 
-    `moments` (order,) are those over all scenarios, `each` (scenario, order) those in each, with
-    the third cumulants `unmixed` k(X, X, X) and `mixed` k(X, X, conj X). Where they are too few
-    numbers for the distribution, `draws` are equally likely values of X, (order, draw) of all
-    scenarios or (order, scenario, draw) of each, and `noise` (draw,) is circular of variance 1.
+    `moments` (order,) are those over all scenarios, `each` (scenario, order) those in each; so are
+    `parts` and `parts_of_each` along and across the component, with third cumulants. Where these
+    are too few numbers for the distribution, `draws` are values of R + j I of `parts`, (order,
+    draw) of all scenarios or (order, scenario, draw) of each, and `noise` (draw,) is circular of
+    variance 1.
     """
 
     moments: AverageMoments
     each: AverageMoments
-    unmixed: Array
-    mixed: Array
+    parts: Parts
+    parts_of_each: Parts
     draws: Array | None = field(default=None, repr=False)
     noise: Array | None = field(default=None, repr=False)
 
@@ -87,16 +96,17 @@ class Amplitudes:
         """
         rows = np.asarray(order)
         shift, noise = np.asarray(shift), np.asarray(noise)
-        moments = self.moments.of((rows,)).shifted(shift).with_noise(noise)
         if self.draws is not None:
-            return self._sampled(self.draws[rows, :most], moments, shift, noise)
+            return self._sampled(self.draws[rows, :most], self.parts.of((rows,)), shift, noise)
         count = len(self.each.mean)
         curved = self._curved((slice(None), rows), shift, noise)
         if count == 1:
             return curved
-        values = curved.spread(max(_FEWEST, _DRAWS // count)).reshape(count, rows.size, -1)
-        return SampledDistribution(np.moveaxis(values, 1, 0).reshape(rows.size, -1),
-                                   moments.mean_square)
+        values = curved.center[:, None] + curved.spread(max(_FEWEST, _DRAWS // count))
+        values = np.moveaxis(values.reshape(count, rows.size, -1), 1, 0).reshape(rows.size, -1)
+        center = values.mean(axis=1)
+        moments = self.moments.of((rows,)).shifted(shift).with_noise(noise)
+        return SampledDistribution(center, values - center[:, None], moments.mean_square)
 
     def distribution_in(
         self, scenario: ArrayLike, order: ArrayLike, *, shift: ArrayLike = 0.0,
@@ -107,27 +117,20 @@ class Amplitudes:
         shift, noise = np.asarray(shift), np.asarray(noise)
         if self.draws is None:
             return self._curved(rows, shift, noise)
-        moments = self.each.of(rows).shifted(shift).with_noise(noise)
-        return self._sampled(self.draws[rows[::-1]], moments, shift, noise)
-
-    @property
-    def skew(self) -> Array:
-        """Return the skewness of the part along of each scenario and order."""
-        return self._curved((slice(None), slice(None)), np.zeros(()), np.zeros(())).skew
+        return self._sampled(self.draws[rows[::-1]], self.parts_of_each.of(rows), shift, noise)
 
     def _curved(self, rows: Any, shift: Array, noise: Array) -> AmplitudeDistribution:
-        moments = self.each.of(rows).shifted(shift).with_noise(noise)
-        return curved_distribution(AverageMoments(
-            moments.mean.ravel(), moments.variance.ravel(), moments.pseudo_variance.ravel()),
-            self.unmixed[rows].ravel(), self.mixed[rows].ravel())
+        parts = self.parts_of_each.of(rows).shifted(shift).with_noise(noise)
+        return curved_along(parts.centred().raveled())
 
-    def _sampled(self, draws: Array, moments: AverageMoments, shift: Array, noise: Array
+    def _sampled(self, draws: Array, parts: Parts, shift: Array, noise: Array
                  ) -> SampledDistribution:
         assert self.noise is not None
-        size = np.sqrt(noise).astype(np.float32)
-        values = (draws + shift.astype(np.complex64)[..., None]
-                  + size[..., None] * self.noise[:draws.shape[1]])
-        return SampledDistribution(np.abs(values), moments.mean_square, (values, moments))
+        whole = parts.shifted(shift).with_noise(noise)
+        turn = parts.direction * whole.direction.conj()
+        return distribution_of(
+            draws * turn[..., None]
+            + np.sqrt(noise)[..., None] * self.noise[:draws.shape[1]], whole)
 
 
 def component_gain(model: DeclaredModel, influences: Sequence[Influence]) -> Array:
@@ -165,19 +168,48 @@ def unit_amplitudes(model: DeclaredModel, influences: Sequence[Influence] = ()) 
     if known:
         errors = _affordable(model, processes, _combined([errors for _, errors in known]))
         return _pooled(model, processes, errors, gain)
+    return _of_random(model, processes, gain)
+
+
+def _of_random(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: Array
+               ) -> Amplitudes:
+    """
+    Return the amplitudes of random errors alone.
+
+    Where errors are small, moments are differences of numbers that hardly differ. An order of
+    which they are so small is taken for a higher one, of which they are `_SMALL`, and put back by
+    the powers with which turning and shortening grow: to 1e-4 of what is missing from 1.
+    Mean and mean square are exact to the last digits. Beside a gain, which does not grow with the
+    order, standard deviations are good to 1e-8.
+    """
     count, orders = model.trigger_cycles, np.asarray(model.orders)
     frequency = model.fundamental_frequency
     jitters = [process.distribution for process in processes
                if isinstance(process, IndependentPulseJitter)
                and (process.frequency, process.weights) == (frequency, model.weights)]
     alike = len(jitters) == len(processes) > 0
-    spread = float(orders.max()) * frequency * math.sqrt(sum(item.variance for item in jitters))
+    angle = 2.0 * np.pi * orders * angle_spread(processes)
+    grown = np.ones(orders.size)
+    if only_angles(processes):
+        np.divide(_SMALL, angle, out=grown, where=(angle > 0.0) & (angle < _SMALL))
+    higher = grown * orders
+    spread = float(np.max(angle * grown)) / (2.0 * np.pi)
     nodes = int(np.clip(16.0 + 16.0 * spread, 16 if alike else 32, 160))
-    cycles = cycle_moments(orders, processes, nodes=nodes, lags=count)
-    unmixed, mixed = average_cumulants(orders, processes, count, cycles)
-    found = _of_scenarios(cycles.averaged(count).of(np.newaxis), unmixed, mixed, gain)
-    if few_cycles(cycles, count, alike, found.skew) and can_be_sampled(
-            processes, count, orders.size):
+    if any(isinstance(item, Empirical) for item in jitters):  # which smear nothing
+        nodes = int(np.clip(4.0 * spread, nodes, 640))
+    cycles = cycle_moments(higher, processes, nodes=nodes, lags=count)
+    unmixed, mixed = average_cumulants(higher, processes, count, cycles)
+    average = cycles.averaged(count)
+    parts = Parts.about(1.0, average, unmixed, mixed).shrunk(1.0 / grown)
+    plain = (grown > 1.0) & (grown < _MOST_GROWN)
+    if plain.any():
+        own = Parts.about(1.0, cycle_moments(
+            orders[plain], processes, nodes=nodes, lags=count).averaged(count))
+        for name in ('r', 'i', 'ri', 'ii'):
+            getattr(parts, name)[plain] = getattr(own, name)
+    found = _of_parts(parts.of(np.newaxis), gain)
+    few = _few_independent(model, jitters, cycles, spread) if alike else None
+    if few_cycles(cycles, count, few) and can_be_sampled(processes, count, orders.size):
         return _with_draws(found, model, processes, gain)
     return found
 
@@ -194,25 +226,46 @@ def known_amplitudes(model: DeclaredModel, processes: Sequence[AngleErrorProcess
     found, cycles = _with_errors(model, processes, errors, gain)
     count = model.trigger_cycles
     independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    if not independent and few_cycles(cycles, count, False, found.skew) and can_be_sampled(
+    if not independent and few_cycles(cycles, count, None) and can_be_sampled(
             processes, count, len(model.orders)):
         return _with_draws(found, model, processes, gain, errors, apart=True)
     return found
 
 
-def few_cycles(cycles: CycleMoments, trigger_cycles: int, independent: bool, skew: Array) -> bool:
+def _few_independent(model: DeclaredModel, jitters: Sequence[PulseErrorDistribution],
+                     cycles: CycleMoments, spread: float) -> int:
+    """
+    Return up to how many cycles the distribution of independent pulse errors is sampled.
+
+    It is not where that few draws of as many orders are worth their time that the curved
+    distribution is closer.
+    """
+    linear = model.angle_law == LINEAR_LAW.name
+    if affordable_draws(len(model.orders), model.trigger_cycles,
+                        1 if linear else places(spread)) < _ENOUGH:
+        return _FEW_CYCLES
+    few = float(_FEW_INDEPENDENT if linear else _FEW_BENT)
+    for item in jitters:
+        if isinstance(item, Empirical):
+            few *= 1.0 + item.skewness**2
+            if item.values <= _VALUES:
+                few = max(few, _FEW_OF_VALUES)
+    left = np.min(np.real(cycles.variance[0]) + np.abs(cycles.mean) ** 2)
+    return int(min(max(few, _FEW_LEFT / max(left, 1e-9)), _MOST_FEW))
+
+
+def few_cycles(cycles: CycleMoments, trigger_cycles: int, independent: int | None) -> bool:
     """
     Return whether an average holds too few cycles for a limit theorem, so that it is sampled.
 
     Cycles that remember each other count as fewer: as the variance of one over that of the average
-    says. `independent`: all errors are; `skew` is the skewness of the curved distribution.
+    says. `independent` is how many are few if all errors are, None if they are not.
     """
     average = cycles.averaged(trigger_cycles)
     power = np.abs(cycles.mean) ** 2
     if np.all(average.variance <= _NOTHING * power):
         return False
-    lopsided = np.max(np.abs(skew)) > _LOPSIDED
-    if trigger_cycles <= (_FEW_LOPSIDED_CYCLES if independent and lopsided else _FEW_CYCLES):
+    if trigger_cycles <= (independent or _FEW_CYCLES):
         return True
     if independent:
         return False
@@ -237,16 +290,18 @@ def _of_orders(name: str, value: ArrayLike, model: DeclaredModel, least: float) 
     return given
 
 
-def _of_scenarios(each: AverageMoments, unmixed: Array, mixed: Array, gain: Array) -> Amplitudes:
+def _of_parts(each: Parts, gain: Array) -> Amplitudes:
     """Return amplitudes of scenarios of the same probability, without draws."""
-    mean = each.mean.mean(axis=0)
-    spread = each.mean - mean
-    moments = AverageMoments(mean, np.mean(each.variance + np.abs(spread) ** 2, axis=0),
-                             np.mean(each.pseudo_variance + spread**2, axis=0))
-    # A scenario turns the cycles' phasors apart and shortens their sum, skewness included.
-    return Amplitudes(moments.scaled(gain), each.scaled(gain),
-                      np.broadcast_to(unmixed * gain**3, each.mean.shape),
-                      np.broadcast_to(mixed * gain * np.abs(gain) ** 2, each.mean.shape))
+    each = each.scaled(gain)
+    moments = each.moments
+    if len(moments.mean) == 1:
+        whole = each.of(0)
+        return Amplitudes(whole.moments, moments, whole, each)
+    mean = moments.mean.mean(axis=0)
+    spread = moments.mean - mean
+    pooled = AverageMoments(mean, np.mean(moments.variance + np.abs(spread) ** 2, axis=0),
+                            np.mean(moments.pseudo_variance + spread**2, axis=0))
+    return Amplitudes(pooled, moments, Parts.about(gain, pooled), each)
 
 
 def _with_errors(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
@@ -256,9 +311,10 @@ def _with_errors(model: DeclaredModel, processes: Sequence[AngleErrorProcess], e
     each = scenario_moments(model, processes, errors)
     cycles = cycle_moments(orders, processes, nodes=_SCENARIO_NODES, lags=count)
     unmixed, mixed = average_cumulants(orders, processes, count, cycles)
+    # A scenario turns the cycles' phasors apart and shortens their sum, skewness included.
     share = each.mean / np.where(np.abs(cycles.mean) > 0.0, cycles.mean, 1.0)
-    found = _of_scenarios(each, unmixed * share**3, mixed * share * np.abs(share) ** 2, gain)
-    return found, cycles
+    parts = Parts.about(1.0, each, unmixed * share**3, mixed * share * np.abs(share) ** 2)
+    return _of_parts(parts, gain), cycles
 
 
 def _pooled(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors: Array,
@@ -267,7 +323,8 @@ def _pooled(model: DeclaredModel, processes: Sequence[AngleErrorProcess], errors
     count = model.trigger_cycles
     found, cycles = _with_errors(model, processes, errors, gain)
     independent = all(isinstance(process, IndependentPulseJitter) for process in processes)
-    few = count <= _FEW_CYCLES_OF_SCENARIOS or few_cycles(cycles, count, independent, found.skew)
+    few = count <= _FEW_CYCLES_OF_SCENARIOS or few_cycles(
+        cycles, count, _FEW_CYCLES_OF_SCENARIOS if independent else None)
     if few and can_be_sampled(processes, count, len(model.orders)):
         return _with_draws(found, model, processes, gain, errors)
     return found
@@ -279,7 +336,8 @@ def _with_draws(found: Amplitudes, model: DeclaredModel, processes: Sequence[Ang
     cycles = None if errors is None else errors * model.fundamental_frequency
     known = None if apart or cycles is None else lambda n: cycles[np.arange(n) % len(cycles)]
     draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles, known=known,
-                                  weights=model.weights, each=cycles if apart else None)
+                                  weights=model.weights, each=cycles if apart else None,
+                                  spread=max(model.orders) * angle_spread(processes))
     return replace(found, draws=_grown(draws, gain), noise=noise)
 
 
@@ -303,18 +361,18 @@ def _drawn(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gain: A
         return total * model.fundamental_frequency
 
     draws, noise = drawn_averages(model.orders, processes, model.trigger_cycles,
-                                  weights=model.weights, known=known)
+                                  weights=model.weights, known=known,
+                                  spread=max(model.orders) * angle_spread(processes))
     moments = influences[0][0].exact_moments(model, processes) if len(influences) == 1 else None
     if moments is None:
         moments = moments_of(draws)
-    nothing = np.zeros(len(model.orders))
-    found = _of_scenarios(moments.of(np.newaxis), nothing, nothing, gain)
+    found = _of_parts(Parts.about(1.0, moments.of(np.newaxis)), gain)
     return replace(found, draws=_grown(draws, gain), noise=noise)
 
 
 def _grown(draws: Array, gain: Array) -> Array:
-    """Return draws (order, ...) of the component with its gain, in their precision."""
-    return np.asarray((draws.T * gain.astype(np.complex64)).T)
+    """Return draws (order, ...) of R + j I of the component with its gain."""
+    return np.asarray((draws.T * np.abs(gain)).T)
 
 
 def _combined(known: Sequence[Array]) -> Array:

@@ -28,6 +28,7 @@ then the distribution of averages of few cycles is sampled (`sampled_distributio
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -187,6 +188,24 @@ def joint_characteristic(
     for process in processes:
         product = product * process.characteristic(coefficients, positions, cycles)
     return product
+
+
+def angle_spread(processes: Sequence[AngleErrorProcess]) -> float:
+    """Return the standard deviation of the angle errors in fundamental cycles, roughly."""
+    variance = 0.0
+    for process in processes:
+        if isinstance(process, IndependentPulseJitter):
+            variance += process.frequency**2 * process.distribution.variance
+        elif isinstance(process, GaussianAngleError):
+            u = np.array([0.0, 0.5])
+            variance += float(np.max(process.covariance(u, u, 0)))
+    return math.sqrt(variance)
+
+
+def only_angles(processes: Sequence[AngleErrorProcess]) -> bool:
+    """Return whether all processes are angle errors whose spread is known."""
+    return all(isinstance(process, (IndependentPulseJitter, GaussianAngleError))
+               for process in processes)
 
 
 @lru_cache(maxsize=64)

@@ -138,7 +138,7 @@ def average_cumulants(
     Normal gains have no third cumulants; what their superposition makes of them is taken out. With
     both kinds of processes the superposition is corrected by its error for the short ones.
     Independent jitter seen through a law that reads many pulses counts as seen through its `near`
-    distribution, which moves the distribution function of |X| by less than 0.02.
+    law, which moves the distribution function of |X| by less than 0.01 where it is not sampled.
     """
     near = [_near(process) for process in processes]
     if all(one is other and one.correlation_length <= _REACH

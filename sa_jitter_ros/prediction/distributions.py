@@ -17,6 +17,7 @@ Where errors are given in fundamental cycles, the argument is simply the order.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 from numbers import Real
 from typing import Any, Protocol, runtime_checkable, TypeVar
@@ -174,6 +175,20 @@ class Empirical:
     def variance(self) -> float:
         """Variance in s^2."""
         return float(np.mean(self.table**2))
+
+    @cached_property
+    def values(self) -> int:
+        """Number of different values."""
+        return int(np.unique(self.table).size)
+
+    @property
+    def skewness(self) -> float:
+        """Third central moment over the third power of the standard deviation, 0 for one value."""
+        unit = np.max(np.abs(self.table))
+        if unit == 0.0:
+            return 0.0
+        value = self.table / unit
+        return float(np.mean(value**3) / np.mean(value**2) ** 1.5)
 
     @property
     def width(self) -> float:

@@ -25,7 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, unit_nodes
+from sa_jitter_ros.prediction.distributions import Empirical
 from sa_jitter_ros.prediction.moments import AverageMoments
+from sa_jitter_ros.prediction.parts import offset_of, Parts
 from sa_jitter_ros.pulses.angle_law import LINEAR, PulseWeights
 
 Array = NDArray[Any]
@@ -33,38 +35,66 @@ Array = NDArray[Any]
 KnownErrors = Callable[[int], Array]
 
 _SEED = 20190215
-_BUDGET = 3_000_000  # phasors in one distribution: a tenth of a second
-_FEWEST, _MOST = 4096, 65536  # draws: standard errors of 0.008 and 0.002 of a median
+_BUDGET = 1_500_000  # phasors in one distribution: some hundredths of a second
+_FEWEST, _MOST = 8192, 24576  # draws: standard errors of 0.0035 and 0.002 of a median's rank
 #: Fewest draws of long averages.
 COARSEST = 512
 _IN_EACH = 256  # draws in a scenario that counts by itself: 6 % of its standard deviation
 LONGEST, MOST_PHASORS = 20_000, 50_000  # cycles of an average drawn, and times orders
 _MOST_POINTS = 1000  # of a process drawn at once: the cube of it is its time
-_LINEAR_RULE, _BENT_RULE = unit_nodes(8), unit_nodes(12)  # inside a cycle
+# Places inside a cycle where errors are small, more for each cycle of the order that they spread.
+_PLACES, _PLACES_PER_TURN, _MOST_PLACES = 6, 16.0, 96
+# Cycles of the order beyond which single precision loses the angle, or the square of errors.
+_NARROW, _WIDE = 1e-12, 30.0
+_VALUES = 30  # of a table, whose averages may have so few that rounding must not part them
+_NEAR_ZERO = 0.5  # square of an angle up to which a series gives its sine
+# (-1)^n / (2 n + 3)!, highest first: all for double precision, the last for single.
+_SINE = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(7)][::-1]
+_SINGLE = 4
+_MUCH = 1e-3  # of the mean square, of which differences have digits
+_BELIEVED = 8.0  # standard errors of the mean of a control
+_COLLINEAR = 1e-5  # variance of a sum of controls over that of one
 
 
 @dataclass(frozen=True)
 class SampledDistribution:
     """
-    The distribution of |X| by equally likely `draws` (orders, n) and an exact mean square.
+    The distribution of |X| by draws |X| = center + offset (orders, n) and an exact mean square.
 
-    `drawn` are the complex X (orders, n) of these, if known, with their exact moments.
+    The draws have `weights` (orders, n), or are equally likely. Offsets keep the digits of draws
+    that hardly differ.
     """
 
-    draws: Array = field(repr=False)
+    center: Array
+    offset: Array = field(repr=False)
     mean_square: Array
-    drawn: tuple[Array, AverageMoments] | None = field(default=None, repr=False)
+    weights: Array | None = field(default=None, repr=False)
+
+    @property
+    def draws(self) -> Array:
+        """Return the draws of |X| (orders, n)."""
+        return np.asarray(self.center[:, None] + self.offset)
 
     @cached_property
-    def _sorted(self) -> Array:
-        return np.sort(self.draws, axis=1)
+    def _sorted(self) -> tuple[Array, Array | None]:
+        """Return sorted offsets, and the probability up to each unless all are equally likely."""
+        if self.weights is None:
+            return np.sort(self.offset, axis=1), None
+        order = np.argsort(self.offset, axis=1)
+        below = np.cumsum(np.take_along_axis(self.weights, order, axis=1), axis=1)
+        np.maximum.accumulate(below, axis=1, out=below)  # a weight may be negative
+        return (np.take_along_axis(self.offset, order, axis=1),
+                np.asarray(np.clip(below / below[:, -1:], 0.0, 1.0)))
 
     @cached_property
     def variance(self) -> Array:
-        """Return Var|X|: that of the draws, or what is left of the mean square by E|X|."""
-        if self.drawn is None:
-            return np.asarray(np.var(self.draws, axis=1, dtype=float))
-        return np.asarray(np.maximum(self.mean_square - _mean_size(*self.drawn) ** 2, 0.0))
+        """Return Var|X|: that of the draws, or what E|X| leaves of the mean square if much."""
+        if self.weights is None:
+            return np.asarray(np.var(self.offset, axis=1))
+        mean = np.sum(self.weights * self.offset, axis=1)
+        drawn = np.sum(self.weights * (self.offset - mean[:, None]) ** 2, axis=1)
+        left = self.mean_square - (self.center + mean) ** 2
+        return np.asarray(np.maximum(np.where(left > _MUCH * self.mean_square, left, drawn), 0.0))
 
     @property
     def mean(self) -> Array:
@@ -74,26 +104,35 @@ class SampledDistribution:
     def cdf(self, amplitude: ArrayLike) -> Array:
         """Return P(|X| <= amplitude), (orders, k) for amplitudes of shape (k,) or (orders, k)."""
         y = np.atleast_2d(np.asarray(amplitude, float))
-        y = np.broadcast_to(y, (self.draws.shape[0], y.shape[-1]))
+        y = np.broadcast_to(y, (self.offset.shape[0], y.shape[-1])) - self.center[:, None]
         if y.shape[1] == 1:  # not worth sorting
-            counts = np.count_nonzero(self.draws <= y, axis=1)[:, None]
+            inside = self.offset <= y
+            found = (inside.mean(axis=1) if self.weights is None
+                     else np.clip(np.sum(self.weights * inside, axis=1), 0.0, 1.0))[:, None]
         else:
+            values, below = self._sorted
             counts = np.array([np.searchsorted(row, at, side='right')
-                               for row, at in zip(self._sorted, y)])
-        return np.where(np.isnan(y), np.nan, counts / self.draws.shape[1])
+                               for row, at in zip(values, y)])
+            found = (counts / values.shape[1] if below is None else np.take_along_axis(
+                np.pad(below, ((0, 0), (1, 0))), counts, axis=1))
+        return np.where(np.isnan(y), np.nan, found)
 
     def ppf(self, probability: ArrayLike) -> Array:
         """
         Return quantiles of |X|, shape (orders, k) for k probabilities in (0, 1).
 
-        Raises ParameterError for a probability outside (0, 1).
+        Each is a draw, so that it is one of the values where these are few. Raises ParameterError
+        for a probability outside (0, 1).
         """
         p = require_probabilities(probability)
-        position = p * (self.draws.shape[1] - 1)
-        index = np.minimum(position.astype(int), self.draws.shape[1] - 2)
-        part = position - index
-        return np.asarray((1.0 - part) * self._sorted[:, index]
-                          + part * self._sorted[:, index + 1])
+        values, below = self._sorted
+        count = values.shape[1]
+        if below is None:
+            index = np.broadcast_to(np.ceil(p * count).astype(int) - 1, (len(values), p.size))
+        else:
+            index = np.array([np.searchsorted(row, p) for row in below])
+        return np.asarray(self.center[:, None] + np.take_along_axis(
+            values, np.clip(index, 0, count - 1), axis=1))
 
 
 def can_be_sampled(
@@ -101,7 +140,7 @@ def can_be_sampled(
 ) -> bool:
     """Return whether averages of all processes can be drawn, and in about a second."""
     pulsed = all(hasattr(process, 'draw_pulses') for process in processes)
-    points = trigger_cycles * (1 if pulsed else _LINEAR_RULE[0].size)
+    points = trigger_cycles * (1 if pulsed else _PLACES)
     drawn = _MOST_POINTS if any(hasattr(item, 'draw_angle') or hasattr(item, 'draw_gain')
                                 for item in processes) else math.inf
     return points <= min(drawn, LONGEST) and points * orders <= MOST_PHASORS and all(
@@ -112,49 +151,54 @@ def can_be_sampled(
 def drawn_averages(
     orders: ArrayLike, processes: Sequence[Any], trigger_cycles: int, *,
     weights: PulseWeights = LINEAR, known: KnownErrors | None = None, each: Array | None = None,
+    spread: float = 0.0,
 ) -> tuple[Array, Array]:
     """
-    Return complex averages (order, draw) of `trigger_cycles` cycles, and noise (draw,), E|n|^2 1.
+    Return X - 1 (order, draw) of averages of `trigger_cycles` cycles, and noise, E|n|^2 1.
 
-    Both are of single precision. `processes` `can_be_sampled`; `weights` are those of the angle
-    law. ``known(count)`` returns pulse errors (count, n) in fundamental cycles that come on top of
-    the random ones, of all N_t - 1 + weights.pulses pulses or of the average's own N_t + 1. The
-    errors `each` (scenario, n) come on top of the same random ones each, so that draws are
-    (order, scenario, draw).
+    `processes` `can_be_sampled`; `weights` are those of the angle law. ``known(count)`` returns
+    pulse errors (count, n) in fundamental cycles that come on top of the random ones, of all N_t -
+    1 + weights.pulses pulses or of the average's own N_t + 1. The errors `each` (scenario, n) come
+    on top of the same random ones each, so that draws are (order, scenario, draw). `spread` is the
+    standard deviation of the random errors in cycles of the highest order.
+
+    Both parts of X - 1 are right to some digits of single precision, relative to themselves. They
+    have double precision of tables of few values under the linear law, whose averages have few,
+    too, and of errors too large or too small for single precision.
     """
     g = np.asarray(orders, float)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
     inside = [process for process in processes if process not in pulsed]
     bare = weights is LINEAR and not inside
-    u, w = _LINEAR_RULE if weights is LINEAR else _BENT_RULE
-    w = w.astype(np.float32)
-    count = _IN_EACH if each is not None else _affordable(
-        g.size * (trigger_cycles + 3) * (1 if bare else u.size), g.size)
+    rough = known is not None or each is not None
+    u, w = unit_nodes(1 if bare else places(spread, rough))
+    count = _IN_EACH if each is not None else affordable_draws(
+        g.size, trigger_cycles, u.size)
     rng = np.random.default_rng(_SEED)
     shape = (trigger_cycles + weights.pulses - 1, count)
     errors: Array = np.zeros(shape)
     for process in pulsed:
         errors = errors + process.draw_pulses(rng, shape)
-    noise = rng.normal(0.0, np.sqrt(0.5), (2, count)).astype(np.float32)
+    noise = rng.normal(0.0, np.sqrt(0.5), (2, count))
     if known is not None:
         errors = errors + weights.padded(known(count), trigger_cycles).T
     extra = [process.draw_angle(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_angle')]
     gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_gain')]
-    swell = np.prod(gains, axis=0) if gains else np.ones(1, np.float32)
+    swell = np.prod(gains, axis=0) if gains else None
+    few = bare and any(_of_few_values(process) for process in pulsed)
+    kind = np.float32 if _NARROW < spread < _WIDE and not few else np.float64
 
     def averages(errors: Array) -> Array:
-        angle = (2.0 * np.pi * (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
-                                + sum(extra))).astype(np.float32) if not bare else errors
-        draws = np.empty((g.size, count), np.complex64)
+        angle = errors if bare else (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
+                                     + sum(extra))
+        angle = (2.0 * np.pi * angle).astype(kind)
+        draws = np.empty((g.size, count), complex)
         for row, order in zip(draws, g):
-            if bare:
-                real, imag = _linear_cycles((order * errors).astype(np.float32))
-            else:
-                turned = np.float32(order) * angle
-                real, imag = w @ (swell * np.cos(turned)), w @ (swell * np.sin(turned))
-            row[:] = real.mean(axis=0) + 1j * imag.mean(axis=0)
+            turned = kind(order) * angle
+            real, imag = _linear_cycles(turned) if bare else _bent_cycles(turned, w, swell)
+            row.real, row.imag = real.mean(axis=0), imag.mean(axis=0)
         return draws
 
     found = averages(errors) if each is None else np.stack(
@@ -162,49 +206,114 @@ def drawn_averages(
     return found, noise[0] + 1j * noise[1]
 
 
-def _affordable(phasors: int, orders: int) -> int:
+def places(spread: float, rough: bool = False) -> int:
+    """Return at how many places in a cycle to draw errors of so many cycles of the order."""
+    fewest = 2 * _PLACES if rough else _PLACES
+    return min(math.ceil(fewest + _PLACES_PER_TURN * spread), _MOST_PLACES)
+
+
+def _of_few_values(process: Any) -> bool:
+    """Return whether pulse errors are of a table of few values, so that averages have few, too."""
+    distribution = getattr(process, 'distribution', None)
+    return isinstance(distribution, Empirical) and distribution.values <= _VALUES
+
+
+def affordable_draws(orders: int, trigger_cycles: int, places: int) -> int:
     """Return how many averages of so many phasors are worth their time and memory."""
+    phasors = orders * (trigger_cycles + 3) * places
     count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
     most = min(MOST_PHASORS, LONGEST * orders)
     return max(COARSEST, min(count, COARSEST * most // phasors))
 
 
 def moments_of(draws: Array) -> AverageMoments:
-    """Return the moments of complex draws (order, draw)."""
-    mean = draws.mean(axis=1, dtype=complex)
+    """Return the moments of X of draws (order, draw) of X - 1."""
+    mean = draws.mean(axis=1)
     off = draws - mean[:, None]
-    return AverageMoments(mean, np.mean(np.abs(off) ** 2, axis=1), np.mean(off**2, axis=1))
+    return AverageMoments(1.0 + mean, np.mean(np.abs(off) ** 2, axis=1), np.mean(off**2, axis=1))
 
 
-def _mean_size(draws: Array, moments: AverageMoments) -> Array:
+def distribution_of(off: Array, parts: Parts) -> SampledDistribution:
     """
-    Return E|X| (order,) by complex draws (order, draw) of exact moments.
+    Return the distribution of |X| by draws `off` (order, draw) of R + j I with these `parts`.
 
-    First and second moments of real and imaginary part are control variates, of which |X| is
-    nearly a sum: the mean of some thousand draws scatters far more.
+    The draws get the weights that give power and second moments their exact means. |X| is nearly a
+    sum of these, and so is what falls below a quantile: means and quantiles scatter less.
     """
-    off = draws - moments.mean[:, None]
-    power = np.abs(off) ** 2 - moments.variance[:, None]
-    square = off**2 - moments.pseudo_variance[:, None]
+    size = parts.size
+    real, imag = off.real, off.imag
+    offset = offset_of(size[:, None], size[:, None], np.zeros((size.size, 1)), real, imag)
+    ii, ri, rr = (parts.ii + parts.i**2, parts.ri + parts.r * parts.i, parts.rr + parts.r**2)
+    power = 2.0 * size * parts.r + rr + ii
     controls = np.stack([
-        np.ones(off.shape), off.real, off.imag, power, square.real, square.imag])
-    controls /= np.sqrt(np.mean(controls**2, axis=-1, keepdims=True)) + np.finfo(float).tiny
-    normal = np.einsum('iod,jod->oij', controls, controls)
-    right = np.einsum('iod,od->oi', controls, np.abs(draws.astype(complex)))
-    return np.asarray(np.einsum('oi,oi->o', np.linalg.pinv(normal, hermitian=True)[:, 0], right))
+        offset * (2.0 * size[:, None] + offset) - power[:, None], imag - parts.i[:, None],
+        imag**2 - ii[:, None], real * imag - ri[:, None], real**2 - rr[:, None]], axis=1)
+    return SampledDistribution(size, offset, np.asarray(size**2 + power), _calibrated(controls))
 
 
-def _linear_cycles(errors: Array) -> tuple[Array, Array]:
+def _calibrated(controls: Array) -> Array:
     """
-    Return real and imaginary part of int_0^1 exp(j 2 pi e_k(u)) du, cycles on axis 0, linear law.
+    Return weights (order, draw) of sum 1 that give controls (order, i, draw) the mean 0.
 
-    `errors` are pulse errors in cycles of the order, pulses on axis 0; the precision is theirs.
+    They are those of the estimator by regression. A control whose mean the draws contradict is
+    rounding and does not count; nor does what is left of a control beside the others, if that is.
     """
-    middle = np.pi * (errors[1:] + errors[:-1])
-    half = np.pi * np.diff(errors, axis=0)
-    half[half == 0.0] = np.finfo(half.dtype).tiny
-    gain = np.sin(half) / half
-    return gain * np.cos(middle), gain * np.sin(middle)
+    count = controls.shape[-1]
+    mean = controls.mean(axis=-1, keepdims=True)
+    off = controls - mean
+    scale = np.sqrt(np.einsum('oid,oid->oi', off, off) / count)[..., None]
+    known = np.abs(mean) < _BELIEVED / math.sqrt(count) * scale
+    factor = np.where(known, 1.0 / np.where(known, scale, 1.0), 0.0)
+    off = (off * factor).astype(np.float32)
+    normal = (off @ off.transpose(0, 2, 1)).astype(float) / count
+    inverse = np.linalg.pinv(normal, rcond=_COLLINEAR, hermitian=True)
+    slope = (mean * factor).transpose(0, 2, 1) @ inverse
+    return np.asarray((1.0 - (slope.astype(np.float32) @ off)[:, 0]) / count, float)
+
+
+def _linear_cycles(angle: Array) -> tuple[Array, Array]:
+    """
+    Return both parts of int_0^1 exp(j e_k(u)) du - 1, cycles on axis 0, under the linear law.
+
+    `angle` are pulse errors in radians of the order, pulses on axis 0; the precision is theirs.
+    """
+    half = 0.5 * (angle[1:] - angle[:-1])
+    less = _less_than_sine(half)
+    middle = half
+    middle += angle[:-1]
+    behind = np.sin(0.5 * middle)
+    behind *= 2.0 * behind
+    imag = np.sin(middle, out=middle)
+    imag -= less * imag
+    real = less * behind
+    real -= less
+    real -= behind
+    return real, imag
+
+
+def _less_than_sine(half: Array) -> Array:
+    """Return 1 - sin(half) / half, which is small where half is."""
+    square = half * half
+    series = _SINE[-len(_SINE) if half.dtype == np.float64 else -_SINGLE:]
+    less = np.full_like(square, series[0])
+    near = np.minimum(square, _NEAR_ZERO)
+    for term in series[1:]:
+        less *= near
+        less += term
+    less *= near
+    if square.max(initial=0.0) > _NEAR_ZERO:
+        far = square > _NEAR_ZERO
+        less[far] = 1.0 - np.sin(half[far]) / half[far]
+    return less
+
+
+def _bent_cycles(angle: Array, weights: Array, swell: Array | None) -> tuple[Array, Array]:
+    """Return the same of angles (cycle, place, draw) at places of such weights, with a gain."""
+    w = weights.astype(angle.dtype)
+    real, imag = -2.0 * np.sin(0.5 * angle) ** 2, np.sin(angle)
+    if swell is not None:
+        real, imag = swell * real + (swell - 1.0), swell * imag
+    return w @ real, w @ imag
 
 
 def require_probabilities(probability: ArrayLike) -> Array:
