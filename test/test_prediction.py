@@ -74,9 +74,9 @@ def simulate(model, order, iterations, seed):
     ({'ratio': 5.8154, 'jitter_distribution': 'triangular', 'noise_std': 20.0,
       'sample_rate': 5e4}, 16.0, 0.004),
     ({'ratio': 5.8154, 'trigger_cycles': 1}, 16.0, 0.004),
-    ({'jitter_distribution': 'normal', 'jitter_std': 1e-4, 'trigger_cycles': 12}, 30.0, 0.012),
+    ({'jitter_distribution': 'normal', 'jitter_std': 1e-4, 'trigger_cycles': 12}, 30.0, 0.004),
     ({'jitter_distribution': 'table', 'jitter_table': SKEWED, 'trigger_cycles': 15}, 38.0, 0.004),
-    ({'jitter_distribution': 'table', 'jitter_table': SKEWED, 'trigger_cycles': 60}, 38.0, 0.02),
+    ({'jitter_distribution': 'table', 'jitter_table': SKEWED, 'trigger_cycles': 60}, 38.0, 0.004),
     ({'pulses_per_revolution': 6, 'pulses_per_trigger': 2, 'trigger_cycles': 123}, 38.0, 0.004)])
 def test_prediction_agrees_with_an_independent_simulation(changes, order, bias):
     model = replace(MODEL, orders=(0.5 * order, order), **changes)
@@ -276,5 +276,7 @@ def test_effect_of_no_size_changes_no_drawn_prediction():
     geometry = make_effect('target_geometry', pulse_angles=angles)
     alone = predict(model, [geometry])
     beside = predict(model, [geometry, make_effect('phase_wander', std=1e-9, bandwidth=0.2)])
-    np.testing.assert_allclose(beside.standard_deviation, alone.standard_deviation, rtol=5e-3)
+    error = 0.5 * np.sqrt(2.0 / beside.distribution.draws.shape[1])  # of a standard deviation
+    np.testing.assert_allclose(beside.standard_deviation, alone.standard_deviation,
+                               rtol=3.0 * error)
     np.testing.assert_allclose(beside.mean_attenuation, alone.mean_attenuation, atol=5e-5)

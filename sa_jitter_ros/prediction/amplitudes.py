@@ -53,8 +53,9 @@ _FEW_LEFT = 7.0  # cycles over the share of its power that one keeps, all of it 
 _MOST_FEW, _ENOUGH = 400, 4096  # draws, in which a median is uncertain by 0.005
 # With scenarios: those of a pattern turn the cycles apart.
 _FEW_CYCLES_OF_SCENARIOS = 20
-# Radians of an order. There 1e-8 is left of the scatter along, and 1e-13 of its third power.
-_SMALL, _MOST_GROWN = 0.02, 1e3  # beyond, digits of the mean are left of what is missing from 1
+# Radians of an order: there 1e-9 is left of the scatter along, 1e-14 of its third power. What is
+# missing of the mean, and the scatter across, keep digits until errors are so many times less.
+_SMALL, _PLAIN = 0.01, {'r': 1e3, 'ii': 1e4}
 # Independent cycles of effects: 10 of independent pulse errors count as 6.4 along, 5.3 across.
 _FEW_ALONG, _FEW_ACROSS, _NOTHING = 12.0, 5.0, 1e-12
 #: Scenarios of an influence, and of several together.
@@ -178,7 +179,8 @@ def _of_random(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gai
 
     Where errors are small, moments are differences of numbers that hardly differ. An order of
     which they are so small is taken for a higher one, of which they are `_SMALL`, and put back by
-    the powers with which turning and shortening grow: to 1e-4 of what is missing from 1.
+    the powers with which turning and shortening grow: to 1e-5 of what is missing from 1, and
+    3e-4 where a table has values far out.
     Mean and mean square are exact to the last digits. Beside a gain, which does not grow with the
     order, standard deviations are good to 1e-8.
     """
@@ -201,11 +203,11 @@ def _of_random(model: DeclaredModel, processes: Sequence[AngleErrorProcess], gai
     unmixed, mixed = average_cumulants(higher, processes, count, cycles)
     average = cycles.averaged(count)
     parts = Parts.about(1.0, average, unmixed, mixed).shrunk(1.0 / grown)
-    plain = (grown > 1.0) & (grown < _MOST_GROWN)
-    if plain.any():
-        own = Parts.about(1.0, cycle_moments(
-            orders[plain], processes, nodes=nodes, lags=count).averaged(count))
-        for name in ('r', 'i', 'ri', 'ii'):
+    for name, most in _PLAIN.items():
+        plain = (grown > 1.0) & (grown < most)
+        if plain.any():
+            own = Parts.about(1.0, cycle_moments(
+                orders[plain], processes, nodes=nodes, lags=count).averaged(count))
             getattr(parts, name)[plain] = getattr(own, name)
     found = _of_parts(parts.of(np.newaxis), gain)
     few = _few_independent(model, jitters, cycles, spread) if alike else None

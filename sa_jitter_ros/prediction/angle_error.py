@@ -99,6 +99,10 @@ class IndependentPulseJitter:
         """Return independent pulse errors (pulse, draw) in fundamental cycles."""
         return self.frequency * self.distribution.draw(rng, shape)
 
+    def pulses_at(self, probability: Array) -> Array:
+        """Return the pulse errors in fundamental cycles at these probabilities in (0, 1)."""
+        return np.asarray(self.frequency * self.distribution.quantile(probability))
+
 
 @dataclass(frozen=True)
 class GaussianAngleError:

@@ -63,7 +63,7 @@ class Design:
     >>> found = sa.design(orders=[19, 38], trigger_speed=25.0, maximum_loss=0.02)
     >>> found  # doctest: +NORMALIZE_WHITESPACE
     Design(keyphasor_rate 7011 Hz, trigger_cycles 1, orders 19, 38, loss 0.00502, 0.02,
-    variation 0.00149, 0.00597)
+    variation 0.00149, 0.00595)
     >>> found.keyphasor_rate, found.loss.round(3).tolist()
     (7011.0, [0.005, 0.02])
     """

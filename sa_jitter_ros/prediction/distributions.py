@@ -25,6 +25,7 @@ from typing import Any, Protocol, runtime_checkable, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.errors import ModelError
+from scipy.special import ndtri
 
 Array = NDArray[Any]
 Shape = int | tuple[int, ...]
@@ -53,6 +54,9 @@ class PulseErrorDistribution(Protocol):
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
 
+    def quantile(self, probability: Array) -> Array:
+        """Return the errors in s that are exceeded with 1 - `probability`, in (0, 1)."""
+
     def scaled(self, factor: float) -> 'PulseErrorDistribution':
         """Return the distribution of `factor` times the error."""
 
@@ -79,6 +83,10 @@ class Uniform:
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
         return rng.uniform(-0.5 * self.width, 0.5 * self.width, shape)
+
+    def quantile(self, probability: Array) -> Array:
+        """Return the errors in s that are exceeded with 1 - `probability`."""
+        return np.asarray(self.width * (probability - 0.5))
 
     def scaled(self, factor: float) -> 'Uniform':
         """Return the distribution of `factor` times the error."""
@@ -122,6 +130,10 @@ class Normal(_OfStd):
         """Return independent errors in s."""
         return rng.normal(0.0, self.std, shape)
 
+    def quantile(self, probability: Array) -> Array:
+        """Return the errors in s that are exceeded with 1 - `probability`."""
+        return np.asarray(self.std * ndtri(probability))
+
 
 @dataclass(frozen=True)
 class Triangular(_OfStd):
@@ -139,6 +151,11 @@ class Triangular(_OfStd):
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
         return 0.25 * self.width * (rng.uniform(-1.0, 1.0, shape) + rng.uniform(-1.0, 1.0, shape))
+
+    def quantile(self, probability: Array) -> Array:
+        """Return the errors in s that are exceeded with 1 - `probability`."""
+        below = 2.0 * probability - 1.0
+        return np.asarray(0.5 * self.width * np.sign(below) * (1.0 - np.sqrt(1.0 - np.abs(below))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +253,10 @@ class Empirical:
     def draw(self, rng: np.random.Generator, shape: Shape) -> Array:
         """Return independent errors in s."""
         return np.asarray(rng.choice(self.table, shape))
+
+    def quantile(self, probability: Array) -> Array:
+        """Return the errors in s that are exceeded with 1 - `probability`."""
+        return np.asarray(np.sort(self.table)[(probability * self.table.size).astype(np.intp)])
 
     def scaled(self, factor: float) -> 'Empirical':
         """Return the distribution of `factor` times the error."""

@@ -35,8 +35,8 @@ Array = NDArray[Any]
 KnownErrors = Callable[[int], Array]
 
 _SEED = 20190215
-_BUDGET = 1_500_000  # phasors in one distribution: some hundredths of a second
-_FEWEST, _MOST = 8192, 24576  # draws: standard errors of 0.0035 and 0.002 of a median's rank
+_BUDGET = 2_000_000  # phasors in one distribution: some hundredths of a second
+_FEWEST, _MOST = 8192, 65536  # draws: errors of 0.003 and 0.001 of a median's rank
 #: Fewest draws of long averages.
 COARSEST = 512
 _IN_EACH = 256  # draws in a scenario that counts by itself: 6 % of its standard deviation
@@ -46,7 +46,18 @@ _MOST_POINTS = 1000  # of a process drawn at once: the cube of it is its time
 _PLACES, _PLACES_PER_TURN, _MOST_PLACES = 6, 16.0, 96
 # Cycles of the order beyond which single precision loses the angle, or the square of errors.
 _NARROW, _WIDE = 1e-12, 30.0
-_VALUES = 30  # of a table, whose averages may have so few that rounding must not part them
+# Values of a table, whose averages may have so few that rounding must not part them: of any number
+# of cycles under the linear law, of this many under the others.
+_VALUES, _LUMPY = 30, 9
+# Generating vector of a lattice of 2^m points, m up to 20, by Cools, Kuo and Nuyens, "Constructing
+# embedded lattice rules for multivariate integration", SIAM J. Sci. Comput. 28 (2006) 2162-2188.
+_LATTICE = np.array([
+    1, 182667, 469891, 498753, 110745, 446247, 250185, 118627, 245333, 283199, 408519, 391023,
+    246327, 126539, 399185, 461527, 300343, 69681, 516695, 436179, 106383, 238523, 413283, 70841,
+    47719, 300129, 113029, 123925, 410745, 211325, 17489, 511893, 40767, 186077, 519471, 255369,
+    101819, 243573, 66189, 152143])
+_LEAST = 1e-16  # probability of an error
+_CHORDS = 2.0  # cycles of the order from which on an angle is straight between places
 _NEAR_ZERO = 0.5  # square of an angle up to which a series gives its sine
 # (-1)^n / (2 n + 3)!, highest first: all for double precision, the last for single.
 _SINE = [(-1.0) ** n / math.factorial(2 * n + 3) for n in range(7)][::-1]
@@ -163,22 +174,23 @@ def drawn_averages(
     standard deviation of the random errors in cycles of the highest order.
 
     Both parts of X - 1 are right to some digits of single precision, relative to themselves. They
-    have double precision of tables of few values under the linear law, whose averages have few,
-    too, and of errors too large or too small for single precision.
+    have double precision of tables of few values, where averages have few, too, and of errors too
+    large or too small for single precision.
     """
     g = np.asarray(orders, float)
     pulsed = [process for process in processes if hasattr(process, 'draw_pulses')]
     inside = [process for process in processes if process not in pulsed]
     bare = weights is LINEAR and not inside
     rough = known is not None or each is not None
+    chords = spread > _CHORDS and not any(hasattr(item, 'draw_gain') for item in inside)
     u, w = unit_nodes(1 if bare else places(spread, rough))
+    if chords and not bare:
+        u = np.linspace(0.0, 1.0, u.size)
     count = _IN_EACH if each is not None else affordable_draws(
         g.size, trigger_cycles, u.size)
     rng = np.random.default_rng(_SEED)
     shape = (trigger_cycles + weights.pulses - 1, count)
-    errors: Array = np.zeros(shape)
-    for process in pulsed:
-        errors = errors + process.draw_pulses(rng, shape)
+    errors = _pulse_errors(pulsed, rng, shape)
     noise = rng.normal(0.0, np.sqrt(0.5), (2, count))
     if known is not None:
         errors = errors + weights.padded(known(count), trigger_cycles).T
@@ -187,18 +199,23 @@ def drawn_averages(
     gains = [process.draw_gain(rng, trigger_cycles, u, count) for process in inside
              if hasattr(process, 'draw_gain')]
     swell = np.prod(gains, axis=0) if gains else None
-    few = bare and any(_of_few_values(process) for process in pulsed)
+    few = (bare or trigger_cycles <= _LUMPY) and any(map(_of_few_values, pulsed))
     kind = np.float32 if _NARROW < spread < _WIDE and not few else np.float64
 
     def averages(errors: Array) -> Array:
         angle = errors if bare else (weights.path(errors.T, u, trigger_cycles).transpose(1, 2, 0)
                                      + sum(extra))
         angle = (2.0 * np.pi * angle).astype(kind)
+        if chords and not bare:
+            angle = angle.transpose(1, 0, 2).reshape(u.size, -1)
         draws = np.empty((g.size, count), complex)
         for row, order in zip(draws, g):
             turned = kind(order) * angle
-            real, imag = _linear_cycles(turned) if bare else _bent_cycles(turned, w, swell)
-            row.real, row.imag = real.mean(axis=0), imag.mean(axis=0)
+            if bare or chords:
+                real, imag = _linear_cycles(turned)
+            else:
+                real, imag = _bent_cycles(turned, w, swell)
+            row.real, row.imag = (part.reshape(-1, count).mean(axis=0) for part in (real, imag))
         return draws
 
     found = averages(errors) if each is None else np.stack(
@@ -212,6 +229,31 @@ def places(spread: float, rough: bool = False) -> int:
     return min(math.ceil(fewest + _PLACES_PER_TURN * spread), _MOST_PLACES)
 
 
+def _pulse_errors(processes: Sequence[Any], rng: np.random.Generator, shape: tuple[int, int]
+                  ) -> Array:
+    """
+    Return the sum of pulse errors (pulse, draw) in fundamental cycles.
+
+    Those of one process of independent errors lie evenly, in each pulse and in each pair of them:
+    on a lattice as far as it has dimensions, those in the middle first. A standard deviation then
+    scatters half as much as that of random draws.
+    """
+    total: Array = np.zeros(shape)
+    pulses, count = shape
+    even = [item for item in processes if hasattr(item, 'pulses_at')][:1]
+    for process in processes:
+        if process not in even:
+            total = total + process.draw_pulses(rng, shape)
+            continue
+        place = rng.random(shape)
+        middle = np.argsort(np.abs(np.arange(pulses) - 0.5 * (pulses - 1)), kind='stable')
+        middle = middle[:_LATTICE.size]
+        steps = np.arange(count) * _LATTICE[:middle.size, None] % count
+        place[middle] = (steps / count + place[middle, :1]) % 1.0
+        total = total + process.pulses_at(np.clip(place, _LEAST, 1.0 - _LEAST))
+    return total
+
+
 def _of_few_values(process: Any) -> bool:
     """Return whether pulse errors are of a table of few values, so that averages have few, too."""
     distribution = getattr(process, 'distribution', None)
@@ -223,7 +265,8 @@ def affordable_draws(orders: int, trigger_cycles: int, places: int) -> int:
     phasors = orders * (trigger_cycles + 3) * places
     count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
     most = min(MOST_PHASORS, LONGEST * orders)
-    return max(COARSEST, min(count, COARSEST * most // phasors))
+    count = max(COARSEST, min(count, COARSEST * most // phasors))
+    return int(2 ** math.floor(math.log2(count)))  # as a lattice needs
 
 
 def moments_of(draws: Array) -> AverageMoments:
