@@ -216,7 +216,7 @@ def main() -> None:
     """Draw settings, compare and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--settings', type=int, default=570)
-    parser.add_argument('--draws', type=int, default=40_000)
+    parser.add_argument('--draws', type=int, default=20_000)
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--show', action='store_true', help='print the settings that are off')
     options = parser.parse_args()

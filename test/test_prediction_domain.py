@@ -109,7 +109,7 @@ def test_single_cycles_are_as_a_quadrature_says():
         assert prediction.standard_deviation[0] == pytest.approx(std, rel=0.01)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(anywhere(most_cycles=1000), logarithmic(1e-9, 1e-3))
 def test_without_jitter_nothing_is_lost(setting, factor):
     """Mean and standard deviation go to their limits as the square of the errors."""
@@ -159,8 +159,9 @@ def test_effects_of_no_size_change_nothing(name, size, cycles, rate):
                           orders=(1.0, 40.0), sample_rate=1e4)
     alone = predict(model)
     beside = predict(model, [make_effect(name, **{NOTHING[name]: size})])
-    np.testing.assert_allclose(beside.mean_attenuation, alone.mean_attenuation, atol=1e-8,
-                               rtol=1e-3 * float(alone.standard_deviation.max()))
+    # 8192 draws, of which controls explain all but 0.2 standard deviations
+    error = 0.2 / np.sqrt(8192.0) * alone.standard_deviation
+    assert np.all(np.abs(beside.mean_attenuation - alone.mean_attenuation) <= 3.0 * error + 1e-8)
     # other draws, and what rounding leaves of two numbers that hardly differ
     np.testing.assert_allclose(beside.standard_deviation, alone.standard_deviation, rtol=0.05,
                                atol=1e-7 + 40.0 * np.sqrt(cycles * size))

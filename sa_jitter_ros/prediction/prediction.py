@@ -133,7 +133,9 @@ def predict(model: DeclaredModel, effects: Sequence[Influence] = ()) -> Predicti
     `effects` act beside the declared jitter and noise; one may take the place of the jitter. Mean
     square and complex moments are exact; where averages must be drawn (`amplitudes`), those of
     lost pulses alone are. The distribution is sampled (fixed seed) for few trigger cycles, curved
-    otherwise, and mixed over scenarios.
+    otherwise, and mixed over scenarios. Of independent pulse errors, quantiles have their
+    probabilities to 0.01, E|X| is good to 0.01 standard deviations of |X|, these to 1 %; errors of
+    more than some hundred cycles of an order leave E|X|^2 alone that good.
 
     Raises ModelError for an effect that has no forward model with this declared model, and for a
     gain or noise that is no number for each order.

@@ -36,7 +36,8 @@ KnownErrors = Callable[[int], Array]
 
 _SEED = 20190215
 _BUDGET = 2_000_000  # phasors in one distribution: some hundredths of a second
-_FEWEST, _MOST = 8192, 65536  # draws: errors of 0.003 and 0.001 of a median's rank
+# Draws: errors of 0.003 and 0.001 of a median's rank. The more cycles, the less heavy the tails.
+_FEWEST, _MOST = 8192, 65536
 #: Fewest draws of long averages.
 COARSEST = 512
 _IN_EACH = 256  # draws in a scenario that counts by itself: 6 % of its standard deviation
@@ -73,7 +74,8 @@ class SampledDistribution:
     The distribution of |X| by draws |X| = center + offset (orders, n) and an exact mean square.
 
     The draws have `weights` (orders, n), or are equally likely. Offsets keep the digits of draws
-    that hardly differ.
+    that hardly differ. Of 8192 evenly drawn averages with weights a median has its rank to 0.003,
+    one standard error, and the standard deviation is good to 0.5 %; of random draws, 1 %.
     """
 
     center: Array
@@ -263,7 +265,8 @@ def _of_few_values(process: Any) -> bool:
 def affordable_draws(orders: int, trigger_cycles: int, places: int) -> int:
     """Return how many averages of so many phasors are worth their time and memory."""
     phasors = orders * (trigger_cycles + 3) * places
-    count = int(np.clip(_BUDGET // phasors, _FEWEST, _MOST))
+    count = int(np.clip(_BUDGET // phasors, _FEWEST, max(_MOST // max(trigger_cycles // 4, 1),
+                                                          _FEWEST)))
     most = min(MOST_PHASORS, LONGEST * orders)
     count = max(COARSEST, min(count, COARSEST * most // phasors))
     return int(2 ** math.floor(math.log2(count)))  # as a lattice needs
