@@ -18,6 +18,7 @@ which is the default, `ratio` and `orders` belong to it; with several, each has 
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+import math
 from pathlib import Path
 from typing import Any
 
@@ -54,8 +55,9 @@ MODEL_PARAMETERS = (
               '1/(sqrt(12) keyphasor_rate)', unit='s', minimum=0.0),
     Parameter('jitter_table', [], 'equally likely pulse errors, with jitter_distribution table',
               unit='s'),
-    Parameter('noise_std', 0.0, 'standard deviation of white noise per vibration sample, in '
-              'units of the vibration; predicted components have the amplitude 1', minimum=0.0),
+    Parameter('noise_std', math.nan, 'standard deviation of white noise per vibration sample, in '
+              'units of the vibration; predicted components have the amplitude 1. NaN: not '
+              'declared, so that no noise is predicted and close_loop estimates it', minimum=0.0),
     Parameter('sample_rate', 0.0, 'sampling rate of the vibration, needed with noise_std',
               unit='Hz', minimum=0.0),
     Parameter('angle_law', 'linear', 'how the angle runs between pulses, as in the averager',

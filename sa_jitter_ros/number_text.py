@@ -21,7 +21,6 @@ _PREFIXED = ('s', 'rad')
 _LARGE = (('T', 1e12), ('G', 1e9), ('M', 1e6))  # prefixes of a frequency
 _EXACT = 1e-9  # relative error of a number that only rounding makes uncertain
 _DIGITS = 3  # of a number without error
-_LEAST_P = 1e-12
 
 
 def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
@@ -83,18 +82,6 @@ def order_text(order: float) -> str:
     ('39.0476', '60')
     """
     return f'{order:.6g}'
-
-
-def p_text(value: Json) -> str:
-    """
-    Return a probability; one that is smaller than anybody should believe is a limit.
-
-    >>> p_text(0.51675), p_text(3.9e-37), p_text(None)
-    ('0.517', '< 1e-12', '–')
-    """
-    if value is not None and value <= _LEAST_P:
-        return f'< {_LEAST_P:.0e}'
-    return number_text(value)
 
 
 def _unit(values: Sequence[Json], unit: str) -> tuple[float, str]:

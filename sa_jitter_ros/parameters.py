@@ -40,7 +40,8 @@ class Parameter:
     The type of the default is the type of the parameter; `element` is the type of the elements
     where the default is an empty list. `minimum` and `maximum` limit a number or every element of
     a list; a value must be greater than `above`. `choices` are the values that a text may have. A
-    `read_only` parameter is fixed when the node starts.
+    `read_only` parameter is fixed when the node starts. A default of NaN means "not given", which
+    a value may say, too.
     """
 
     name: str
@@ -95,6 +96,8 @@ class Parameter:
         return value
 
     def _check_range(self, value: Any, given: Any, name: str) -> None:
+        if isinstance(self.default, float) and math.isnan(value) and math.isnan(self.default):
+            return
         limit = ''
         if isinstance(value, float) and not math.isfinite(value):
             limit = f'a finite number, at most {_LARGEST:g} in size'

@@ -170,9 +170,10 @@ def test_what_ticks_hide_of_the_motion_is_no_other_effect(quantised):
     """One channel: nothing predicts the motion within the ticks, and so nobody is to blame."""
     recording, model = quantised
     found = trace([observe(recording, model)], [recording])
-    assert [item.name for item in found.findings] == ['keyphasor_quantisation']
-    assert found.verdict == 'traced'
-    assert found.after.rms < 0.3 * found.before.rms
+    assert found.findings == ()
+    assert [item.name for item in found.refinements] == ['keyphasor_quantisation']
+    assert found.verdict == 'none'
+    assert found.after.rms < 0.3 * found.as_declared.rms
     assert 0.2 < found.after.chi2_per_dof < 3.0
 
 

@@ -158,9 +158,10 @@ def test_effect_on_the_mean_is_traced(name, values, parameter):
     content = report(found)
     assert content['verdict'] == 'traced'
     assert [item['name'] for item in content['missing_effects']] == [name]
-    assert content['probabilities'].keys() == EFFECTS.keys()
-    assert content['probabilities'][name] > 0.9
-    assert all(0.0 <= item <= 1.0 for item in content['probabilities'].values())
+    assert found.probabilities.keys() == EFFECTS.keys()
+    assert found.probabilities[name] > 0.9
+    assert all(0.0 <= item <= 1.0 for item in found.probabilities.values())
+    assert content['probabilities'] is None  # they are not calibrated
     fitted = content['missing_effects'][0]['parameters'][parameter]
     assert abs(fitted['value'] - values[parameter]) < 4.0 * fitted['standard_error']
     before, after = content['error_before']['rms'], content['error_after']['rms']
@@ -195,16 +196,18 @@ def test_effect_on_the_scatter_is_traced(name, values, parameter, tolerance):
 
 
 @pytest.mark.machines
-def test_clock_is_traced_pulse_by_pulse():
+def test_declared_clock_refines_the_prediction_pulse_by_pulse():
     model = DeclaredModel(**{**vars(MODEL), 'keyphasor_rate': 2000.0})
     quantised = make_effects({'keyphasor_quantisation': {'clock_rate': 2000.0,
                                                          'period_std': 4e-6}})
     content = report(traced(*quantised, model=model, jitter=False))
-    assert content['verdict'] == 'traced'
-    assert content['missing_effects'][0]['name'] == 'keyphasor_quantisation'
-    clock = content['missing_effects'][0]['parameters']['clock_rate']
+    assert (content['verdict'], content['missing_effects']) == ('none', [])
+    clock, = [item for item in content['declared_changes'] if item['parameter'] == 'clock_rate']
+    assert (clock['name'], clock['declared']) == ('keyphasor_quantisation', None)
     assert clock['value'] == pytest.approx(2000.0, rel=1e-6)
-    assert content['error_after']['rms'] < 0.2 * content['error_before']['rms']
+    assert content['error_after'] == content['error_before']
+    assert content['error_after']['rms'] < 0.2 * content['error_as_declared']['rms']
+    assert 'clock_rate' in content['parameter_file']
 
 
 @pytest.mark.machines
@@ -378,8 +381,10 @@ def test_measured_gearbox_needs_the_phases_of_its_pulses(shared_data):
     model = DeclaredModel(keyphasor_rate=3300.0, trigger_speed=33.33, trigger_cycles=40,
                           orders=(23.0, 46.0, 69.0, 92.0, 115.0))
     content = report(trace([observe(recording, model)], [recording]))
-    assert content['missing_effects'][0]['name'] == 'keyphasor_quantisation'
-    assert content['error_before']['rms'] > 0.1
+    changes = {item['parameter']: item['value'] for item in content['declared_changes']}
+    assert changes['clock_rate'] == pytest.approx(3300.0, rel=1e-6)
+    assert changes['noise_std'] > 0.0
+    assert content['error_as_declared']['rms'] > 0.1
     assert content['error_after']['rms'] < 0.015
 
 
@@ -401,7 +406,8 @@ def test_recording_that_hides_its_pulse_errors_says_what_it_cannot_exclude(share
         assert {'additive_noise', 'amplitude_modulation'} <= set(content['undecided'])
     else:  # no error of a single pulse shows, but bends do, and noise, of which none is declared
         assert content['error_after']['rms'] < 1e-3
-        assert [item['name'] for item in content['missing_effects']] == ['additive_noise']
+        assert content['missing_effects'] == []
+        assert 'noise_std' in [item['parameter'] for item in content['declared_changes']]
         assert 0.0 < upper['amplitude_modulation'] < 1.0
     assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
 

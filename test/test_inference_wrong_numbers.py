@@ -119,7 +119,7 @@ def test_noise_below_the_declared_is_another_number_and_no_effect(recording):
     change, = content['declared_changes']
     assert (change['name'], change['parameter']) == ('noise', 'noise_std')
     assert abs(change['value'] - NOISE) < 3.0 * change['standard_error'] < 0.05 * NOISE
-    assert content['error_before']['chi2_per_dof'] < 0.5
+    assert content['error_as_declared']['chi2_per_dof'] < 0.5
     assert 0.7 < content['error_after']['chi2_per_dof'] < 1.4
     assert ('noise is not as it was declared.') in [meaning for meaning, _ in findings(content)]
     section, = yaml.safe_load(content['parameter_file']).values()

@@ -54,8 +54,8 @@ class Given(Influence):
 def simulate(model, order, iterations, seed):
     """Amplitudes of one order of whole trigger cycles, noise included."""
     averaged = AveragedSignal(model.trigger_cycles, model.cycle_length, order)
-    noise = (4.0 * model.noise_std**2 / (model.sample_rate * model.duration)
-             if model.noise_std else 0.0)
+    noise = (4.0 * model.noise**2 / (model.sample_rate * model.duration)
+             if model.noise else 0.0)
 
     class Scaled:
         """The declared distribution in fundamental cycles."""

@@ -42,7 +42,7 @@ def logarithmic(low, high):
 
 @st.composite
 def anywhere(draw, most_cycles=1_000_000):
-    """A setting anywhere in the domain: errors from 1e-15 of a trigger cycle up to all of it."""
+    """Draw any setting of the domain: errors from 1e-15 of a trigger cycle up to all of it."""
     distribution = draw(st.sampled_from([*WIDTHS, 'table']))
     speed, unit = draw(logarithmic(1.0, 200.0)), ()
     share = draw(logarithmic(1e-15, 0.99))

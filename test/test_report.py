@@ -37,7 +37,7 @@ pytestmark = pytest.mark.machines
 RATIO, SPEED, RATE, CLOCK = 183 / 76, 25.0, 8192.0, 20000.0
 NAMES = {'residual', 'distribution', 'pulse_errors', 'trigger_cycle', 'amplitudes'}
 MODEL = DeclaredModel(keyphasor_rate=CLOCK, trigger_speed=SPEED, trigger_cycles=20,
-                      orders=(19.0, 38.0), ratio=RATIO)
+                      orders=(19.0, 38.0), ratio=RATIO, noise_std=0.05, sample_rate=RATE)
 
 
 def traced(marks=1, **effects):

@@ -53,7 +53,7 @@ class AdditiveNoise(DirectEffect):
     @classmethod
     def _power(cls, evidence: Evidence) -> tuple[float, float, float]:
         """Return the declared power of the noise, that around the lines, and its error."""
-        known = evidence.model.noise_std**2 + sum(
+        known = evidence.model.noise**2 + sum(
             effect.std**2 for effect in evidence.explained if isinstance(effect, cls))
         power = evidence.lines.noise_density**2
         count, width = power.shape
@@ -83,9 +83,19 @@ class AdditiveNoise(DirectEffect):
         error = math.hypot(error, 2.0 * _LINES * value)
         std, std_error = root(value - known, error)
         text = (f'the lines scatter as white noise of {np.sqrt(value):.3g} per sample '
-                f'would make them, noise_std is {np.sqrt(known):.3g}')
+                'would make them, '
+                + (f'noise_std is {np.sqrt(known):.3g}' if evidence.model.noise_is_declared
+                   else 'and noise_std is not declared'))
         return weighed(Finding(cls.name, cls(std), {'std': std_error}, 1.0, text),
                        _likelihood((value - known) / error, evidence), 1, evidence)
+
+
+def measured_noise(evidence: Evidence) -> tuple[float, float] | None:
+    """Return the noise per sample, and its error, None where no line shows it."""
+    _, value, error = AdditiveNoise._power(evidence)
+    if not (value > 0.0 and error > 0.0):
+        return None
+    return root(value, math.hypot(error, 2.0 * _LINES * value))
 
 
 def less_noise(evidence: Evidence) -> tuple[float, float] | None:

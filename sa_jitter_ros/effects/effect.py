@@ -249,8 +249,7 @@ def weighed(finding: Finding, likelihood: float, parameters: int, evidence: Evid
     found = replace(finding, gain=gain, p_value=min(
         1.0, tried * float(special.chdtrc(parameters, 2.0 * likelihood))))
     return found if gain > ODDS else absent(
-        finding.name, 'the likelihood gains too little by it: probability '
-        f'{found.probability:.2g}', p_value=found.p_value, gain=gain)
+        finding.name, 'the likelihood gains too little by it', p_value=found.p_value, gain=gain)
 
 
 def same(found: Any, known: Any) -> bool:

@@ -25,7 +25,7 @@ import numpy as np
 from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, parameter, require_in_turn)
 from sa_jitter_ros.effects.evidence import root
-from sa_jitter_ros.effects.lattice import SAME_RATE
+from sa_jitter_ros.effects.lattice import Clock, SLOPE_OFF
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import Pulses
@@ -33,7 +33,6 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 
 _SEED = 6
 _PARTS = 8
-_OFF = 0.25  # what the slope of the errors over those that a grid imposes may be off by
 
 
 def _of_grid(setting: Setting) -> Array:
@@ -53,7 +52,7 @@ class KeyphasorQuantisation(Effect):
         'a clock rounds the pulse times to its ticks, so that the errors of neighbouring '
         'pulses depend on each other')
     remedy: ClassVar[str] = 'sample the keyphasor faster, or time its edges by a counter'
-    timing: ClassVar[Pattern] = Pattern(_of_grid, off_by=_OFF, replaces_jitter=True)
+    timing: ClassVar[Pattern] = Pattern(_of_grid, off_by=SLOPE_OFF, replaces_jitter=True)
     clock_rate: float = parameter(10000.0, 'rate of the clock that times the pulses', 'Hz',
                                   above=0.0)
     period_std: float = parameter(0.0, 'standard deviation of the trigger period', 's',
@@ -85,7 +84,7 @@ class KeyphasorQuantisation(Effect):
 
     def replaces_jitter(self, model: DeclaredModel) -> bool:
         """Return whether this clock is the declared one."""
-        return abs(self.clock_rate / model.keyphasor_rate - 1.0) < SAME_RATE
+        return Clock(self.clock_rate, 0.0).same_as(model.keyphasor_rate)
 
     @classmethod
     def of_timing(cls, sizes: Array, errors: Array, setting: Setting

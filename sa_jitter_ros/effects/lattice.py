@@ -25,6 +25,8 @@ Array = NDArray[Any]
 SAME_RATE = 0.01
 #: Of a tick: what errors that a clock makes may be wrong by, and what none is seen below.
 ROOM = 0.02
+#: What the slope of errors over those of the smoothest motion on a grid may be off by.
+SLOPE_OFF = 0.25
 _STEPS = 3000
 # Ticks that an interval holds at least: with fewer, pulses are no time measurement.
 _COARSEST = 4.0
@@ -41,6 +43,10 @@ class Clock:
     rate: float
     standard_error: float
     dithered: bool = False
+
+    def same_as(self, rate: float) -> bool:
+        """Return whether it is a clock of this `rate`."""
+        return abs(self.rate - rate) < SAME_RATE * rate
 
     def visible(self, declared: float) -> bool:
         """Return whether there is one whose tick is not lost in one of the `declared` rate."""

@@ -11,6 +11,7 @@
 """The function `predict` of the library: a prediction from the parameters of the predictor."""
 
 from collections.abc import Mapping, Sequence
+import math
 from types import MappingProxyType
 from typing import Any
 
@@ -27,7 +28,7 @@ def predict(
     *, keyphasor_rate: float, trigger_speed: float, trigger_cycles: int,
     orders: Sequence[float], ratio: float = 1.0, pulses_per_revolution: int = 1,
     pulses_per_trigger: int = 0, jitter_distribution: str = 'uniform', jitter_std: float = 0.0,
-    jitter_table: Sequence[float] = (), noise_std: float = 0.0, sample_rate: float = 0.0,
+    jitter_table: Sequence[float] = (), noise_std: float = math.nan, sample_rate: float = 0.0,
     angle_law: str = 'linear', effects: Mapping[str, Mapping[str, Any]] = _NONE,
 ) -> prediction.Prediction:
     """
@@ -37,7 +38,7 @@ def predict(
     in s, `orders` in multiples of the shaft of interest. `keyphasor_rate` is the rate at which the
     keyphasor is sampled, `trigger_cycles` the number N_t of trigger cycles in an average, `ratio`
     the speed of the shaft of interest over that of the tach shaft, `pulses_per_trigger` 0 all
-    pulses of a revolution. `effects` maps the name of an effect to its parameters.
+    pulses of a revolution, `noise_std` NaN no noise. `effects` maps the name of an effect to its parameters.
 
     The attributes of the result are the fields of the topic `prediction`, arrays with one entry
     per order, for a component of amplitude 1; `loss` is 1 - |E X|, and `cdf(amplitude)` and

@@ -55,7 +55,7 @@ class Dependence:
         name = self.on.replace('_', ' ')
         unit = f' {self.unit}' if self.unit else ''
         return (f'what is left changes by {self.change:+.4f} from {name} {self.low:.4g} to '
-                f'{self.high:.4g}{unit} (p = {self.p_value:.2g})')
+                f'{self.high:.4g}{unit}')
 
 
 def moving(found: Sequence[Dependence]) -> Dependence | None:

@@ -21,7 +21,8 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, on_grid, ROOM, sizes_within_ticks, smooth_on_grid, ticks_leave_room)
+    Clock, find_clock, on_grid, ROOM, sizes_within_ticks, SLOPE_OFF, smooth_on_grid,
+    ticks_leave_room)
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
@@ -38,6 +39,7 @@ Array = NDArray[Any]
 STRONG = 0.2
 _COHERENT = 0.9
 _GROUPS = 3
+_LAGS = 5  # at which errors on the ticks of a clock depend on each other, where they do
 
 
 @dataclass(frozen=True)
@@ -138,18 +140,51 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
 
 def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
     """
-    Return the clock of the pulses, and the errors (pulse,) of the smoothest motion on its grid.
+    Return the clock of the pulses, and what its grid says of their errors (pulse,).
 
-    These are None where no clock shows, or where its ticks are errors independent of each other.
+    That is the share of the errors of the smoothest motion on the grid that the vibration
+    confirms. None where no clock shows, where jitter moves pulses over its ticks, or where the
+    shaft moves so much from pulse to pulse that the smoothest motion is another one: the errors
+    are then uniform within their ticks.
     """
     times = observation.pulses.times
     clock = find_clock(times)
     if not clock.visible(observation.model.keyphasor_rate):
         return Clock(0.0, 0.0), None
     smooth = smooth_on_grid(times, clock.rate)
-    if dithered(observation, clock, smooth):
+    share = _confirmed(observation, smooth)
+    untold = share < 1.0 - SLOPE_OFF and _independent(observation)
+    if untold or dithered(observation, clock, smooth):
         return replace(clock, dithered=True), None
-    return clock, smooth
+    return clock, min(max(share, 0.0), 1.0) * smooth
+
+
+def _confirmed(observation: Observation, smooth: Array) -> float:
+    """
+    Return the slope of the errors of the pulses over those of the `smooth`est motion (pulse,).
+
+    It is 1 where the vibration shows no errors.
+    """
+    usable = [item for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
+    imposed = _of_acquisitions(smooth, usable) if usable else np.zeros((0, 1))
+    imposed = imposed - imposed.mean(axis=1, keepdims=True)
+    power = float(np.sum(imposed**2))
+    return float(np.sum(imposed * [item.errors for item in usable]) / power) if power else 1.0
+
+
+def _independent(observation: Observation) -> bool:
+    """Return whether recovered errors are independent from pulse to pulse, as far as they tell."""
+    usable = [item.errors for item in observation.acquisitions if np.all(np.isfinite(item.errors))]
+    if not usable or usable[0].size <= _LAGS + 1:
+        return False
+    errors = np.array(usable)
+    power = float(np.mean(errors**2))
+    if not power > 0.0:
+        return False
+    together = np.array([np.mean(errors[:, lag:] * errors[:, :-lag]) for lag in range(
+        1, _LAGS + 1)]) / power
+    chance = special.ndtri(1.0 - 0.5 * FALSE_ALARM / _LAGS)
+    return bool(np.all(np.abs(together) * math.sqrt(errors.size) < chance))
 
 
 def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:

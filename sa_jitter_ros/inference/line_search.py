@@ -294,6 +294,19 @@ def _turning(states: States) -> tuple[BoolArray, BoolArray]:
     return turning, single
 
 
+def with_a_shaft(states: States) -> BoolArray:
+    """
+    Tell which orders, and tones after them (line,), are certainly sharper over angle than time.
+
+    A shaft makes them, whatever its ratio: the speed that varies spreads them over time.
+    """
+    found = np.zeros(states.amplitudes.shape[1], np.bool_)
+    if states.orders.size > states.declared:
+        over_angle, over_time, _ = _both_ways(states)
+        found[states.declared:states.orders.size] = over_angle > over_time + ODDS
+    return found
+
+
 def fit_lines(states: States) -> None:
     """Fit the amplitudes of all lines, and tell which of them turn."""
     states.fit_amplitudes()

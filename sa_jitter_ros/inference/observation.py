@@ -32,6 +32,7 @@ from sa_jitter_ros.averaging.cycle import cycle_grid
 from sa_jitter_ros.averaging.noise import (
     attenuation, noise_floor, radial_noise, without_leakage)
 from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.inference.clock_steps import broken_at_steps, clock_steps, ClockStep
 from sa_jitter_ros.inference.cycle_reader import CycleReader, MARGIN
 from sa_jitter_ros.inference.order_band import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
@@ -128,7 +129,7 @@ class Observation:
     `orders` are the declared ones, `sources` these and the undeclared orders that leak into them.
     The amplitudes of an acquisition are those of `sources`. The trigger_speed of `model` is the
     measured mean; `declared_speed` (Hz) is the declared one. `recoveries` are those of the
-    recordings, none on line.
+    recordings, none on line; `clock_steps` are where their clock steps.
     """
 
     model: DeclaredModel
@@ -142,6 +143,7 @@ class Observation:
     declared_speed: float
     name: str = ''
     recoveries: tuple[RecordRecovery, ...] = ()
+    clock_steps: tuple[ClockStep, ...] = ()
 
     @property
     def compared(self) -> tuple[int, ...]:
@@ -207,6 +209,17 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
             'trigger_cycles or record longer'
             + ''.join(f' ({remark})' for remark in pulses.remarks))
     recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses, model)
+    steps = clock_steps(reader, pulses, recovery.stretches, model)
+    if steps:
+        pulses = broken_at_steps(pulses, steps)
+        recovery = recover_record(samples, recording.start_time, recording.sample_rate, pulses,
+                                  model)
+        starts = _starts(pulses, model.trigger_cycles, reader, angle_law(model.angle_law))
+        if not starts:
+            raise RecordingError(
+                f'the clock steps {len(steps)} times, first at {steps[0].time:.6g} s by '
+                f'{steps[0].step:.3g} s: no acquisition of {model.trigger_cycles} trigger cycles '
+                'is left between; lower trigger_cycles, or record without losing samples')
     orders = np.array(sources if len(sources) else [*once, *leaking_orders(recovery, model)])
     bare = replace(pulses, reference=None)
     found, referenced = [], []
@@ -224,7 +237,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, declared_speed,
-        recording.description, (recovery,))
+        recording.description, (recovery,), steps)
 
 
 def together(observations: Sequence[Observation]) -> Observation:
@@ -266,7 +279,8 @@ def together(observations: Sequence[Observation]) -> Observation:
                    acquisitions=tuple(acquisition for item in observations
                                       for acquisition in item.acquisitions),
                    recoveries=tuple(recovery for item in observations
-                                    for recovery in item.recoveries))
+                                    for recovery in item.recoveries),
+                   clock_steps=tuple(step for item in observations for step in item.clock_steps))
 
 
 def recovered_again(recording: Recording, observation: Observation, channels: Sequence[int]

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.timing import ROUNDING
 from sa_jitter_ros.inference.cycle_states import States
 from sa_jitter_ros.inference.line_search import (
-    add_lines, FALSE, fit_lines, follow_speed, follow_trend, let_stand, new_lines, prune, refine)
+    add_lines, FALSE, fit_lines, follow_speed, follow_trend, let_stand, new_lines, prune, refine,
+    with_a_shaft)
 from sa_jitter_ros.inference.order_band import band_end, OrderBand
 from sa_jitter_ros.inference.slips import mend_slips
 from scipy.special import gammaincc
@@ -185,7 +186,7 @@ def _result(states: States, false_alarm: float) -> RecordFit:
         errors, np.sqrt(states.variances(0)), _roughness(states), bends, bend_errors,
         states.declared, states.orders, states.tones, states.amplitudes[:, :states.orders.size],
         states.amplitudes[:, states.orders.size:],
-        np.sqrt(variances), states.turning,
+        np.sqrt(variances), states.turning | with_a_shaft(states),
         float(states.size[0]), states.size[:3] * np.array([weak, 1.0, 1.0]), states.trend,
         bool(gammaincc(shown.size, 0.5 * shown.sum()) < false_alarm))
 

@@ -94,6 +94,11 @@ class Residual:
         return _one_of_three(self.p_mean, self.p_scatter, self.p_amplitude_scatter)
 
     @property
+    def of_amplitude(self) -> bool:
+        """Return whether the scatter of the amplitude is the surest of what is not predicted."""
+        return self.p_amplitude_scatter <= min(self.p_mean, self.p_scatter)
+
+    @property
     def text(self) -> str:
         """Return the surest of what is not as predicted, in words."""
         _, text = min(
@@ -103,7 +108,7 @@ class Residual:
              'predicted'),
             (self.p_amplitude_scatter, 'the amplitudes scatter more among the held-out '
              'acquisitions than predicted'))
-        return f'{text} (p = {self.p_value:.2g})'
+        return text
 
 
 def _one_of_three(*p_values: float) -> float:

@@ -26,18 +26,18 @@ from sa_jitter_ros.effects.effect import Finding, possible
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.inference.expectation import expect, Expectation, Lines, Memory
+from sa_jitter_ros.inference.gate import HeldOut
 from sa_jitter_ros.inference.gathering import gather
 from sa_jitter_ros.inference.observation import Observation
-from sa_jitter_ros.inference.residual import FALSE_ALARM, Residual, residual, Sensitivity
+from sa_jitter_ros.inference.residual import (
+    ACCURACY, FALSE_ALARM, Residual, residual, Sensitivity)
+from sa_jitter_ros.inference.unsteady import STEADY, unsteady_lines, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import component_gain
 from sa_jitter_ros.prediction.influence import Pulses
 from scipy import special
 
 Array = NDArray[Any]
 
-#: Relative scatter of an amplitude from average to average that steady machines were measured to
-#: have and that no effect describes (docs/measured_cases.md).
-STEADY = 0.02
 _FREEDOM = 4.0  # with fewer degrees, a variance is hardly known
 
 
@@ -115,6 +115,12 @@ class Bench:
         return replace(self, declared=tuple(
             item for item in self.declared if item.name != name))
 
+    def declaring(self, effects: Sequence[Effect]) -> 'Bench':
+        """Return the bench of a model that declares some more effects."""
+        return replace(self, declared=(*self.declared, *effects),
+                       fewer=self.fewer and self.fewer.declaring(effects),
+                       hidden=self.hidden and self.hidden.declaring(effects))
+
     def with_declared(self, effects: Sequence[Effect]) -> list[Effect]:
         """Return the declared effects and others, which take the place of those of their name."""
         names = {item.name for item in effects}
@@ -160,6 +166,18 @@ class Bench:
             kept = kept * self._without_jitter(self.moving, chosen).attenuation
         return (kept * of('attenuation'), of('attenuation_standard_error') ** 2,
                 kept * np.abs(of('raw')) / self.level)
+
+    def unsteady_lines(self, effects: Sequence[Effect]) -> tuple[UnsteadyLine, ...]:
+        """Return the lines that vary more than noise, pulse errors and effects let them."""
+        orders = self.observation.orders.size
+        known = self._corrected_variance(effects)
+        if not all(item.recovered for item in self.observation.acquisitions) and not (
+                self.observation.against_reference):  # then the pulse errors are in them
+            every = range(len(self.observation.acquisitions))
+            known = self.expect(effects, every).amplitude_variance.mean(axis=0)
+        return unsteady_lines(
+            self.lines.of(np.abs(self.observation.stacked('corrected')[..., :orders])), known,
+            self.observation.orders, self.observation.channel_names, self.lines)
 
     def unsteadiness(self, effects: Sequence[Effect]) -> float:
         """
@@ -209,7 +227,7 @@ class Bench:
         whose variance is estimated scatter as Student's variable does.
         """
         attenuation, variance, amplitude = self.observed(self.held_out)
-        level = (self._corrected_variance(effects) + unsteadiness**2) / len(self.fit)
+        level = self._level_variance(effects, unsteadiness)
         unsure = np.sqrt(level + unsteadiness**2)
         expected = self.expect(effects, self.held_out, unsteadiness=unsure)
         moved, doubt = [], 0.0
@@ -233,6 +251,24 @@ class Bench:
             attenuation, expected.attenuation, expected.attenuation_variance + variance, amplitude,
             expected.amplitude, expected.amplitude_variance, expected.cdf(amplitude),
             level_variance=level, sensitivities=moved)
+
+    def held_out_prediction(self, effects: Sequence[Effect], *, unsteadiness: float) -> HeldOut:
+        """Return what declared model and effects say of the held-out acquisitions, one by one."""
+        attenuation, variance, amplitude = self.observed(self.held_out)
+        unsure = np.sqrt(self._level_variance(effects, unsteadiness) + unsteadiness**2)
+        expected = self.expect(effects, self.held_out, unsteadiness=unsure)
+        found = HeldOut(
+            np.stack([attenuation, amplitude]),
+            np.stack([expected.attenuation, expected.amplitude]),
+            np.stack([expected.attenuation_variance + variance + ACCURACY**2,
+                      expected.amplitude_variance]), self.lines.count)
+        # orders that are not compared are predicted, too
+        return found if self.hidden is None else found.beside(
+            self.hidden.held_out_prediction(effects, unsteadiness=unsteadiness))
+
+    def _level_variance(self, effects: Sequence[Effect], unsteadiness: float) -> Array:
+        """Return by how much (line,) the levels err that were measured where parameters fit."""
+        return np.asarray((self._corrected_variance(effects) + unsteadiness**2) / len(self.fit))
 
     def _moved(self, effects: Sequence[Effect], findings: Sequence[Finding]
                ) -> Iterator[tuple[list[Effect], bool]]:

@@ -393,7 +393,7 @@ def _text(choice: Choice, name: str, effect: Effect, errors: Mapping[str, Any]) 
     """Say what was found and how surely."""
     remark = effect.remark(choice.setting.model)
     return (f'{effect.summary}: {_sizes(effect, errors)}{remark}, which pulse times and errors '
-            f'recovered from the vibration show; probability {choice.probabilities[name]:.3g}')
+            f'recovered from the vibration show')
 
 
 def _sizes(effect: Effect, errors: Mapping[str, Any]) -> str:
@@ -417,8 +417,7 @@ def _of_jitter(chooser: Chooser, choice: Choice) -> Finding:
     p_value = _p_value(choice, JITTER, chooser)
     same = math.sqrt(setting.model.distribution.variance)
     text = (f'independent pulse errors of {measured_text(scale * same, None, "s")}, '
-            f'{measured_text(scale, 0.5 * scale * error)} times the declared ones; probability '
-            f'{choice.probabilities[JITTER]:.3g} beside all other sets of effects')
+            f'{measured_text(scale, 0.5 * scale * error)} times the declared ones')
     rivals = tuple(name for name in choice.rivals(JITTER) if name in EFFECTS)
     odds = math.inf
     if scale > 1.0:  # the same power, but the distribution tells

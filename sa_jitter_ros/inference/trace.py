@@ -19,8 +19,8 @@ by that of what the lines show. They are fitted to some of the acquisitions and 
 others. The result may be that no effect explains the residual.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 import math
 from typing import Any
@@ -28,18 +28,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
-from sa_jitter_ros.effects.additive_noise import less_noise
+from sa_jitter_ros.effects.additive_noise import less_noise, measured_noise
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding, RARE
 from sa_jitter_ros.effects.evidence import Evidence
+from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
+from sa_jitter_ros.inference.clock_steps import ClockStep, steps_text
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines, Memory
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
+from sa_jitter_ros.inference.gate import gain, Gain, HeldOut, NO_GAIN, passed
 from sa_jitter_ros.inference.gathering import (
     channel_groups, choose_lines, gather_pulses, hidden_lines, line_evidence,
     pulse_evidence)
@@ -50,6 +53,7 @@ from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UN
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
 from sa_jitter_ros.inference.timing_checks import Check
+from sa_jitter_ros.inference.unsteady import unsteady_text, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.recordings.recording import Recording
@@ -64,6 +68,8 @@ _GAIN = 'amplitude_modulation'
 _UNDECIDED = 1e-2  # change of an average by what may be there
 _SCATTER = 'the scatter of the amplitudes'
 _WORSE = 'the attenuation of held-out acquisitions is predicted worse with it'
+_REFINES = 'its clock is the declared one: it refines the declared model (declared_changes)'
+_HARMS = 'held-out acquisitions are predicted worse with it than with the declared model'
 _MOST_LEFT = 'most of the residual of held-out acquisitions remains with it'
 _UNSEEN = 'nothing of it shows in this recording'
 _TAKEN = 'it is declared, and nothing tells whether it is there: it is taken as declared'
@@ -85,9 +91,13 @@ class Trace:
     (acquisition, line) of the `lines`, `attenuation` and `amplitude` the observed values.
     `evidence` is that of the first round, less declared effects only. `unsteadiness` is the
     unexplained scatter of the amplitudes relative to their level, part of the scale of both
-    residuals. `noise` is the noise per sample and its standard error where it is less than
-    declared, which `after` and `prediction_after` take for declared. `not_compared` says why there
-    are no `lines`, '' where there are some.
+    residuals. What only refines the declared model is part of all residuals and predictions but
+    `as_declared`: `noise`, the noise per sample and its standard error where it was not declared
+    or is less, and the ticks of the declared clock (`refinements`). `not_compared` says why there
+    are no `lines`, '' where there are some. `gain` is what the findings gain over the declared
+    model on held-out acquisitions: with findings that predict these worse there is no trace.
+    `clock` is that on whose ticks the pulses lie; `remains` says what is left over, '' where nothing is; `unsteady` are the lines that vary by
+    themselves, `not_testable` the effects that could not be looked for, and why.
     """
 
     observation: Observation
@@ -117,6 +127,19 @@ class Trace:
     probabilities: Mapping[str, float]
     not_compared: str = ''
     noise: tuple[float, float] | None = None
+    refinements: tuple[Finding, ...] = ()
+    as_declared: Residual = UNDEFINED
+    gain: Gain = NO_GAIN
+    remains: str = ''
+    unsteady: tuple[UnsteadyLine, ...] = ()
+    not_testable: Mapping[str, str] = field(default_factory=dict)
+    clock: Clock = Clock(0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Refuse effects with which held-out acquisitions are predicted worse."""
+        if self.findings and self.gain.worse:
+            names = ', '.join(item.name for item in self.findings)
+            raise ValueError(f'{names}: {_HARMS}')
 
 
 def trace(observations: Sequence[Observation], recordings: Sequence[Recording], *,
@@ -205,38 +228,49 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     coherent = choose_lines(observation).count > 0  # else no line holds the angle to the pulses
     timing = read_timing([replace(item, held=item.held and coherent) for item in parts], declared,
                          names=frozenset())
+    known = [item.name for item in declared]
+    noise: tuple[float, float] | None = None
+    gained, harmful, unsteady = NO_GAIN, list[Finding](), tuple[UnsteadyLine, ...]()
+    tried: list[Candidate] = []
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
         return _published_change(observation, others, [*others, effect])
 
-    known = [item.name for item in declared]
     if bench is None:
-        evidence, by_how_much, tried = pulse_evidence(observation), change, []
-        findings = [kind.fit(evidence) for kind in EFFECTS.values()
-                    if issubclass(kind, DirectEffect) and kind.visible_in_pulse_times
-                    and kind.name not in known and not kind.unmodelled(observation.model)]
-        found = [replace(item, largest_change=change(declared, item.effect)) for item in findings
+        evidence, by_how_much = pulse_evidence(observation), change
+        found = [replace(item, largest_change=change(declared, item.effect)) for item in (
+            kind.fit(evidence) for kind in EFFECTS.values()
+            if issubclass(kind, DirectEffect) and kind.visible_in_pulse_times
+            and kind.name not in known and not kind.unmodelled(observation.model))
                  if item.effect is not None]
     else:
+        bench, noise = _of_noise(bench)
         evidence = bench.gather((), range(count))
         by_how_much = partial(bench.change, chosen=_few(bench))
         tried = candidates_of_lines(bench, ())
         found = [item.finding for item in tried if not item.rejected_because]
+        found, harmful, gained = passed(
+            found, _predicting(bench, bench.unsteadiness(_effects(found))))
+        unsteady = bench.unsteady_lines(_effects(found))
     present = [item.finding for item in tried
                if item.rejected_because and item.finding.effect is not None]
     rows = limits(timing, evidence, [*known, *(item.name for item in (*found, *present))])
-
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
     undecided = tuple(row.name for row in rows if row.name in {
         *open_, *_undecided(by_how_much, declared, rows)})
+    tested = {item.name for item in (*found, *tried)}
+    left_over = _left_over(observation, '', harmful, unsteady)
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
-        tuple(present), tuple(tried), UNDEFINED, UNDEFINED, (), (), np.zeros((count, 0)),
-        np.zeros((count, 0)), nothing, nothing, None, 'traced' if found else 'none', float('nan'),
+        tuple(present), tuple(_without_harmful(tried, harmful)), UNDEFINED, UNDEFINED, (), (),
+        np.zeros((count, 0)), np.zeros((count, 0)), nothing, nothing, None,
+        'unexplained' if left_over else 'traced' if found else 'none', float('nan'),
         None, None, rows, undecided,
         {**{row.name: absent(row.name, _UNSEEN).probability for row in rows},
          **_probabilities(None, tried), **{item.name: item.probability for item in found}},
-        reason)
+        reason, noise, gain=gained, remains=left_over, unsteady=unsteady,
+        not_testable={name: reason for name in EFFECTS if name not in tested},
+        clock=Clock(0.0, 0.0) if bench is None else bench.clock)
 
 
 def _published_change(observation: Observation, without: Sequence[Effect],
@@ -267,15 +301,6 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     observation, declared = bench.observation, bench.declared
     everything = range(len(observation.acquisitions))
     say = progress or (lambda text: None)
-    as_declared, (bench, noise) = bench, _less_noise(bench)
-    whole = _refitted(bench, timing)
-    chosen, present = _of_timing(bench, timing, whole)
-    first = as_declared.score((), unsteadiness=as_declared.unsteadiness(()))
-    say(f'declared model: p = {first.p_value:.2g}, RMS residual {first.rms:.4f}')
-    if noise is not None:
-        say(f'found noise of {noise[0]:.3g}, less than declared')
-    bench = bench.with_moving_source(_effects(chosen))
-    at_first = dependences(bench, (), ())
     known = {item.name for item in declared}
 
     def tell(found: Sequence[Finding]) -> None:
@@ -283,10 +308,20 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
             what = 'other numbers of ' if finding.name in known else ''
             say(f'found {what}{finding.name}: {finding.evidence}')
 
+    as_declared = bench.score((), unsteadiness=bench.unsteadiness(()))
+    say(f'declared model: RMS residual {as_declared.rms:.4f}')
+    bench, noise = _of_noise(bench)
+    if noise is not None:
+        say(f'noise of {noise[0]:.3g} per sample, '
+            + ('less than declared' if observation.model.noise_is_declared else 'not declared'))
+    whole = _refitted(bench, timing)
+    chosen, present = _of_timing(bench, timing, whole)
+    bench, refinements, chosen, present = _refined(bench, chosen, present)
     tell(chosen)
     candidates = [Candidate(finding.name, 0, finding, None, '') for finding in chosen]
     candidates += [Candidate(finding.name, 0, finding, None, too_small(finding))
                    for finding in present]
+    candidates += [Candidate(finding.name, 0, finding, None, _REFINES) for finding in refinements]
     tried = candidates_of_lines(bench, chosen)
     candidates += tried
     added = [item.finding for item in tried if not item.rejected_because]
@@ -295,62 +330,167 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
     present += [item.finding for item in tried
                 if item.rejected_because and item.finding.effect is not None]
     evidence = bench.gather((), everything)
+    scores = _scored(bench, chosen)
+    left = _unexplained(scores.bench, whole, chosen)
+    significant = left is not None or remains(scores.after, scores.moves_after)
+    certain, candidates = _certain(scores, left, chosen, candidates)
+    scores = scores if len(certain) == len(chosen) else _scored(bench, certain)
+    chosen, harmful, gained = passed(certain, _predicting(scores.bench, scores.unsteadiness))
+    candidates = _without_harmful(candidates, harmful)
+    scores, effects = _scored(bench, chosen) if harmful else scores, _effects(chosen)
+    unsteady = scores.bench.unsteady_lines(effects)
+    left_over = _left_over(observation, _most_left(left, scores, unsteady) if significant else '',
+                           harmful, unsteady)
+    attenuation, _, amplitude = scores.bench.observed(everything)
+    rows = limits(timing, evidence, [item.name for item in (*chosen, *present, *refinements)])
+    assumed = [item.name for item in bench.assumed]
+    candidates += _not_tried(bench, timing, candidates, known)
+    final = tuple(_on_all(bench, whole, [*chosen, *present, *refinements]))
+    few, own = partial(bench.change, chosen=_few(bench)), scores.unsteadiness
+    return Trace(
+        observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
+        final[:len(chosen)], final[len(chosen):len(chosen) + len(present)], tuple(candidates),
+        scores.before, scores.after, scores.moves_before, scores.moves_after, attenuation,
+        amplitude, scores.bench.expect((), everything, unsteadiness=own),
+        scores.bench.expect(effects, everything, unsteadiness=own), evidence,
+        'unexplained' if left_over else 'traced' if chosen else 'none', own, timing, left,
+        rows, (*_undecided(few, effects, rows), *assumed), _probabilities(timing, candidates),
+        '', noise, final[len(chosen) + len(present):], as_declared, gained, left_over, unsteady,
+        {**bench.untold, **_without_timing(timing)}, bench.clock)
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """What a bench says of the held-out acquisitions without and with the chosen effects."""
+
+    bench: Bench
+    unsteadiness: float
+    before: Residual
+    after: Residual
+    moves_before: tuple[Dependence, ...]
+    moves_after: tuple[Dependence, ...]
+
+
+def _scored(bench: Bench, chosen: Sequence[Finding]) -> _Scores:
+    """Score the chosen effects against the declared model."""
     effects = _effects(chosen)
+    bench = bench.with_moving_source(effects)
     own = bench.unsteadiness(effects)
-    as_declared = as_declared.with_moving_source(effects)
-    before = as_declared.score((), unsteadiness=own) if chosen or noise else first
-    after = bench.score(effects, chosen, unsteadiness=own) if chosen or noise else first
-    moves = dependences(bench, effects, chosen) if chosen else at_first
-    left = _unexplained(bench, whole, chosen)
-    unexplained = remains(after, moves) or left is not None
-    of_timing = left.text if left is not None else _little_is_gained(chosen, before, after) if (
-        unexplained) else ''
-    of_lines = _SCATTER if left is None and after.p_amplitude < FALSE_ALARM else ''
-    if of_timing or of_lines:
-        chosen, candidates = _beyond_doubt(chosen, candidates, of_timing, of_lines)
-        effects = _effects(chosen)
-        bench = bench.with_moving_source(effects)
-        as_declared = as_declared.with_moving_source(effects)
-        own = bench.unsteadiness(effects)
-        before = as_declared.score((), unsteadiness=own)
-        after = bench.score(effects, chosen, unsteadiness=own)
-        moves = dependences(bench, effects, chosen)
-    attenuation, _, amplitude = bench.observed(everything)
-    rows = limits(timing, evidence, [item.name for item in (*chosen, *present)])
+    before, moves = bench.score((), unsteadiness=own), dependences(bench, (), ())
+    if not chosen:
+        return _Scores(bench, own, before, before, moves, moves)
+    return _Scores(bench, own, before, bench.score(effects, chosen, unsteadiness=own), moves,
+                   dependences(bench, effects, chosen))
+
+
+def _predicting(bench: Bench, own: float) -> Callable[[Sequence[Finding]], HeldOut]:
+    """Return how the held-out acquisitions, so unsteady, are predicted with some findings."""
+    return lambda findings: bench.held_out_prediction(_effects(findings), unsteadiness=own)
+
+
+def _certain(scores: _Scores, left: Check | None, chosen: list[Finding],
+             candidates: list[Candidate]) -> tuple[list[Finding], list[Candidate]]:
+    """Return the effects that do not merely absorb a part of what is left, and the candidates."""
+    of_timing = left.text if left is not None else ''
+    if left is None and remains(scores.after, scores.moves_after):
+        of_timing = _little_is_gained(chosen, scores.before, scores.after)
+    of_lines = _SCATTER if left is None and scores.after.p_amplitude < FALSE_ALARM else ''
+    if not (of_timing or of_lines):
+        return chosen, candidates
+    return _beyond_doubt(chosen, candidates, of_timing, of_lines)
+
+
+def _most_left(left: Check | None, scores: _Scores, unsteady: Sequence[UnsteadyLine]) -> str:
+    """Return the surest of what is left; lines that vary say it better than their scatter."""
+    if left is not None:
+        return left.text
+    moves = moving(scores.moves_after)
+    if moves is not None:
+        return str(moves)
+    return '' if any(item.large for item in unsteady) and scores.after.of_amplitude else scores.after.text
+
+
+def _left_over(observation: Observation, most: str, harmful: Sequence[Finding],
+               unsteady: Sequence[UnsteadyLine]) -> str:
+    """Return in words what no effect explains, '' where nothing is left."""
+    worse = [f'{", ".join(item.name for item in harmful)}: {_HARMS}'] if harmful else []
+    steps = [steps_text(observation.clock_steps)] if observation.clock_steps else []
+    large = [item for item in unsteady if item.large]
+    lines = [unsteady_text(large)] if large else []
+    return '; '.join(filter(None, (*steps, most, *worse, *lines)))
+
+
+def _without_harmful(candidates: Sequence[Candidate], harmful: Sequence[Finding]
+                     ) -> list[Candidate]:
+    """Return the candidates, of which those that predict worse are rejected."""
+    names = {item.name for item in harmful}
+    return [replace(item, rejected_because=_HARMS) if item.name in names
+            and not item.rejected_because else item for item in candidates]
+
+
+def _not_tried(bench: Bench, timing: Timing | None, candidates: Sequence[Candidate],
+               known: Collection[str]) -> list[Candidate]:
+    """Return a candidate for every effect that is none yet, with the reason why."""
     named = {item.name for item in candidates}
     assumed = [item.name for item in bench.assumed]
-    for name in EFFECTS:
-        if name in named:
-            continue
+    found = []
+    for name in (name for name in EFFECTS if name not in named):
         if name in known:
             reason = _TAKEN if name in assumed else _AS_DECLARED
         elif timing is not None and name in timing.probabilities:
-            reason = ('the likelihood of the timing gains nothing by it: probability '
-                      f'{timing.probabilities[name]:.2g}')
+            reason = 'the likelihood of the timing gains too little by it'
         else:
             reason = bench.untold.get(name, _UNSEEN)
-        candidates.append(Candidate(name, 0, absent(name, reason), None, reason))
-    final = tuple(_on_all(bench, whole, [*chosen, *present]))
-    return Trace(
-        observation, declared, bench.lines, bench.level, bench.fit, bench.held_out,
-        final[:len(chosen)], final[len(chosen):], tuple(candidates), before, after, at_first,
-        moves, attenuation, amplitude,
-        as_declared.expect((), everything, unsteadiness=own),
-        bench.expect(effects, everything, unsteadiness=own), evidence,
-        'unexplained' if unexplained else 'traced' if chosen else 'none', own, timing, left,
-        rows, (*_undecided(partial(bench.change, chosen=_few(bench)), effects, rows), *assumed),
-        _probabilities(timing, candidates), noise=noise)
+        found.append(Candidate(name, 0, absent(name, reason), None, reason))
+    return found
 
 
-def _less_noise(bench: Bench) -> tuple[Bench, tuple[float, float] | None]:
-    """Return the bench, and the noise where averages scatter less than with the declared one."""
-    found = less_noise(bench.gather((), bench.fit))
+def _without_timing(timing: Timing | None) -> Mapping[str, str]:
+    """Return the effects on the timing where nothing shows it, and why."""
+    if timing is not None:
+        return {}
+    return {name: 'the recording holds too few consecutive trigger cycles'
+            for name, kind in EFFECTS.items() if kind.timing is not None}
+
+
+def _of_noise(bench: Bench) -> tuple[Bench, tuple[float, float] | None]:
+    """
+    Return the bench with the noise of the recording where that refines what was declared.
+
+    That is where no noise was declared, or where averages scatter less than with the declared one.
+    """
+    evidence = bench.gather((), bench.fit)
+    if not bench.observation.model.noise_is_declared:
+        found = measured_noise(evidence)
+        return (bench, None) if found is None else (bench.with_noise(found[0]), found)
+    found = less_noise(evidence)
     if found is None:
         return bench, None
     quiet = bench.with_noise(found[0])
     declared, true = (np.sqrt(item.expect((), bench.fit).amplitude_variance.mean(axis=0))
                       for item in (bench, quiet))
     return (quiet, found) if np.max(declared - true) >= ACCURACY else (bench, None)
+
+
+def _refined(bench: Bench, chosen: list[Finding], present: list[Finding]
+             ) -> tuple[Bench, list[Finding], list[Finding], list[Finding]]:
+    """
+    Return the bench with the ticks of the declared clock, these, and the other findings.
+
+    A keyphasor that is sampled at the declared rate has them: they are no effect that the declared
+    model lacks. Where acquisitions are predicted worse with them, they are left out.
+    """
+    ticks = [item for item in (*chosen, *present)
+             if isinstance(item.effect, KeyphasorQuantisation)
+             and item.effect.replaces_jitter(bench.observation.model)
+             and item.name not in {effect.name for effect in bench.declared}]
+    if not ticks:
+        return bench, [], chosen, present
+    refined = bench.declaring(_effects(ticks))
+    own = refined.unsteadiness(())
+    worse = gain(_predicting(bench, own)([]), _predicting(refined, own)([]), of_mean=True).worse
+    others = ([item for item in items if item not in ticks] for items in (chosen, present))
+    return (bench, [], *others) if worse else (refined, ticks, *others)
 
 
 def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None

@@ -40,11 +40,14 @@ def descriptor_of(item: Parameter) -> ParameterDescriptor:
         limits.append(f'one of {", ".join(item.choices)}')
     if item.above is not None:
         limits.append(f'more than {item.above}')
+    may_be_nan = isinstance(item.default, float) and math.isnan(item.default)
+    if may_be_nan:  # which ROS takes for out of every range
+        limits.append('NaN' + ('' if item.minimum is None else f', or at least {item.minimum}'))
     # With dynamic typing ROS passes an integer on to `_convert`, which makes it a float.
     descriptor = ParameterDescriptor(
         description=text, read_only=item.read_only, dynamic_typing=True,
         additional_constraints='; '.join(limits))
-    if item.minimum is not None or item.maximum is not None:
+    if (item.minimum is not None or item.maximum is not None) and not may_be_nan:
         low = -math.inf if item.minimum is None else item.minimum
         high = math.inf if item.maximum is None else item.maximum
         if item.kind is float:

@@ -254,7 +254,7 @@ class ResidualAnalyser(MonitoringNode):
         self._untraced += averages - sum(content['acquisitions'].values())
         self._verdict = content['verdict']
         self._missing_effect.publish(String(data=json.dumps(content, allow_nan=False)))
-        found = {item.name: item.effect.values for item in trace.findings
+        found = {item.name: item.effect.values for item in (*trace.findings, *trace.refinements)
                  if item.effect is not None}
         changed = (found or self._added) if self._significant else (found and not self._added)
         if self._values['close_loop'] and changed:

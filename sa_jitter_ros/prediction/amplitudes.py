@@ -145,8 +145,8 @@ def component_gain(model: DeclaredModel, influences: Sequence[Influence]) -> Arr
 def line_variance(model: DeclaredModel, influences: Sequence[Influence]) -> Array:
     """Return E|n|^2 (order,) of declared noise and all influences in a peak amplitude."""
     total: Array = np.zeros(len(model.orders))
-    if model.noise_std:
-        total = total + noise_line_variance(model.noise_std, model.sample_rate, model.duration)
+    if model.noise:
+        total = total + noise_line_variance(model.noise, model.sample_rate, model.duration)
     for item in influences:
         total = total + _of_orders('line_variance', item.line_variance(model), model, 0.0)
     return total

@@ -195,7 +195,7 @@ class Empirical:
 
     @cached_property
     def values(self) -> int:
-        """Number of different values."""
+        """Return the number of different values."""
         return int(np.unique(self.table).size)
 
     @property

@@ -38,8 +38,9 @@ class DeclaredModel:
 
     Rates and speeds are in Hz, times in s, orders in multiples of the shaft of interest.
     `pulses_per_trigger` 0 means all pulses of a revolution, `jitter_std` 0 the standard deviation
-    1/(sqrt(12) keyphasor_rate), `sample_rate` 0 unknown; `angle_law` is that of the average. What
-    a distribution does not use (`jitter_std` of a uniform one, `jitter_table` of any but table)
+    1/(sqrt(12) keyphasor_rate), `noise_std` NaN that the noise is not declared (no noise is
+    predicted), `sample_rate` 0 unknown; `angle_law` is that of the average. What a distribution
+    does not use (`jitter_std` of a uniform one, `jitter_table` of any but table)
     may stay set, so that the distribution can be switched. Raises ModelError for values that make
     no sense.
 
@@ -63,7 +64,7 @@ class DeclaredModel:
     jitter_distribution: str = 'uniform'
     jitter_std: float = 0.0
     jitter_table: tuple[float, ...] = ()
-    noise_std: float = 0.0
+    noise_std: float = math.nan
     sample_rate: float = 0.0
     angle_law: str = 'linear'
 
@@ -73,8 +74,11 @@ class DeclaredModel:
             object.__setattr__(self, item.name, unwrapped(getattr(self, item.name)))
         for name in ('keyphasor_rate', 'trigger_speed', 'ratio'):
             _require(name, getattr(self, name), lambda value: value > 0.0, 'above 0')
-        for name in ('jitter_std', 'noise_std', 'sample_rate'):
+        for name in ('jitter_std', 'sample_rate'):
             _require(name, getattr(self, name), lambda value: value >= 0.0, '0 (unset) or above')
+        if self.noise_is_declared:
+            _require('noise_std', self.noise_std, lambda value: value >= 0.0,
+                     'NaN (not declared), 0 or above')
         _require('pulses_per_revolution', self.pulses_per_revolution,
                  lambda value: value >= 1 and float(value).is_integer(), 'whole, at least 1')
         _require('pulses_per_trigger', self.pulses_per_trigger,
@@ -113,6 +117,16 @@ class DeclaredModel:
                 f'pulse errors spread over {width:.3g} s but a trigger cycle lasts '
                 f'{self.trigger_period:.3g} s, so pulses could swap: raise keyphasor_rate or '
                 'pulses_per_trigger, or lower jitter_std or trigger_speed')
+
+    @property
+    def noise_is_declared(self) -> bool:
+        """Return whether the noise is declared; NaN says that it is not."""
+        return not (isinstance(self.noise_std, float) and math.isnan(self.noise_std))
+
+    @property
+    def noise(self) -> float:
+        """Return the standard deviation of the declared noise per sample, 0 for none."""
+        return self.noise_std if self.noise_is_declared else 0.0
 
     @property
     def distribution(self) -> PulseErrorDistribution:

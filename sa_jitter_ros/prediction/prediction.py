@@ -104,7 +104,7 @@ class Prediction:
     @property
     def noise_standard_deviation(self) -> float:
         """Return the standard deviation of the declared noise per vibration sample."""
-        return self.model.noise_std
+        return self.model.noise
 
     @property
     def loss(self) -> Array:

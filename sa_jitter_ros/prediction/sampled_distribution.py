@@ -265,8 +265,8 @@ def _of_few_values(process: Any) -> bool:
 def affordable_draws(orders: int, trigger_cycles: int, places: int) -> int:
     """Return how many averages of so many phasors are worth their time and memory."""
     phasors = orders * (trigger_cycles + 3) * places
-    count = int(np.clip(_BUDGET // phasors, _FEWEST, max(_MOST // max(trigger_cycles // 4, 1),
-                                                          _FEWEST)))
+    largest = max(_MOST // max(trigger_cycles // 4, 1), _FEWEST)
+    count = int(np.clip(_BUDGET // phasors, _FEWEST, largest))
     most = min(MOST_PHASORS, LONGEST * orders)
     count = max(COARSEST, min(count, COARSEST * most // phasors))
     return int(2 ** math.floor(math.log2(count)))  # as a lattice needs

@@ -19,7 +19,7 @@ from typing import Any
 
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.number_text import (
-    measured_text, number_text, order_text, p_text, percent_text)
+    measured_text, number_text, order_text, percent_text)
 from sa_jitter_ros.report.figures import illustrate, Illustration
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
 from sa_jitter_ros.report.report import parameter_unit
@@ -220,26 +220,23 @@ def _error_table(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
     return _table(('', 'before', 'after'), [
         *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
-        ('p value of the residual', p_text(before['p_value']), p_text(after['p_value'])),
-        ('unsteadiness: unexplained scatter of the amplitudes, which chi2 and p value take into '
-         'account', *2 * (percent_text(content['unsteadiness']),))])
+        ('unsteadiness: unexplained scatter of the amplitudes, which chi2 takes into account',
+         *2 * (percent_text(content['unsteadiness']),))])
 
 
 def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
     return _table(
-        ('over', 'from', 'to', 'change of the residual, before', 'p value', 'after',
-         'p value, after'),
+        ('over', 'from', 'to', 'change of the residual, before', 'after'),
         [(item['on'].replace('_', ' '), number_text(item['low']),
           measured_text(item['high'], None, item['unit']),
-          *(text for when in ('before', 'after') for text in (
-              measured_text(item[when]['change'], item[when]['standard_error']),
-              p_text(item[when]['p_value'])))) for item in rows], kind='cards')
+          *(measured_text(item[when]['change'], item[when]['standard_error'])
+            for when in ('before', 'after'))) for item in rows], kind='cards')
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
-    return _table(('effect', 'round', 'held-out score', 'p value', 'outcome'), [
+    return _table(('effect', 'round', 'held-out score', 'outcome'), [
         (item['name'], item['round'], number_text(item['held_out_score']),
-         p_text(item['p_value']), item['rejected_because'] or 'added')
+         item['rejected_because'] or 'added')
         for item in candidates], kind='cards')
 
 

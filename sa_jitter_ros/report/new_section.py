@@ -33,7 +33,8 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
     It declares the `models` of all shafts, by their names, as before, with the effects added; what
     is new has a remark.
     """
-    found = {item.name: item.effect for item in trace.findings if item.effect is not None}
+    found = {item.name: item.effect for item in (*trace.findings, *trace.refinements)
+             if item.effect is not None}
     model, declared = trace.observation.model, {item.name: item for item in trace.declared}
     if not found and trace.noise is None:
         return ''
@@ -45,7 +46,8 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
         for place, each in places.items():
             value = trace.observation.declared_speed if item.name == 'trigger_speed' else getattr(
                 each, item.name)
-            if item.default is MISSING or value != item.default:
+            undeclared = item.name == 'noise_std' and not each.noise_is_declared
+            if not undeclared and (item.default is MISSING or value != item.default):
                 values[place] = value
     remarks = {}
     skew = found.get(ClockSkew.name)
@@ -57,7 +59,8 @@ def new_section(trace: Trace, models: Mapping[str, DeclaredModel]) -> str:
             remarks[place] = f'was {model.ratio:.{_DIGITS_OF_RATIO}g}'
     if trace.noise is not None:
         values['noise_std'] = _short(trace.noise[0])
-        remarks['noise_std'] = f'was {model.noise_std:g}'
+        remarks['noise_std'] = (f'was {model.noise_std:g}' if model.noise_is_declared
+                                else 'measured')
     if declared or found:
         values['effects'] = {}
     for name, effect in {**declared, **found}.items():

@@ -22,8 +22,9 @@ from sa_jitter_ros.effects.additive_noise import AdditiveNoise
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import departs, Finding, same
 from sa_jitter_ros.effects.jitter_scale import JitterScale
+from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.inference.candidates import Candidate
-from sa_jitter_ros.inference.dependence import Dependence, moving
+from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace import Trace
 from sa_jitter_ros.json_values import json_values
@@ -75,27 +76,27 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'limits': [{'name': item.name, 'parameter': item.parameter, 'upper_95': item.upper,
                     'lower_95': item.lower, 'unit': item.unit} for item in trace.limits],
         'undecided': list(trace.undecided),
-        'probabilities': dict(trace.probabilities),
+        'probabilities': None,
         'declared_changes': _changes(trace),
         'candidates': [_candidate(item) for item in trace.candidates],
         'error_before': errors(trace.before),
         'error_after': errors(trace.after),
+        'error_as_declared': errors(trace.as_declared),
+        'gain': asdict(trace.gain),
         'dependence': [_dependence(*pair) for pair in zip(
             trace.dependences_before, trace.dependences_after)],
         'unsteadiness': trace.unsteadiness,
         'verdict': trace.verdict,
-        'remains': _remains(trace),
+        'remains': trace.remains,
+        'clock_steps': [{'time': item.time, 'step': item.step,
+                         'standard_error': item.standard_error}
+                        for item in observation.clock_steps],
+        'unsteady_lines': [asdict(item) for item in trace.unsteady],
+        'not_testable': [{'name': name, 'reason': reason}
+                         for name, reason in trace.not_testable.items()],
         'lines': lines,
     })
     return content
-
-
-def _remains(trace: Trace) -> str:
-    """Return what no effect explains, '' where nothing is left."""
-    if trace.verdict != 'unexplained':
-        return ''
-    return trace.left.text if trace.left else str(
-        moving(trace.dependences_after) or trace.after.text)
 
 
 def errors(item: Residual) -> Mapping[str, Json]:
@@ -105,7 +106,7 @@ def errors(item: Residual) -> Mapping[str, Json]:
         'cramer_von_mises': item.cramer_von_mises, 'coverage_95': item.coverage,
         'mean': item.mean.mean() if item.mean.size else None,
         'rms_standard_error': item.rms_standard_error,
-        'rms_parameter_error': item.rms_parameter_error, 'p_value': item.p_value}
+        'rms_parameter_error': item.rms_parameter_error, 'p_value': None}
 
 
 def summary(content: Mapping[str, Json]) -> str:
@@ -121,6 +122,8 @@ def summary(content: Mapping[str, Json]) -> str:
                         f'{", ".join(effect["indistinguishable_from"])}')
     for item in other_numbers(content):
         text.append(f'{item["name"]}: {change_text(item, content["unit"])}')
+    text += [f'measured {item["name"]}: {change_text(item, content["unit"])}'
+             for item in refinements(content)]
     if content['lines']:
         text.append(f'held-out error (RMS of observed minus predicted attenuation): '
                     f'{before["rms"]:.4f} before, {after["rms"]:.4f} after')
@@ -130,22 +133,30 @@ def summary(content: Mapping[str, Json]) -> str:
         text.append(content['remains'])
     if content['unsteadiness']:
         text.append('unexplained scatter of the amplitudes (unsteadiness): '
-                    f'{content["unsteadiness"]:.2%}; chi2 and p value take it into account')
+                    f'{content["unsteadiness"]:.2%}; chi2 takes it into account')
     return '\n'.join(text)
 
 
 def other_numbers(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
     """Return the changes of declared numbers that no missing effect stands for."""
     declared = content['declared']['effects']
-    return [item for item in content['declared_changes'] if item['name'] in declared or (
-        item['parameter'] == 'noise_std' and item['value'] < item['declared'])]
+    return [item for item in content['declared_changes'] if item['declared'] is not None and (
+        item['name'] in declared or (
+            item['parameter'] == 'noise_std' and item['value'] < item['declared']))]
+
+
+def refinements(content: Mapping[str, Json]) -> Sequence[Mapping[str, Json]]:
+    """Return the numbers that were not declared and that the recording shows."""
+    return [item for item in content['declared_changes'] if item['declared'] is None]
 
 
 def change_text(item: Mapping[str, Json], unit: str) -> str:
     """Return a number of a declared effect as it is and as it was declared."""
     unit = parameter_unit(item['name'], item['parameter'], item['unit'], unit)
-    return (f'{item["parameter"]} = {measured_text(item["value"], item["standard_error"], unit)}, '
-            f'declared as {measured_text(item["declared"], None, unit)}')
+    before = ('not declared' if item['declared'] is None else
+              f'declared as {measured_text(item["declared"], None, unit)}')
+    value = measured_text(item['value'], item['standard_error'], unit)
+    return f'{item["parameter"]} = {value}, {before}'
 
 
 def _not_compared(trace: Trace) -> Sequence[str]:
@@ -161,7 +172,7 @@ def _not_compared(trace: Trace) -> Sequence[str]:
 def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
     return {'on': before.on, 'unit': before.unit, 'low': before.low, 'high': before.high,
             **{when: {'change': item.change, 'standard_error': item.standard_error,
-                      'p_value': item.p_value}
+                      'p_value': None}
                for when, item in (('before', before), ('after', after))}}
 
 
@@ -174,7 +185,7 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
     small = [item for item in trace.present if item.effect is not None and (
         departs(item.effect, item.standard_errors, declared[item.name], cycles)
         if item.name in declared
-        else isinstance(item.effect, AdditiveNoise) and model.noise_std > 0.0)]
+        else isinstance(item.effect, AdditiveNoise) and model.noise > 0.0)]
     for item in (*trace.findings, *small):
         effect = item.effect
         if effect is None:
@@ -192,9 +203,18 @@ def _changes(trace: Trace) -> list[Mapping[str, Json]]:
                 if error.get(name) is not None or not same(before, value):
                     found.append((item.name, name, before, value, error.get(name), limits.unit))
         elif isinstance(effect, AdditiveNoise):
-            total = math.hypot(model.noise_std, effect.std)
+            total = math.hypot(model.noise, effect.std)
             found.append(('noise', 'noise_std', model.noise_std, total,
                           effect.std / total * error['std'], '1'))
+    if trace.clock.same_as(model.keyphasor_rate) and not trace.refinements and (
+            KeyphasorQuantisation.name not in {name for name, *_ in found} | declared.keys()):
+        found.append((KeyphasorQuantisation.name, 'clock_rate', None, trace.clock.rate,
+                      trace.clock.standard_error, 'Hz'))
+    for item in trace.refinements:
+        assert item.effect is not None
+        found += [(item.name, name, None, item.effect.values[name],
+                   item.standard_errors.get(name), limits.unit)
+                  for name, limits in parameter_ranges(type(item.effect)).items()]
     if trace.noise is not None:
         found.append(('noise', 'noise_std', model.noise_std, *trace.noise, '1'))
     keys = 'name', 'parameter', 'declared', 'value', 'standard_error', 'unit'
@@ -214,14 +234,14 @@ def _effect(finding: Finding) -> Mapping[str, Json]:
                               'standard_error': finding.standard_errors.get(name),
                               'unit': ranges[name].unit}
                        for name, value in finding.effect.values.items()},
-        'evidence': evidence, 'p_value': finding.p_value,
+        'evidence': evidence, 'p_value': None,
         'deciding_measurement': finding.deciding_measurement,
         'indistinguishable_from': list(finding.indistinguishable_from)}
 
 
 def _candidate(item: Candidate) -> Mapping[str, Json]:
     return {'name': item.name, 'round': item.stage, 'held_out_score': item.held_out_score,
-            'p_value': item.finding.p_value, 'rejected_because': item.rejected_because,
+            'p_value': None, 'rejected_because': item.rejected_because,
             'added': not item.rejected_because}
 
 

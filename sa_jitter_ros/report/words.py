@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.number_text import order_text, p_text, percent_text
-from sa_jitter_ros.report.report import change_text, other_numbers, parameters_text
+from sa_jitter_ros.number_text import order_text, percent_text
+from sa_jitter_ros.report.report import (
+    change_text, other_numbers, parameters_text, refinements)
 
 Json = Any
 
@@ -54,17 +55,18 @@ def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
 def verdict_sentence(content: Mapping[str, Json]) -> str:
     """Return the verdict of a report in one sentence."""
     others = dict.fromkeys(item['name'] for item in other_numbers(content))
+    remains = f' What remains: {content["remains"]}.' if content['remains'] else ''
     names = _listed([*(item['name'] for item in content['missing_effects']),
                      *(f'the right numbers of {name}' for name in others)], 'and')
     if not content['lines'] and content['candidates']:  # the vibration holds lines
         found = f'Lines and pulse times show {names or "nothing"}'
         return (f'{found}; no attenuation can be compared with its prediction, since the errors '
-                'of single pulses do not show.')
+                f'of single pulses do not show.{remains}')
     if not content['lines']:
         found = f'The pulse times alone show {names}; nothing else' if names else (
             'Nothing was found, and nothing')
         return (f'{found} could have been seen: no line of the vibration can be compared with its '
-                'prediction.')
+                f'prediction.{remains}')
     if content['verdict'] == 'none':
         return ('The declared model suffices: the averages lose what it predicts, within '
                 f'{_rms(content, "before")} of an amplitude.')
@@ -75,8 +77,7 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
                     f'{_rms(content, "before")}.')
         return (f'The declared model lacks {names}. With it the prediction misses the measured '
                 f'amplitudes by {_rms(content, "after")} instead of {_rms(content, "before")}.')
-    missed = f'{_rms(content, "after")} (p {_equals(content["error_after"]["p_value"])})'
-    remains = f' What remains: {content["remains"]}.' if content['remains'] else ''
+    missed = _rms(content, 'after')
     if names:
         return (f'The averages are not explained: even with {names} the prediction misses the '
                 f'measured amplitudes by {missed}.{remains}')
@@ -95,11 +96,6 @@ def _rms(content: Mapping[str, Json], when: str) -> str:
     return percent_text(error['rms'], error['rms_standard_error'])
 
 
-def _equals(probability: Json) -> str:
-    text = p_text(probability)
-    return text if text.startswith('<') else f'= {text}'
-
-
 def findings(content: Mapping[str, Json]) -> Iterator[tuple[str, str]]:
     """Iterate over what was found: what it means, and the effect with its numbers."""
     for item in content['missing_effects']:
@@ -112,21 +108,33 @@ def findings(content: Mapping[str, Json]) -> Iterator[tuple[str, str]]:
     for item in other_numbers(content):
         yield (f'{item["name"]} is not as it was declared.',
                f'{change_text(item, content["unit"])}.')
+    for item in refinements(content):
+        yield ('The recording says more of the machine than was declared; predictions take it '
+               'into account.', f'{item["name"]}: {change_text(item, content["unit"])}.')
 
 
 def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
     """Return what to do next, the most useful first."""
     steps = []
     shares = order_shares(content)
-    if content['parameter_file']:
+    explained = content['verdict'] != 'unexplained'
+    if content['parameter_file'] and content['verdict'] == 'none' and not other_numbers(content):
+        steps.append('Nothing has to change: predictions hold for this machine. The section below '
+                     'declares, too, what the recording shows of it.')
+    elif content['parameter_file'] and explained:
         steps.append('Paste the section below into your machine file'
                      + (': predictions then hold for this machine.' if _improves(content) else
                         ' only if a longer recording confirms it: here predictions are no better '
                         'with it.'))
-    if content['verdict'] == 'unexplained':
-        steps.append('Do not rely on predictions for this machine. Take corrected amplitudes, '
-                     'which need none, and look in the evidence below at when and where the rest '
-                     'appears.')
+    if not explained:
+        steps.append('Do not rely on predictions for this machine'
+                     + (', not even with the section below, which declares what is certain'
+                        if content['parameter_file'] else '')
+                     + '. Take corrected amplitudes, which need none, and look in the evidence '
+                     'below at when and where the rest appears.')
+    if content['clock_steps']:
+        steps.append('Look for lost samples at the times of clock_steps: a buffer that overflows, '
+                     'or a file that was cut. Each average that holds such a time is left out.')
     if shares and min(item.observed for item in shares) < 1.0 - _LOSS:
         worst = min(shares, key=lambda item: item.observed)
         steps.append(

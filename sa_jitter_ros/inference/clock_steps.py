@@ -1,0 +1,187 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Steps of a clock: samples or pulses that were lost unnoticed, as the phases of the lines show.
+
+From such a place on all pulses are late, or early, by the same time, and all lines turn by it. That
+is no effect on an average: the recording is in two parts there, each right by itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.inference.cycle_reader import CycleReader
+from sa_jitter_ros.inference.record_pulses import RecordPulses
+from sa_jitter_ros.number_text import measured_text
+from sa_jitter_ros.prediction.model import DeclaredModel
+
+Array = NDArray[Any]
+
+# Cycles on either side whose mean phasors are compared, most and fewest, and of a sudden change.
+_BESIDE, _FEWEST, _SUDDEN = 24, 8, 4
+# Standard deviations of the contrasts of a record from which on one is a step: drifts make 5.
+_CLEAR = 8.0
+_MOST = 50  # steps of a record
+_FINE = 10  # times that are tried, in a period of the highest order
+_EVEN = 0.995  # likelihoods, over the best one, that are as good: then the smallest step counts
+_CHUNK = 500  # cycles read at once
+
+
+@dataclass(frozen=True)
+class ClockStep:
+    """
+    Pulses are late by `step` (s) more from `time` (s) on, with its `standard_error`.
+
+    `pulse` is the first of them among all trigger pulses, interpolated ones included. Lost samples
+    of the vibration make pulses late, lost time of the keyphasor early.
+    """
+
+    pulse: int
+    time: float
+    step: float
+    standard_error: float
+
+
+def clock_steps(reader: CycleReader, pulses: RecordPulses, stretches: Sequence[slice],
+                model: DeclaredModel) -> tuple[ClockStep, ...]:
+    """
+    Return the steps in unbroken `stretches` of the bridged pulses, in the order of time.
+
+    A step is a delay of all lines, of some cycles after a place against those before, that is far
+    beyond all such delays of the record and that one cycle makes. Delays are tried up to half a
+    trigger cycle; of those that turn the lines alike, the shortest counts.
+    """
+    found: list[ClockStep] = []
+    for part in stretches:
+        phasors = _Phasors.read(reader, pulses.bridged[part], model)
+        edges = [0, phasors.count]
+        while len(found) < _MOST and (step := _clearest(phasors, edges)) is not None:
+            at, size, error = step
+            pulse = part.start + at + 1  # the step is inside cycle `at`
+            found.append(ClockStep(pulse, float(np.mean(pulses.bridged[pulse - 1:pulse + 1])),
+                                   size, error))
+            edges = sorted([*edges, at])
+    return tuple(sorted(found, key=lambda item: item.pulse))
+
+
+def steps_text(steps: Sequence[ClockStep]) -> str:
+    """Return in words where the clock steps, and by how much."""
+    first = steps[0]
+    size = measured_text(abs(first.step), first.standard_error, 's')
+    way = 'late' if first.step > 0.0 else 'early'
+    more = f', and at {len(steps) - 1} later times' if len(steps) > 1 else ''
+    return (f'from {first.time:.6g} s on the pulses are {size} too {way} against the vibration'
+            f'{more}, as lost samples or a slipping shaft make them')
+
+
+def broken_at_steps(pulses: RecordPulses, steps: Sequence[ClockStep]) -> RecordPulses:
+    """Return the pulses with a new run behind every step."""
+    later = np.searchsorted(pulses.number, [item.pulse for item in steps])
+    starts = pulses.starts_run.copy()
+    starts[later] = True
+    return replace(pulses, starts_run=starts)
+
+
+@dataclass(frozen=True)
+class _Phasors:
+    """
+    Sums of the phasors of consecutive trigger cycles, over the root of their noise.
+
+    `total` (cycle + 1, line) is that of all cycles before; `turns` (delay, line) are what the
+    `delays` (delay,) in s, shortest first, turn the lines by.
+    """
+
+    total: Array
+    delays: Array
+    turns: Array
+
+    @property
+    def count(self) -> int:
+        """Return the number of cycles."""
+        return len(self.total) - 1
+
+    @classmethod
+    def read(cls, reader: CycleReader, times: Array, model: DeclaredModel) -> '_Phasors':
+        """Return the phasors of the declared orders between pulses at `times` (s)."""
+        orders = np.array(tuple(dict.fromkeys(model.orders)))
+        rows = []
+        for first in range(0, times.size - 1, _CHUNK):
+            cycles = reader.amplitudes(
+                reader.cycles(times[first:first + _CHUNK + 1]), model, orders)
+            rows.append(cycles * np.exp(-2j * np.pi * model.cycle_length * first * orders))
+        phasors = np.concatenate(rows)
+        noise = np.mean(np.abs(np.diff(phasors, axis=0)) ** 2, axis=0) if len(phasors) > 1 else 1.0
+        scaled = phasors / np.sqrt(np.maximum(noise, np.finfo(float).tiny))
+        lines = np.concatenate([np.zeros((1, scaled[0].size)),
+                                np.cumsum(scaled.reshape(len(scaled), -1), axis=0)])
+        frequency = np.tile(orders * model.fundamental_frequency, phasors.shape[1])
+        step = 1.0 / (_FINE * float(frequency.max()))
+        reach = math.floor(0.5 * model.trigger_period / step)
+        delays = step * np.arange(-reach, reach + 1)
+        delays = delays[np.argsort(np.abs(delays), kind='stable')]
+        return cls(lines, delays, np.exp(-2j * np.pi * np.multiply.outer(delays, frequency)))
+
+    def delay(self, before: tuple[int, int], after: tuple[int, int]) -> float:
+        """Return by how much pulses of the cycles `after` are late against those `before`, s."""
+        both = self._both(before, after)
+        likely = (self.turns @ both).real
+        best = int(np.argmax(likely > likely.max() - (1.0 - _EVEN) * np.abs(both).sum()))
+        near = np.argsort(np.abs(self.delays - self.delays[best]), kind='stable')[:3]
+        if near.size < 3:
+            return float(self.delays[best])
+        near = near[np.argsort(self.delays[near])]
+        bend = np.polyfit(self.delays[near] - self.delays[near[1]], likely[near], 2)
+        return float(self.delays[near[1]] - (0.5 * bend[1] / bend[0] if bend[0] < 0.0 else 0.0))
+
+
+    def likelihood(self, at: int, beside: int, delay: float) -> float:
+        """Return how well a `delay` (s) in cycle `at` fits some cycles on either side."""
+        turn = np.interp(delay, *(values[np.argsort(self.delays)] for values in (
+            self.delays, (self.turns @ self._both((at - beside, at), (at + 1, at + 1 + beside))
+                          ).real)))
+        return float(turn)
+
+    def _both(self, before: tuple[int, int], after: tuple[int, int]) -> Array:
+        early, late = (self.total[stop] - self.total[start] for start, stop in (before, after))
+        return np.asarray(early.conj() * late)
+
+
+def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, float] | None:
+    """Return in which cycle the clearest step is, its size in s, and what that errs by."""
+    places, delays = [], []
+    for low, high in zip(edges[:-1], edges[1:]):
+        beside = min(_BESIDE, (high - low) // 3)
+        if beside >= _FEWEST:
+            for at in range(low + beside, high - beside):
+                places.append(at)
+                delays.append(phasors.delay((at - beside, at), (at + 1, at + 1 + beside)))
+    if len(places) < 2 * _BESIDE:
+        return None
+    usual = float(np.median(delays))
+    apart = np.array(delays) - usual
+    size = apart[np.argmax(np.abs(apart))]
+    away = np.abs(np.array(places) - places[int(np.argmax(np.abs(apart)))]) > _BESIDE
+    error = float(np.sqrt(np.mean(apart[away] ** 2))) if away.any() else math.inf
+    if not abs(size) > _CLEAR * error:
+        return None
+    near = [at for at in places if not away[places.index(at)]]
+    at = max(near, key=lambda place: phasors.likelihood(place, _FEWEST, size + usual))
+    first, last = max(edge for edge in edges if edge <= at), min(
+        edge for edge in edges if edge > at)
+    size = phasors.delay((max(first, at - 2 * _BESIDE), at),
+                         (at + 1, min(last, at + 1 + 2 * _BESIDE))) - usual
+    sudden = all(phasors.likelihood(at, _SUDDEN, size + usual) > phasors.likelihood(
+        at, _SUDDEN, part * size + usual) for part in (0.0, 0.5))
+    return (at, size, error) if sudden else None
