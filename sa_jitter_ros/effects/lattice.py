@@ -53,6 +53,9 @@ class Clock:
         return 0.0 < ROOM * self.rate < declared
 
 
+NO_CLOCK = Clock(0.0, 0.0)
+
+
 def find_clock(times: Array) -> Clock:
     """
     Find the clock whose ticks are all pulse `times` (n,) in s.

@@ -38,7 +38,8 @@ def predict(
     in s, `orders` in multiples of the shaft of interest. `keyphasor_rate` is the rate at which the
     keyphasor is sampled, `trigger_cycles` the number N_t of trigger cycles in an average, `ratio`
     the speed of the shaft of interest over that of the tach shaft, `pulses_per_trigger` 0 all
-    pulses of a revolution, `noise_std` NaN no noise. `effects` maps the name of an effect to its parameters.
+    pulses of a revolution, `noise_std` NaN no noise. `effects` maps the name of an effect to its
+    parameters.
 
     The attributes of the result are the fields of the topic `prediction`, arrays with one entry
     per order, for a component of amplitude 1; `loss` is 1 - |E X|, and `cdf(amplitude)` and

@@ -11,12 +11,13 @@
 """
 Steps of a clock: samples or pulses that were lost unnoticed, as the phases of the lines show.
 
-From such a place on all pulses are late, or early, by the same time, and all lines turn by it. That
-is no effect on an average: the recording is in two parts there, each right by itself.
+From such a place on all pulses are late, or early, by the same time, and all lines turn by it.
+That is no effect on an average: the recording is in two parts there, each right by itself.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 import math
 from typing import Any
 
@@ -145,13 +146,11 @@ class _Phasors:
         bend = np.polyfit(self.delays[near] - self.delays[near[1]], likely[near], 2)
         return float(self.delays[near[1]] - (0.5 * bend[1] / bend[0] if bend[0] < 0.0 else 0.0))
 
-
     def likelihood(self, at: int, beside: int, delay: float) -> float:
         """Return how well a `delay` (s) in cycle `at` fits some cycles on either side."""
-        turn = np.interp(delay, *(values[np.argsort(self.delays)] for values in (
-            self.delays, (self.turns @ self._both((at - beside, at), (at + 1, at + 1 + beside))
-                          ).real)))
-        return float(turn)
+        likely = (self.turns @ self._both((at - beside, at), (at + 1, at + 1 + beside))).real
+        rising = np.argsort(self.delays)
+        return float(np.interp(delay, self.delays[rising], likely[rising]))
 
     def _both(self, before: tuple[int, int], after: tuple[int, int]) -> Array:
         early, late = (self.total[stop] - self.total[start] for start, stop in (before, after))
@@ -161,7 +160,7 @@ class _Phasors:
 def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, float] | None:
     """Return in which cycle the clearest step is, its size in s, and what that errs by."""
     places, delays = [], []
-    for low, high in zip(edges[:-1], edges[1:]):
+    for low, high in pairwise(edges):
         beside = min(_BESIDE, (high - low) // 3)
         if beside >= _FEWEST:
             for at in range(low + beside, high - beside):

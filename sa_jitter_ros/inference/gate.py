@@ -62,8 +62,10 @@ class HeldOut:
 
     def beside(self, other: 'HeldOut') -> 'HeldOut':
         """Return the prediction of these lines and of those of another one, not compared."""
-        return HeldOut(*(np.concatenate([getattr(item, name) for item in (self, other)], axis=2)
-                         for name in ('observed', 'expected', 'variance')), self.compared)
+        observed, expected, variance = (
+            np.concatenate([getattr(item, name) for item in (self, other)], axis=2)
+            for name in ('observed', 'expected', 'variance'))
+        return HeldOut(observed, expected, variance, self.compared)
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,8 @@ def passed(findings: Sequence[Finding], predict: Callable[[Sequence[Finding]], H
     ``predict(findings)`` predicts with the declared model and these. The first to go is the one
     without which the held-out acquisitions are most likely.
     """
-    kept, dropped = list(findings), []
+    kept: list[Finding] = list(findings)
+    dropped: list[Finding] = []
     declared = predict([]) if kept else None
     while kept and declared is not None:
         found = gain(declared, predict(kept), of_mean=any(

@@ -32,13 +32,13 @@ from sa_jitter_ros.effects.additive_noise import less_noise, measured_noise
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding, RARE
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
-from sa_jitter_ros.effects.lattice import Clock, SAME_RATE
+from sa_jitter_ros.effects.lattice import Clock, NO_CLOCK, SAME_RATE
 from sa_jitter_ros.effects.target_geometry import TargetGeometry
 from sa_jitter_ros.effects.timing import Pattern, PULSES
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import (
     Candidate, candidates_of_lines, least_change, too_small)
-from sa_jitter_ros.inference.clock_steps import ClockStep, steps_text
+from sa_jitter_ros.inference.clock_steps import steps_text
 from sa_jitter_ros.inference.dependence import Dependence, dependences, moving
 from sa_jitter_ros.inference.expectation import Expectation, Lines, Memory
 from sa_jitter_ros.inference.fewer_cycles import with_fewer_cycles
@@ -96,8 +96,9 @@ class Trace:
     or is less, and the ticks of the declared clock (`refinements`). `not_compared` says why there
     are no `lines`, '' where there are some. `gain` is what the findings gain over the declared
     model on held-out acquisitions: with findings that predict these worse there is no trace.
-    `clock` is that on whose ticks the pulses lie; `remains` says what is left over, '' where nothing is; `unsteady` are the lines that vary by
-    themselves, `not_testable` the effects that could not be looked for, and why.
+    `clock` is that on whose ticks the pulses lie; `remains` says what is left over, '' where
+    nothing is; `unsteady` are the lines that vary by themselves, `not_testable` the effects that
+    could not be looked for, and why.
     """
 
     observation: Observation
@@ -133,7 +134,7 @@ class Trace:
     remains: str = ''
     unsteady: tuple[UnsteadyLine, ...] = ()
     not_testable: Mapping[str, str] = field(default_factory=dict)
-    clock: Clock = Clock(0.0, 0.0)
+    clock: Clock = NO_CLOCK
 
     def __post_init__(self) -> None:
         """Refuse effects with which held-out acquisitions are predicted worse."""
@@ -224,7 +225,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     count = len(observation.acquisitions)
     none, nothing = np.zeros(0, np.intp), Expectation((), np.zeros((count, 0)))
     fit, held_out = parted(count)
-    parts = stretches(observation, range(count), Clock(0.0, 0.0)) if observation.recoveries else []
+    parts = stretches(observation, range(count), NO_CLOCK) if observation.recoveries else []
     coherent = choose_lines(observation).count > 0  # else no line holds the angle to the pulses
     timing = read_timing([replace(item, held=item.held and coherent) for item in parts], declared,
                          names=frozenset())
@@ -258,7 +259,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     open_ = [row.name for row in rows if row.upper is None and row.lower is None]
     undecided = tuple(row.name for row in rows if row.name in {
         *open_, *_undecided(by_how_much, declared, rows)})
-    tested = {item.name for item in (*found, *tried)}
+    tested = {*(item.name for item in found), *(item.name for item in tried)}
     left_over = _left_over(observation, '', harmful, unsteady)
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
@@ -270,7 +271,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
          **_probabilities(None, tried), **{item.name: item.probability for item in found}},
         reason, noise, gain=gained, remains=left_over, unsteady=unsteady,
         not_testable={name: reason for name in EFFECTS if name not in tested},
-        clock=Clock(0.0, 0.0) if bench is None else bench.clock)
+        clock=NO_CLOCK if bench is None else bench.clock)
 
 
 def _published_change(observation: Observation, without: Sequence[Effect],
@@ -407,7 +408,8 @@ def _most_left(left: Check | None, scores: _Scores, unsteady: Sequence[UnsteadyL
     moves = moving(scores.moves_after)
     if moves is not None:
         return str(moves)
-    return '' if any(item.large for item in unsteady) and scores.after.of_amplitude else scores.after.text
+    said = scores.after.of_amplitude and any(item.large for item in unsteady)
+    return '' if said else scores.after.text
 
 
 def _left_over(observation: Observation, most: str, harmful: Sequence[Finding],
@@ -489,8 +491,9 @@ def _refined(bench: Bench, chosen: list[Finding], present: list[Finding]
     refined = bench.declaring(_effects(ticks))
     own = refined.unsteadiness(())
     worse = gain(_predicting(bench, own)([]), _predicting(refined, own)([]), of_mean=True).worse
-    others = ([item for item in items if item not in ticks] for items in (chosen, present))
-    return (bench, [], *others) if worse else (refined, ticks, *others)
+    chosen, present = ([item for item in items if item not in ticks]
+                       for items in (chosen, present))
+    return (bench, [], chosen, present) if worse else (refined, ticks, chosen, present)
 
 
 def _of_timing(bench: Bench, timing: Timing | None, whole: Timing | None

@@ -71,9 +71,9 @@ def unsteady_lines(amplitude: Array, known: Array, orders: Array, channels: Sequ
 
 
 def unsteady_text(lines: Sequence[UnsteadyLine]) -> str:
-    """Return in words which lines vary."""
+    """Return in words which lines vary, the worst first."""
     worst = lines[0]
     others = len(lines) - 1
-    more = f', and {others} other line{"s vary" if others > 1 else " varies"}, too' if others else ''
+    more = f' (and {others} more: see unsteady_lines)' if others else ''
     return (f'the amplitude of order {order_text(worst.order)} on {worst.channel} varies by '
             f'{percent_text(worst.scatter)} RMS from average to average{more}')

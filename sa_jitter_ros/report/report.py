@@ -178,7 +178,8 @@ def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
 
 def _changes(trace: Trace) -> list[Mapping[str, Json]]:
     """Return the declared numbers that are others, and what they are."""
-    model, found = trace.observation.model, []
+    model = trace.observation.model
+    found: list[tuple[Json, ...]] = []
     jitter = math.sqrt(model.distribution.variance)
     declared = {effect.name: effect for effect in trace.declared}
     cycles = len(trace.observation.acquisitions) * model.trigger_cycles
