@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.pulses.resampling import gain, METHODS
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATE, SPEED = 2000.0, 25.0
@@ -41,6 +42,8 @@ def same(first, second):
                     assert a.pulse_errors == pytest.approx(b.pulse_errors, abs=1e-12)
             elif item.name in ('parts', 'envelope'):
                 assert a is b is None
+            elif item.name == 'refused':
+                assert a == b
             elif item.name == 'amplitude_errors':
                 for x, y in zip(vars(a).values(), vars(b).values(), strict=True):
                     assert np.allclose(x, y, rtol=1e-6, atol=1e-12, equal_nan=True)
@@ -225,6 +228,61 @@ def test_orders_from_the_nyquist_frequency_on_are_named():
                       'Hz, and vibration sampled at 2000 Hz shows orders below 20 only'):
         average, = sa.average(VIBRATION, RATE, PULSES, ratio=2.0, orders=[2, 20, 30])
     assert np.array_equal(np.isnan(average.amplitudes[0]), [False, True, True])
+    assert list(average.refused) == [20.0, 30.0]
+    assert 'orders below 20 only' in average.refused[30.0]
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_amplitudes_are_over_the_gain_of_the_interpolator_as_far_as_half_is_left(method):
+    rate, speed = 4000.0, 24.2
+    time, pulses = np.arange(12_000) / rate, 0.031 + np.arange(60) / speed
+    orders = np.round(np.array([0.1, 0.3, 0.376, 0.43, 0.45, 0.49, 0.499]) * rate / speed)
+    expected = np.where(gain(method, orders * speed / rate) >= 0.5, 0.4, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore', sa.DataWarning)
+        for order, amplitude in zip(orders, expected):
+            vibration = 0.4 * np.cos(2.0 * np.pi * order * speed * time)
+            average, = sa.average(vibration, rate, pulses, orders=[order], interpolation=method)
+            found = abs(average.amplitudes[0, 0])
+            assert found == pytest.approx(amplitude, rel=1e-3, nan_ok=True)
+            assert np.isnan(average.amplitude_errors.upper_95[0, 0]) == np.isnan(found)
+            assert np.isnan(average.cycle_amplitudes).all() == np.isnan(found)
+            assert list(average.refused) == ([order] if np.isnan(found) else [])
+
+
+def test_gain_follows_a_speed_that_changes_during_the_average():
+    rate, order = 4000.0, 60.0
+    time = np.arange(16_000) / rate
+    turns = 20.0 * time + 1.2 * time**2  # order 60 from 0.30 to 0.44 of the sampling rate
+    pulses = np.interp(np.arange(1.0, 98.0), turns, time)
+    vibration = (1.0 + 0.2 * time) * np.cos(2.0 * np.pi * order * turns)
+    average, = sa.average(vibration, rate, pulses, orders=[order], angle_law='spline')
+    middle = 0.5 * (pulses[1:] + pulses[:-1])
+    expected = 1.0 + 0.2 * middle
+    assert average.gains.min() < 0.9
+    # of the first and the last two cycles the spline knows the speed less well
+    assert abs(average.cycle_amplitudes[2:-2, 0, 0]) == pytest.approx(expected[2:-2], rel=3e-3)
+    assert abs(average.amplitudes[0, 0]) == pytest.approx(expected.mean(), rel=2e-3)
+
+
+def test_correction_and_attenuation_near_the_end_of_the_band():
+    rate, speed, order = 4000.0, 25.0, 60.0
+    rng = np.random.default_rng(3)
+    time, pulses = np.arange(14_000) / rate, 0.041 + np.arange(82) / speed
+    late = pulses + rng.uniform(-1.0, 1.0, pulses.size) * 1.2e-4
+    vibration = np.cos(2.0 * np.pi * 20.0 * speed * time) + 0.4 * np.cos(
+        2.0 * np.pi * order * speed * time) + 0.01 * rng.standard_normal(time.size)
+    average, = sa.average(vibration, rate, late, orders=[20.0, order], correct_jitter=True,
+                          keyphasor_rate=4e3)
+    found = average.correction
+    assert average.gain[1] == pytest.approx(gain('band_limited', 0.375), abs=1e-4)
+    for off in (abs(found.amplitudes[0]) - [1.0, 0.4]) / found.amplitude_errors.amplitude[0]:
+        assert abs(off) < 4.0
+    assert found.amplitude_errors.amplitude[0, 1] < 1e-3
+    assert abs(average.amplitudes) / abs(found.amplitudes) == pytest.approx(found.attenuation)
+    turn = 2.0 * np.pi * order * speed * 1.2e-4
+    left = np.sinc(turn * np.linspace(0.0, 1.0, 501) / np.pi)
+    assert found.attenuation[0, 1] == pytest.approx(np.mean(left * left[::-1]), abs=0.05)
 
 
 def test_whole_floats_numpy_scalars_and_0d_arrays_are_numbers():

@@ -384,6 +384,7 @@ def test_orders_and_shafts_beyond_nyquist(bench):
     level, text, _ = b.diagnostics()  # as long as the order is asked for
     assert level == DiagnosticStatus.WARN
     assert text.startswith('orders of shaft: no amplitude of orders 300: the shaft turns at 33.3')
+    assert 'shows orders below' in text
 
 
 # --- parameters ----------------------------------------------------------------------------------

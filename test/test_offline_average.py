@@ -113,7 +113,8 @@ def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
     rows = table(out / 'rig' / 'averages.csv')
     assert list(rows[0]) == [
         'recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
-        'trigger_cycles', 'discarded_cycles', 'channel', *AMPLITUDE_FIELDS, 'channel_name']
+        'trigger_cycles', 'discarded_cycles', 'channel', *AMPLITUDE_FIELDS, 'channel_name',
+        'note']
     assert len(rows) == 4 * 2 * (1 + 2)
     arrays = np.load(out / 'rig' / 'averages.npz')
     row, = (row for row in rows if (row['shaft'], row['sequence'], row['channel'], row['order'])
@@ -125,6 +126,20 @@ def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
     assert everything == [{**row, 'error': ''} for row in rows]
     summary, = table(out / 'recordings.csv')
     assert (summary['averages'], summary['trigger_cycles'], summary['error']) == ('8', '82', '')
+    assert not any(row['note'] for row in rows)
+
+
+def test_an_order_beyond_the_band_has_a_note(rig, tmp_path):
+    out = tmp_path / 'out'
+    assert run(rig, '-p', 'shaft.orders:=[1.0, 5000.0]', '--output', out, '--quiet') == 0
+    rows = table(out / 'rig' / 'averages.csv')
+    assert list(rows[0])[-1] == 'note'
+    for row in rows:
+        refused = row['order'] == '5000.0'
+        assert ('shows orders below' in row['note']) == refused
+        assert (row['raw_amplitude'] == 'nan') == refused
+    with np.load(out / 'rig' / 'averages.npz') as arrays:
+        assert [bool(note) for note in arrays['shaft_note'][0]] == [False, True]
 
 
 def test_finished_recordings_are_skipped_until_settings_or_file_change(

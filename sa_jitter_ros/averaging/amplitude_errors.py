@@ -103,6 +103,11 @@ class AmplitudeErrors:
         limit = upper_limit(size if largest is None else largest, along) / left
         return cls(np.where(np.isnan(size), np.nan, along), _phase_error(size, across), limit)
 
+    def over(self, gain: FloatArray) -> 'AmplitudeErrors':
+        """Return those of the amplitudes over a `gain` (order,)."""
+        return AmplitudeErrors(self.amplitude / gain, self.phase + 0.0 * gain,
+                               self.upper_95 / gain)
+
     @classmethod
     def unknown(cls, shape: tuple[int, ...]) -> 'AmplitudeErrors':
         """Return errors of which nothing is known."""

@@ -10,7 +10,7 @@
 
 """The synchronous average: its parameters, its settings and its result."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 import math
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.amplitude_errors import AmplitudeErrors
 from sa_jitter_ros.averaging.envelope import Envelope, EnvelopeSettings
+from sa_jitter_ros.averaging.interpolator_gain import mean_gain
 from sa_jitter_ros.averaging.jackknife import WaveformParts
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, RATIO, whole_number
@@ -253,10 +254,13 @@ class Average:
     Times in s; `trigger_speed` is the mean speed of the tach shaft in Hz. `waveform` and its
     `standard_error` (channel, angle) are means over whole fundamental cycles at the `angle`
     (angle,) in revolutions of the shaft, NaN if no cycle is whole. `amplitudes` (channel, order)
-    are complex peak amplitudes over whole trigger cycles, NaN from the Nyquist frequency on; a
-    cosine whose maximum is at angle 0 has phase 0. `noise` (channel, order) is their standard
-    deviation along the radius. `first_angle` is the angle of the first pulse in revolutions of the
-    shaft since the start, `pulses` (N_t + 1,) are in s. `discarded_cycles` trigger cycles between
+    are complex peak amplitudes over whole trigger cycles, over what the interpolator leaves of
+    them, `gains` (cycle, order); a cosine whose maximum is at angle 0 has phase 0. They are NaN of
+    the orders that are `refused`, by their reason: those of which the interpolator leaves less
+    than half, or that reach half the sampling rate. `noise` (channel, order) is their standard
+    deviation along the radius. The waveform holds the loss by the interpolator. `first_angle` is
+    the angle of the first pulse in revolutions of the shaft since the start, `pulses` (N_t + 1,)
+    are in s. `discarded_cycles` trigger cycles between
     the first and the last pulse are not in the average: then there are more pulses, those at both
     ends of every run of consecutive cycles, and `used` (pulse,) says which of them begin a cycle
     of the average. `cycle_numbers` (N_t,) count from the first cycle, discarded ones included.
@@ -304,6 +308,13 @@ class Average:
     parts: WaveformParts | None = None
     correction: Correction | None = None
     envelope: Envelope | None = None
+    gains: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
+    refused: Mapping[float, str] = field(default_factory=dict)
+
+    @property
+    def gain(self) -> FloatArray:
+        """Return the mean gain (order,) of the interpolator, NaN of a refused order."""
+        return mean_gain(self.gains, self.orders, self.refused)
 
     @property
     def periods(self) -> FloatArray:
@@ -319,18 +330,3 @@ class Average:
                 f'{self.trigger_speed:.5g} Hz from {self.start_time:.6g} s to '
                 f'{self.end_time:.6g} s, waveform {self.waveform.shape}, orders '
                 f'{listed(self.orders)}{corrected})')
-
-
-def beyond_nyquist(average: Average, ratio: float, rate: float) -> str:
-    """
-    Return which orders have no amplitude because they are too high, '' if all have one.
-
-    The shaft turns `ratio` times as fast as the tach shaft, vibration is sampled at `rate` Hz.
-    """
-    speed = ratio * average.trigger_speed
-    orders = average.orders[average.orders * speed >= 0.5 * rate]
-    if not orders.size:
-        return ''
-    return (f'no amplitude of orders {listed(orders)}: the shaft turns at '
-            f'{speed:.5g} Hz, and vibration sampled at {rate:g} Hz shows orders below '
-            f'{0.5 * rate / speed:.5g} only; drop these orders, or check ratio and sample_rate')

@@ -23,8 +23,9 @@ import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.averaging.average import Average, beyond_nyquist, KeyphasorParameters
+from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.envelope import EnvelopeSettings
+from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
@@ -273,10 +274,9 @@ def average(
             + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
     if discarded:
         warnings.warn(f'{likely}; {discarded}' if likely else discarded, DataWarning, stacklevel=2)
-    beyond = beyond_nyquist(max(found, key=lambda item: item.trigger_speed), float(ratio),
-                            float(sample_rate))
-    if beyond:
-        warnings.warn(beyond, DataWarning, stacklevel=2)
+    refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
+    if refused:
+        warnings.warn(refused, DataWarning, stacklevel=2)
     return found
 
 

@@ -182,14 +182,14 @@ class CorrectingAverager:
         errors = average.amplitude_errors
         if correction.accepted:
             # The vibration and the declaration together know the jitter better than a few cycles.
-            raw, aligned = average.cycle_amplitudes, correction.cycle_amplitudes
             errors = Repeatability.of(
-                raw, _clean(average, raw, self.settings), average.orders,
+                *_resampled(average, average.cycle_amplitudes, self.settings), average.orders,
                 cycle_length=self.settings.cycle_length,
                 jitter=_in_cycles(correction.jitter_std, average, self.settings),
                 kurtosis=kurtosis_of(correction.pulse_errors),
-                corrected=Scatter.of(aligned, _clean(average, aligned, self.settings))).errors(
-                    average.amplitudes)
+                corrected=Scatter.of(*_resampled(
+                    average, correction.cycle_amplitudes, self.settings))).errors(
+                        average.amplitudes * average.gain).over(average.gain)
         return replace(average, correction=correction, amplitude_errors=errors)
 
 
@@ -198,10 +198,16 @@ def _in_cycles(seconds: float, average: Average, settings: AverageSettings) -> f
     return seconds * settings.cycle_length / float(np.mean(average.periods))
 
 
-def _clean(average: Average, cycles: ComplexArray, settings: AverageSettings) -> ComplexArray:
-    """Return the amplitudes of the `cycles` of an average without leakage between its orders."""
-    return without_leakage(cycles, settings.orders, settings.cycle_length,
-                           settings.cycle_length * average.cycle_numbers)
+def _resampled(average: Average, cycles: ComplexArray, settings: AverageSettings
+               ) -> tuple[ComplexArray, ComplexArray]:
+    """
+    Return amplitudes of the `cycles` of an average as the interpolator has left them.
+
+    The second result is without the leakage between the orders.
+    """
+    cycles = cycles * average.gains[:, None]
+    return cycles, without_leakage(cycles, settings.orders, settings.cycle_length,
+                                   settings.cycle_length * average.cycle_numbers)
 
 
 def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageSettings,
@@ -231,14 +237,15 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
     turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
     cycles_again = corrected.cycle_amplitudes
-    scatter = Scatter.of(cycles_again, _clean(raw, cycles_again, settings))
-    ratio, error = attenuation(raw.amplitudes, amplitudes, scatter.error_of_mean, turned)
+    gain = corrected.gain
+    scatter = Scatter.of(*_resampled(corrected, cycles_again, settings))
+    ratio, error = attenuation(raw.amplitudes, amplitudes, scatter.error_of_mean / gain, turned)
     return Correction(
         corrected.waveform, amplitudes, corrected.noise,
         np.where(recovery.resolved, recovery.errors, np.nan), recovery.standard_errors, True, '',
         ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
-            scatter, raw.orders, amplitudes=amplitudes, unsure=unsure, largest=whole,
-            jitter=_in_cycles(recovery.std, raw, settings)),
+            scatter, raw.orders, amplitudes=amplitudes * gain, unsure=unsure, largest=whole * gain,
+            jitter=_in_cycles(recovery.std, raw, settings)).over(gain),
         corrected.parts, recovery.std, refitted,
         _envelope(corrected, _between(raw, cycles, corrected.pulses), settings))
 
@@ -281,7 +288,7 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
         same = np.isclose(raw.orders, order, rtol=1e-9, atol=0.0) & np.isfinite(ratio)[:, None]
         told |= same
         factor = np.where(same, 1.0 / ratio[:, None], factor)
-        noise = np.where(same, of_one[:, None] ** 2 / raw.trigger_cycles, noise)
+        noise = np.where(same, (of_one[:, None] / raw.gain) ** 2 / raw.trigger_cycles, noise)
     whole = aligned.amplitudes * np.where(told, factor, 1.0 + lost)
     start = np.where(told, raw.amplitudes, aligned.amplitudes)
     # Noise that has aligned itself makes an order clear by chance: without evidence it is as clear

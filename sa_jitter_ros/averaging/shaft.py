@@ -29,7 +29,9 @@ from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
     joined, needed_margin, on_grid, waveform_cutoff, WaveformPoints)
+from sa_jitter_ros.averaging.interpolator_gain import InterpolatorGain, mean_gain
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
+from sa_jitter_ros.averaging.latest_rows import LatestRows
 from sa_jitter_ros.averaging.noise import radial_noise, without_leakage
 from sa_jitter_ros.averaging.running_mean import (BlockMean, ExponentialMean, PartsMean,
                                                   RunningMean, SlidingMean)
@@ -163,10 +165,14 @@ class ShaftAverager:
         return average
 
     def amplitudes(self, cycles: CycleSamples) -> ComplexArray:
-        """Take cycles as `update` does; return what all make, (cycle, channel, order)."""
+        """
+        Take cycles as `update` does; return what all make, (cycle, channel, order).
+
+        They hold the loss by the interpolator.
+        """
         self._take(cycles)
         self._average_waiting()
-        return self._window()
+        return np.asarray(self._amplitudes.get() * self._gains.get()[:, None])
 
     def _take(self, cycles: CycleSamples) -> None:
         """Let cycles wait; raise `SignalError`."""
@@ -212,12 +218,13 @@ class ShaftAverager:
         count = cycles.count
         if not self._counted:
             self._expect_from(self._angle(self._cycle))
-        amplitudes = self._resample(cycles)
-        beyond = self.beyond_nyquist(cycles.periods, cycles.rate)
-        if beyond.any():
-            amplitudes = np.where(beyond[:, None], np.nan, amplitudes)
+        self._gain = InterpolatorGain(self.settings.interpolation, cycles.rate)
+        gains = self._gain.gains(np.multiply.outer(
+            self.settings.cycle_length / cycles.periods, self.settings.orders))
+        amplitudes = self._resample(cycles) * (1.0 / gains)[:, None]
         self._amplitude_mean.update(amplitudes)
-        self._remember(amplitudes)
+        self._amplitudes.add(amplitudes)
+        self._gains.add(gains)
         edges = cycles.edges.tolist()
         self._begins.extend(edges[:-1])
         self._ends.extend(edges[1:])
@@ -228,11 +235,6 @@ class ShaftAverager:
     def _angle(self, cycle: int) -> Fraction:
         """Return the angle (fundamental cycles) at which a trigger cycle begins."""
         return exact_cycles(self.settings.cycle_length) * cycle
-
-    def beyond_nyquist(self, periods: FloatArray, rate: float) -> NDArray[np.bool_]:
-        """Return (cycle, order), which orders are at or above half the sampling rate."""
-        frequency = np.multiply.outer(self.settings.cycle_length / periods, self.settings.orders)
-        return np.asarray(frequency >= rate / 2.0)
 
     # --- the grid ---
 
@@ -286,8 +288,9 @@ class ShaftAverager:
         self._noise: tuple[FloatArray, Repeatability] | None = None
         self._amplitude_mean = self._new_mean(settings.trigger_cycles)
         self._wave_mean = self._new_wave_mean()
-        self._amplitudes: ComplexArray = np.empty((0, 0, 0), np.complex128)
-        self._end = 0  # of those of cycles in `_amplitudes`
+        # Of the latest N_t cycles: amplitudes, and what the interpolator left of them before.
+        self._amplitudes = LatestRows(settings.trigger_cycles)
+        self._gains = LatestRows(settings.trigger_cycles)
         # Of the latest N_t cycles: their pulses, and their numbers since the angle was 0.
         self._begins: deque[float] = deque(maxlen=settings.trigger_cycles)
         self._ends: deque[float] = deque(maxlen=settings.trigger_cycles)
@@ -375,25 +378,6 @@ class ShaftAverager:
         total, begins, ends = (np.concatenate(parts) for parts in zip(*sums))
         return points.amplitudes(total, begins, ends, self.settings.orders)
 
-    def _remember(self, amplitudes: ComplexArray) -> None:
-        """Append the amplitudes of cycles to those of the window, in memory never reused."""
-        count = len(amplitudes)
-        if self._end + count > len(self._amplitudes):
-            kept = min(self._counted, self.settings.trigger_cycles - 1)
-            room = np.empty((max(2 * (kept + count), 16), *amplitudes.shape[1:]), np.complex128)
-            if kept:
-                room[:kept] = self._amplitudes[self._end - kept:self._end]
-            self._amplitudes, self._end = room, kept
-        self._amplitudes[self._end:self._end + count] = amplitudes
-        self._end += count
-
-    def _window(self) -> ComplexArray:
-        """Return the amplitudes (cycle, channel, order) of the latest N_t cycles, read-only."""
-        count = min(self._counted, self.settings.trigger_cycles)
-        window = self._amplitudes[self._end - count:self._end]
-        window.flags.writeable = False
-        return window
-
     def _new_mean(self, cycles: float) -> RunningMean:
         if self.settings.averaging == 'exponential':
             return ExponentialMean(cycles)
@@ -475,21 +459,29 @@ class ShaftAverager:
             window = math.floor(self._angle(settings.trigger_cycles))
             count = min(count, max(window, 1))
         pulses, used, seconds = self._edges()
-        cycles, numbers = self._window(), np.array(self._numbers)
-        amplitudes, (noise, scatter) = self._amplitude_mean.mean, self._estimated_noise()
+        cycles, gains = self._amplitudes.get(), self._gains.get()
+        numbers, speed = np.array(self._numbers), len(cycles) / seconds
+        refused = self._gain.refused(settings.orders, gains, settings.cycle_length * speed)
+        gain = mean_gain(gains, settings.orders, refused)
+        amplitudes: ComplexArray = self._amplitude_mean.mean
+        if refused:
+            cycles, amplitudes = (np.where(np.isnan(gain), np.nan, item)
+                                  for item in (cycles, amplitudes))
+        noise, scatter = self._estimated_noise()
         error = waveform_error(waveform, error, count, scatter.jitter, settings.cycle_length)
         average = Average(
             start_time=float(pulses[0]), end_time=float(pulses[-1]), sequence=self._sequence,
             trigger_cycles=len(cycles), fundamental_cycles=count,
             discarded_cycles=int(numbers[-1] - numbers[0]) + 1 - numbers.size,
-            trigger_speed=numbers.size * settings.revolutions_per_trigger / seconds,
+            trigger_speed=speed * settings.revolutions_per_trigger,
             angle=np.arange(shape[0]) / max(shape[0], 1), waveform=waveform.T,
             standard_error=error.T, orders=np.array(settings.orders),
-            amplitudes=amplitudes, noise=noise,
+            amplitudes=amplitudes, noise=noise / gain,
             first_angle=float(self._angle(self._numbers[0])), pulses=pulses, used=used,
             cycle_numbers=numbers - numbers[0], cycle_amplitudes=cycles,
             amplitude_errors=scatter.errors(
-                amplitudes, settings.declared_jitter(seconds / numbers.size)), parts=parts)
+                gain * amplitudes, settings.declared_jitter(1.0 / speed)).over(gain),
+            parts=parts, gains=gains, refused=refused)
         self._sequence += 1
         return average
 
@@ -506,7 +498,7 @@ class ShaftAverager:
         """Return noise and repeatability; a sliding window renews them after an eighth of it."""
         if self._noise is None or self._counted >= self._noise_due:
             orders, cycle_length = self.settings.orders, self.settings.cycle_length
-            cycles = self._window()
+            cycles = self._amplitudes.get() * self._gains.get()[:, None]
             clean = without_leakage(cycles, orders, cycle_length,
                                     cycle_length * np.array(self._numbers))
             self._noise = radial_noise(clean), Repeatability.of(

@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.average import Average, beyond_nyquist
+from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings,
     streaming_averager)
+from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -136,12 +137,10 @@ class SynchronousAverager(MonitoringNode):
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
         revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
-        _, rate = self._averager.timeline.layout or (0, np.inf)
         for name, average in averages:
             self._average_flow.came()
             self._shafts[name].publish(average)
-            ratio = self._averager.shafts[name].settings.cycle_length / revolutions
-            self.set_missing(f'orders of {name}', beyond_nyquist(average, ratio, rate))
+            self.set_missing(f'orders of {name}', without_amplitude(average.refused))
         speed = self._averager.take_speed() * revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))

@@ -38,8 +38,9 @@ from sa_jitter_ros.samples import SampleBlock
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
+Notes = Mapping[float, str]
 
-_VERSION = 1  # of the files: those of another one are written again
+_VERSION = 2  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 
@@ -102,9 +103,10 @@ class RecordingAverager:
         """Return the averager, for its counts."""
         return self._stream
 
-    def results(self, progress: Progress | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+    def results(self, progress: Progress | None = None
+                ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
         """
-        Iterate over the results of all averages, as (shaft, arrays by topic).
+        Iterate over the results of all averages, as (shaft, arrays by topic, refused orders).
 
         A recording that breaks off in the middle ends there: `ended_early` says why.
         """
@@ -160,10 +162,10 @@ class RecordingAverager:
         return (*found, *(weak[0] if all(weak) else ()))
 
     def _arrays(self, averages: list[tuple[str, Average]]
-                ) -> Iterator[tuple[str, dict[str, Any]]]:
+                ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
         for name, average in averages:
             self.refused += average.correction is not None and not average.correction.accepted
-            yield name, self._results[name].of(average)
+            yield name, self._results[name].of(average), average.refused
 
 
 def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
@@ -231,10 +233,10 @@ def collect(averager: RecordingAverager, folder: Path, progress: Progress | None
             ) -> list[ShaftSeries]:
     """Return the averages of all shafts that have any; large arrays are in files in `folder`."""
     collectors: dict[str, ShaftCollector] = {}
-    for shaft, results in averager.results(progress):
+    for shaft, results, refused in averager.results(progress):
         if shaft not in collectors:
             collectors[shaft] = ShaftCollector(shaft, folder)
-        collectors[shaft].add(results)
+        collectors[shaft].add(results, refused)
     return [collector.series() for collector in collectors.values()]
 
 

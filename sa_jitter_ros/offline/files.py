@@ -12,7 +12,8 @@
 The files of averages: `averages.npz` and `averages.csv` of a recording, and tables of many.
 
 `averages.npz` has the arrays of each shaft under `<shaft>_<name>`, and those of the header also
-without a shaft: of the first one. `averages.csv` has a row for each average, channel and order.
+without a shaft: of the first one. `averages.csv` has a row for each average, channel and order;
+its last column, `note`, says why an order has no amplitude.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -115,15 +116,16 @@ def _typed(name: str, array: Any) -> Any:
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
     of_order = series[0]['order_amplitude_fields'].tolist()
-    writer.writerow([*_COLUMNS, *of_order, 'channel_name'])
+    writer.writerow([*_COLUMNS, *of_order, 'channel_name', 'note'])
     for item in series:
         header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
-        for row, table in enumerate(item['order_amplitude']):
+        for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]
             for channel, name, orders in zip(signals.channels, signals.channel_names,
                                              table.tolist()):
-                writer.writerows([*start, channel, *values, name] for values in orders)
+                writer.writerows([*start, channel, *values, name, note]
+                                 for values, note in zip(orders, notes))
 
 
 def write_lines(path: Path, lines: Callable[[TextIO], None]) -> None:

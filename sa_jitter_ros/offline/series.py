@@ -42,8 +42,8 @@ class ShaftSeries:
     The averages of one shaft: `arrays` by the names that they have in `averages.npz`.
 
     `waveform`, `standard_error` and `corrected_average` are average x channel x angle, NaN where
-    an average has none, `order_amplitude` is average x channel x order x field, `start_time`, ...
-    are (average,).
+    an average has none, `order_amplitude` is average x channel x order x field, `note` (average x
+    order) says why an order has no amplitude, `start_time`, ... are (average,).
     """
 
     shaft: str
@@ -112,6 +112,7 @@ class ShaftCollector:
         self._spools: dict[str, _Spool] = {}
         self._names: dict[str, tuple[str, ...]] = {}
         self._pulses: list[Array] = []
+        self._notes: list[list[str]] = []
         self._angles = 0
 
     @property
@@ -119,9 +120,16 @@ class ShaftCollector:
         """Return the number of averages so far."""
         return len(self._headers)
 
-    def add(self, results: Mapping[str, AverageMessage]) -> None:
-        """Take the arrays of the next average by the names of their topics."""
+    def add(self, results: Mapping[str, AverageMessage],
+            refused: Mapping[float, str] | None = None) -> None:
+        """
+        Take the arrays of the next average by the names of their topics.
+
+        `refused` are its orders without amplitude, by their reason.
+        """
         row = self.count
+        self._notes.append([(refused or {}).get(order, '') for order in
+                            results['order_amplitude'].values[0, :, 0].tolist()])
         self._headers.append(asdict(results['synchronous_average'].header))
         self._angles = self._angles or results['synchronous_average'].values.shape[1]
         for topic, result in results.items():
@@ -144,6 +152,7 @@ class ShaftCollector:
             _HEADER.get(name, name): np.array([header[name] for header in self._headers])
             for name in (self._headers[0] if self._headers else ())}
         arrays |= {name: spool.rows(self.count) for name, spool in self._spools.items()}
+        arrays['note'] = np.array(self._notes, dtype=np.str_)
         arrays['angle'] = np.arange(self._angles) / max(self._angles, 1)
         if self._pulses:
             table = np.concatenate(self._pulses)

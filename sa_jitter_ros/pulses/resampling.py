@@ -26,6 +26,7 @@ from functools import lru_cache
 import math
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.inner_loops import room, weighted_sums
@@ -37,6 +38,10 @@ _Places = tuple[NDArray[np.int32], FloatArray, FloatArray, FloatArray]
 _SPLINE_POLE = np.sqrt(3.0) - 2.0
 # method: half-width of its kernel in samples
 _HALF_WIDTH = {'band_limited': 8, 'linear': 1, 'cubic': 2, 'spline': 12}
+_KERNEL_STEPS = 512  # of a sample, in which a kernel is integrated
+# Steps of the table of gains up to the Nyquist frequency: linear between them to 1e-7.
+_GAIN_STEPS = 4096
+_GAIN_DEGREE = 64  # of the polynomial that a table of gains comes from: exact to rounding
 # method: degree of the polynomials
 _DEGREE = {'band_limited': 7, 'linear': 1, 'cubic': 3, 'spline': 3}
 METHODS = tuple(_HALF_WIDTH)
@@ -126,12 +131,34 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
     return np.asarray(np.cos(phase) @ kernel)
 
 
+def gain_below_nyquist(method: str, frequency: FloatArray) -> FloatArray:
+    """
+    Return `gain` to 1e-6 from a table; NaN from half the sampling rate on.
+
+    >>> gain_below_nyquist('linear', np.array([0.1, 0.25, 0.5])).round(3)
+    array([0.968, 0.811,   nan])
+    """
+    grid, gains = _table_of_gains(_known(method))
+    return np.where(frequency < 0.5, np.interp(frequency, grid, gains), np.nan)
+
+
+@lru_cache(maxsize=8)
+def _table_of_gains(method: str) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies up to half the sampling rate, and the gains there."""
+    grid: FloatArray = np.linspace(0.0, 0.5, _GAIN_STEPS + 1)
+    nodes = chebyshev.chebpts1(_GAIN_DEGREE + 1)
+    through = chebyshev.chebfit(nodes, gain(method, 0.25 * (nodes + 1.0)), _GAIN_DEGREE)
+    return grid, np.asarray(chebyshev.chebval(4.0 * grid - 1.0, through), np.float64)
+
+
 @lru_cache(maxsize=8)
 def _steps_of_kernel(method: str) -> tuple[FloatArray, FloatArray]:
     """Return places in a kernel, and its values there times their distance."""
     half = _HALF_WIDTH[method]
-    x, step = np.linspace(-half, half, 1024 * half + 1, retstep=True)
-    return x, _kernel(method, x, half) * step
+    x = np.arange(-half, half, 1.0 / _KERNEL_STEPS)
+    kernel = _kernel(method, x, half).reshape(-1, _KERNEL_STEPS)
+    kernel /= kernel.sum(axis=0) * _KERNEL_STEPS  # the gain of a constant is 1
+    return x, kernel.ravel()
 
 
 def impulse_response(places: FloatArray) -> FloatArray:
