@@ -315,3 +315,33 @@ def test_shafts_that_are_due_together_are_corrected_as_each_alone(monkeypatch):
                                        rtol=1e-9, atol=1e-11)
             np.testing.assert_allclose(one.correction.pulse_errors,
                                        alone.correction.pulse_errors, rtol=1e-7, atol=1e-13)
+
+
+@pytest.mark.parametrize('cycles', [40, 120])
+def test_amplitudes_beside_the_lines_of_another_shaft_are_not_biased(cycles):
+    """Its lines turn the recovered errors slowly, and not as white noise does."""
+    rng, period, rate = np.random.default_rng(cycles), 0.04, 5e3
+    orders, size = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3])
+    others, strength = np.array([6.52, 13.04, 19.56]), np.array([0.3, 0.4, 0.5])
+    std = 0.3 / (2.0 * np.pi * 16.0) * period
+    time = np.arange(round((cycles + 7) * period * rate)) / rate
+    pulses = period * (2.0 + np.arange(cycles + 4.0))
+    waves = np.exp(2j * np.pi * np.outer(np.append(orders, others), (time - pulses[0]) / period))
+    found, errors, limits = [], [], []
+    for _ in range(16):
+        phases = np.exp(2j * np.pi * rng.uniform(size=6))
+        vibration = ((np.append(size, strength) * phases) @ waves).real
+        average, *_ = sa.average(
+            vibration + 0.01 * rng.standard_normal(time.size), rate,
+            pulses + np.sqrt(3.0) * std * rng.uniform(-1.0, 1.0, pulses.size), orders=orders,
+            trigger_cycles=cycles, correct_jitter=True, interval_tolerance=0.45,
+            keyphasor_rate=1.0 / (np.sqrt(12.0) * std))
+        correction = average.correction
+        assert correction.accepted
+        found.append(abs(correction.amplitudes[0]))
+        errors.append(correction.amplitude_errors.amplitude[0])
+        limits.append(correction.amplitude_errors.upper_95[0])
+    off = np.array(found) - size
+    assert np.all(np.abs(off.mean(axis=0)) < 4.0 * off.std(axis=0) / np.sqrt(len(off)))
+    assert np.all(np.abs(off) < 4.0 * np.array(errors))
+    assert np.mean(np.array(limits) >= size) > 0.95 - 3.0 * np.sqrt(0.05 * 0.95 / off.size)

@@ -278,15 +278,19 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     third the largest size of the amplitude: that with the whole factor.
     """
     variance = variance_within(recovery.covariance, _U)
-    left = (np.exp(-2.0 * (np.pi * raw.orders[:, None, None]) ** 2 * variance) @ _U_WEIGHT
-            ).mean(axis=1)
+    turn = 2.0 * (np.pi * raw.orders) ** 2
+    white = (np.exp(-turn[:, None, None] * variance) @ _U_WEIGHT).mean(axis=1)
+    left = np.minimum(white * np.exp(-turn * recovery.excess), 1.0)
     lost = 1.0 / left - 1.0
     size = np.maximum(np.abs(raw.amplitudes), _TINY)
     noise = np.nan_to_num(2.0 * aligned.noise**2, nan=np.inf)
     told, factor = np.zeros(size.shape, np.bool_), np.ones(size.shape)
-    for order, of_one, ratio in zip(recovery.orders, recovery.noise.T, recovery.aligned.T):
+    beside = np.broadcast_to(turn * recovery.excess_error, size.shape)
+    for order, of_one, ratio, error in zip(recovery.orders, recovery.noise.T, recovery.aligned.T,
+                                           recovery.aligned_error.T):
         same = np.isclose(raw.orders, order, rtol=1e-9, atol=0.0) & np.isfinite(ratio)[:, None]
         told |= same
+        beside = np.where(same, error[:, None], beside)
         factor = np.where(same, 1.0 / ratio[:, None], factor)
         noise = np.where(same, (of_one[:, None] / raw.gain) ** 2 / raw.trigger_cycles, noise)
     whole = aligned.amplitudes * np.where(told, factor, 1.0 + lost)
@@ -308,8 +312,9 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     # The factor is as uncertain as the size of the errors, to which N_t cycles contribute what
     # the vibration shows of each.
     unsure_factor = lost / recovery.shown * math.sqrt(2.0 / raw.trigger_cycles)
-    known = left > math.exp(-0.5 * _UNCERTAIN**2)
-    return (np.where(known, amplitudes, np.nan), np.hypot(withheld, unsure_factor),
+    known = np.minimum(white, left) > math.exp(-0.5 * _UNCERTAIN**2)
+    return (np.where(known, amplitudes, np.nan),
+            np.hypot(np.hypot(withheld, unsure_factor), beside),
             np.where(known, np.fmax(np.abs(whole), np.abs(amplitudes)), np.nan))
 
 
@@ -373,10 +378,12 @@ def _of_all_channels(recovery: PulseErrorRecovery, told: NDArray[np.bool_]) -> P
         return recovery
     shape = told.size, recovery.orders.size
     amplitudes = np.zeros(shape, np.complex128)
-    noise, aligned = np.full(shape, np.nan), np.full(shape, np.nan)
-    amplitudes[told], noise[told], aligned[told] = (
-        recovery.amplitudes, recovery.noise, recovery.aligned)
-    return replace(recovery, amplitudes=amplitudes, noise=noise, aligned=aligned)
+    amplitudes[told] = recovery.amplitudes
+    noise, aligned, error = np.full((3, *shape), np.nan)
+    noise[told], aligned[told], error[told] = (
+        recovery.noise, recovery.aligned, recovery.aligned_error)
+    return replace(recovery, amplitudes=amplitudes, noise=noise, aligned=aligned,
+                   aligned_error=error)
 
 
 def _recovered_over_gaps(raw: Average, grid: FloatArray,

@@ -205,3 +205,13 @@ def _without_lines(power: FloatArray) -> FloatArray:
         before = low
         floor = np.sum(power, axis=1, where=low) / np.maximum(low.sum(axis=1), 1) / kept
     return np.asarray(floor)
+
+
+def long_run_variance(series: FloatArray) -> FloatArray:
+    """Return count times the variance of the mean over the first axis (Newey and West 1987)."""
+    count = len(series)
+    lags = count // 4
+    total = np.sum(series**2, axis=0)
+    for lag in range(1, lags + 1):
+        total += 2.0 * (1.0 - lag / (lags + 1.0)) * np.sum(series[lag:] * series[:-lag], axis=0)
+    return np.asarray(total / (count - 1))

@@ -247,7 +247,9 @@ class PulseErrorFit:
     their variance that the vibration shows. `amplitudes` (order, channel) are those without the
     errors; those between the expected pulses are `aligned` times as large, because they align
     noise and leave errors; NaN where the order is not `significant`. `noise` (order, channel) is
-    the standard deviation of the complex amplitude of one cycle.
+    the standard deviation of the complex amplitude of one cycle. `weight` (dimension, channel) is
+    one over the standard deviation of the noise in a dimension, `precision` the inverse of the
+    covariance.
     """
 
     expected: FloatArray
@@ -262,6 +264,8 @@ class PulseErrorFit:
     amplitudes: ComplexArray
     aligned: FloatArray
     noise: FloatArray
+    weight: FloatArray
+    precision: 'Tridiagonal'
 
 
 @dataclass(frozen=True)
@@ -349,7 +353,7 @@ class PulseErrorProblem:
                             where=self.significant & (size > 0.0))
         return PulseErrorFit(
             errors, covariance, unshrunk - unshrunk.mean(), np.sqrt(alone.covariance()[0]), std,
-            evidence, shown, ripple, orders, amplitudes, aligned, noise)
+            evidence, shown, ripple, orders, amplitudes, aligned, noise, weight, shrunk)
 
     def _misfit_without_errors(self, weight: FloatArray) -> float:
         """Return the weighted square of what remains of the cycles without errors of pulses."""

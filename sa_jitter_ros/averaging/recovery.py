@@ -32,6 +32,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.alignment import alignment
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
@@ -86,6 +87,8 @@ class PulseErrorRecovery:
     `aligned` (channel, order) times as large, NaN where a channel does not show the order; `noise`
     (channel, order) is the standard deviation of the complex amplitude of one cycle. `ripple`
     (cycle,) is the factor of u (1 - u) in the error inside a cycle (s), zero unless `with_ripple`.
+    `aligned_error` (channel, order) is the standard error of `aligned`, `excess` the mean variance
+    of the expected errors inside a cycle beyond that of their covariance, `excess_error` its own.
     """
 
     errors: FloatArray
@@ -103,6 +106,9 @@ class PulseErrorRecovery:
     aligned: FloatArray
     noise: FloatArray
     ripple: FloatArray
+    aligned_error: FloatArray
+    excess: float
+    excess_error: float
 
 
 @dataclass(frozen=True)
@@ -159,20 +165,21 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
         additional_orders=additional_orders, most_orders=most_orders, declared=declared,
         with_ripple=with_ripple)
     found = _likeliest(attempt, declared)
-    fit, reason = found.fit, found.reason
-    if found.problem is not None and fit is not None:
-        beside = orders_beside(found.problem, fit.expected, cycle_length)
+    problem, fit, reason = found.problem, found.fit, found.reason
+    if problem is not None and fit is not None:
+        beside = orders_beside(problem, fit.expected, cycle_length)
         if beside.size:
             again = _likeliest(partial(
-                attempt, orders=np.union1d(fit.orders, beside)), declared).fit
-            fit = fit if again is None else again
-    if fit is None:
+                attempt, orders=np.union1d(fit.orders, beside)), declared)
+            if again.fit is not None:
+                problem, fit = again.problem, again.fit
+    if problem is None or fit is None:
         count, _, channels = grid.cycles.shape
         return PulseErrorRecovery(
             np.zeros(count + 1), np.full(count + 1, np.nan), False, reason, np.zeros(count + 1),
             np.zeros((2, count + 1)), np.zeros(count + 1, np.bool_), 0.0, 0.0, 0.0, np.empty(0),
             np.empty((channels, 0), np.complex128), np.empty((channels, 0)),
-            np.empty((channels, 0)), np.zeros(count))
+            np.empty((channels, 0)), np.zeros(count), np.empty((channels, 0)), 0.0, 0.0)
 
     expected = fit.expected * float(np.mean(periods)) / cycle_length
     for _ in range(2):  # a fundamental cycle lasts as long as the corrected pulses say
@@ -186,14 +193,16 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
                       LineSearch.of(grid, cycle_length).gain(fit.expected, found.clear))
     if reason:
         errors, expected = np.zeros_like(errors), np.zeros_like(errors)
+    beside_lines = alignment(problem, fit)
     # of the orders that determine the errors, each with its weight
     power = np.sum(np.abs(fit.amplitudes / fit.noise) ** 2, axis=1)
     order = np.sqrt(np.sum(fit.orders**4 * power) / np.sum(fit.orders**2 * power))
     return PulseErrorRecovery(
         errors, fit.standard_errors * seconds, not reason, reason, expected, fit.covariance,
         2.0 * np.pi * order * fit.standard_errors < _AMBIGUOUS, fit.std * float(seconds.mean()),
-        fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, fit.aligned.T, fit.noise.T,
-        fit.ripple * periods / cycle_length)
+        fit.shown, fit.evidence, fit.orders, fit.amplitudes.T, beside_lines.aligned.T, fit.noise.T,
+        fit.ripple * periods / cycle_length, beside_lines.aligned_error.T, beside_lines.excess,
+        beside_lines.excess_error)
 
 
 def _likeliest(attempt: Callable[..., _Attempt], declared: float) -> _Attempt:

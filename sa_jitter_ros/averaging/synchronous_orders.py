@@ -27,6 +27,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.grid_cycles import GridCycles, taper
+from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, PulseErrorProblem,
                                                      real_parts)
@@ -201,7 +202,7 @@ def significant_orders(model: CompressedCycles, errors: FloatArray, *, tests: in
     amplitudes, deviation, in_phase = _deviations(model, errors, np.arange(len(model.orders)))
     power = np.abs(amplitudes) ** 2
     scatter = np.sum(np.abs(deviation) ** 2, axis=0) / (count - 1)
-    ringing = np.maximum(scatter, 2.0 * _long_run_variance(in_phase))
+    ringing = np.maximum(scatter, 2.0 * long_run_variance(in_phase))
     limit = _significance(tests * channels, count)
     return np.asarray((count * power > limit * ringing) & (np.sqrt(power) > least)
                       & (power > _COHERENCE * (power + scatter)))
@@ -288,13 +289,3 @@ def _significance(tests: int, cycles: int) -> float:
     """Return the level of the F test of one of so many orders and channels."""
     # of 2 and 2 k degrees of freedom the probability above f is (1 + f / k)^-k
     return float((cycles - 1) * np.expm1(np.log(tests / _FALSE_ALARM) / (cycles - 1)))
-
-
-def _long_run_variance(series: FloatArray) -> FloatArray:
-    """Return count times the variance of the mean over the first axis (Newey and West 1987)."""
-    count = len(series)
-    lags = count // 4
-    total = np.sum(series**2, axis=0)
-    for lag in range(1, lags + 1):
-        total += 2.0 * (1.0 - lag / (lags + 1.0)) * np.sum(series[lag:] * series[:-lag], axis=0)
-    return np.asarray(total / (count - 1))

@@ -1,0 +1,115 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+What the noise beside the lines makes of amplitudes between recovered pulses.
+
+The error d of a recovered pulse error turns an order by 2 pi g d, which takes (2 pi g)^2 <d^2> / 2
+of its mean; but the same noise turned the order before, and to turn it back adds
+2 pi g <d Im n>, where n is the noise of the order over its amplitude. Of white noise the second is
+twice the first. Of the lines of another shaft, or of a resonance, it is not: their noise differs
+from order to order in shape, and goes on from cycle to cycle, so that neighbouring errors are
+alike. A pulse error hides what the noise turns of a line, but noise is as strong in phase with it:
+the part that is left in phase is taken for that across, and goes through the same equations.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.noise import long_run_variance
+from sa_jitter_ros.averaging.pulse_error_fit import (
+    least_squares, PulseErrorFit, PulseErrorProblem, real_parts)
+
+FloatArray = NDArray[np.float64]
+
+# Relative step of a precision, in the derivative of a covariance.
+_STEP = 1e-3
+# What noise leaves of an aligned amplitude at least: beyond, its square says nothing.
+_LEAST = 0.5
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """
+    How much larger amplitudes between expected pulses are, as the noise beside the lines shows.
+
+    `aligned` (order, channel) is that of orders that have told the errors, `aligned_error` its
+    standard error; `excess` is the mean variance of the expected errors inside a cycle
+    (fundamental cycles squared) beyond that of their covariance, `excess_error` its standard
+    error. Each is the smaller, the less certain it is that the noise is not white.
+    """
+
+    aligned: FloatArray
+    aligned_error: FloatArray
+    excess: float
+    excess_error: float
+
+
+def alignment(problem: PulseErrorProblem, fit: PulseErrorFit) -> Alignment:
+    """Return what the noise beside the lines of a `fit` of a `problem` makes of amplitudes."""
+    turned, pull, unit = _in_phase(problem, fit)
+    late = fit.precision.solve(pull)
+    late -= late.mean()
+    begin, end = late[:-1], late[1:]
+    power = np.maximum(np.abs(fit.amplitudes) ** 2 * unit[:, None], _TINY)
+    gained = (begin[:, None, None] * turned[0] + end[:, None, None] * turned[1]) / power
+    squares = (begin**2 + begin * end + end**2) / 3.0
+    # What the errors are drawn to their mean by costs as much as they are uncertain by it.
+    slower = fit.precision.plus(_STEP * fit.std**-2).covariance()
+    drawn = (_mean_square(fit.covariance) - _mean_square(slower)) / _STEP
+    expected = _mean_square(fit.covariance)
+    turn = (2.0 * np.pi * fit.orders[:, None]) ** 2
+    larger, error = _shrunk(gained - 0.5 * turn * (squares[:, None, None] + drawn + expected))
+    excess, excess_error = _shrunk(squares + drawn - expected)
+    return Alignment(np.maximum(fit.aligned + larger, _LEAST), error, float(excess),
+                     float(excess_error))
+
+
+def _in_phase(problem: PulseErrorProblem, fit: PulseErrorFit
+              ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """
+    Return the noise in phase with the lines, as it would turn them across.
+
+    That are its products (pulse at begin or end, cycle, order, channel) with what an error of the
+    pulse does, their weighted sums (pulse,), and the power (order,) of unit orders.
+    """
+    model, half = problem.model, len(fit.orders)
+    response = model.response(fit.expected, fit.ripple, problem.chosen)
+    residual = model.coefficients - response.signal @ real_parts(
+        least_squares(response.signal, model.coefficients))
+    weighted = residual * fit.weight**2
+    size = 2.0 * np.pi * fit.orders[:, None] * fit.amplitudes * problem.significant
+    turned = np.zeros((2, len(residual), *size.shape))
+    pull = np.zeros(len(residual) + 1)
+    for i, of_order in enumerate(size):
+        parts = np.stack((of_order.real, of_order.imag))
+        both, last = (item[:, :, [i, half + i]] @ parts
+                      for item in (response.signal, response.late))
+        for number, item in enumerate((both - last, last)):
+            turned[number, :, i] = np.einsum('kdc,kdc->kc', item, residual)
+            pull[number:len(residual) + number] += np.einsum('kdc,kdc->k', item, weighted)
+    unit = np.mean(np.sum(response.signal[:, :, :half] ** 2, axis=1), axis=0)
+    return turned, pull, unit
+
+
+def _mean_square(covariance: FloatArray) -> float:
+    """Return the mean variance inside a cycle of errors of a `covariance` (2, pulse)."""
+    own, beside = covariance
+    return float(np.mean(own[:-1] + beside[:-1] + own[1:]) / 3.0)
+
+
+def _shrunk(series: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of a series (cycle, ...), smaller where it is uncertain, and its error."""
+    mean = series.mean(axis=0)
+    variance = long_run_variance(series - mean) / len(series)
+    sure = np.maximum(1.0 - variance / np.maximum(mean**2, _TINY), 0.0)
+    return np.asarray(sure * mean), np.sqrt(variance)
