@@ -15,6 +15,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.amplitude_errors import (kurtosis_of, Repeatability, Scatter,
                                                       upper_limit)
+from sa_jitter_ros.averaging.steady_part import steady_part
 
 ORDERS = np.array([16.0, 32.0, 8.0, 5.0, 11.0])  # strong, three times; absent; 10 dB weak
 AMPLITUDES = np.array([1.0, 0.3, 0.5, 0.0, 0.0])
@@ -212,3 +213,26 @@ def test_errors_of_one_cycle_of_silence_and_above_nyquist_are_no_numbers():
     for item in (errors.amplitude, errors.phase, errors.upper_95):
         assert np.isnan(item[:, 2]).all()
         assert np.isfinite(item[:, :2]).all()
+
+
+@pytest.mark.parametrize('count', [12, 40])
+def test_steady_part_has_the_errors_of_its_noise(count):
+    """A tone of another shaft is no noise; where there is none, nothing changes."""
+    rng, trials, noise = np.random.default_rng(count), 400, 0.01
+    z, plain = [], 0
+    for _ in range(trials):
+        white = noise * (rng.standard_normal((count, 1, 3, 2)) @ (1.0, 1.0j))
+        turns = rng.uniform(2.0 / count, 0.4) * np.arange(count) + rng.uniform()
+        tone = np.exp(2j * np.pi * turns)[:, None, None] * [0.3, 0.1, 0.2]
+        found = steady_part(1.0 + tone + white)
+        scatter = Scatter.of(found.cycles, found.cycles).inflated(found.inflation, found.lost)
+        z.append((np.abs(found.mean[0]) - 1.0) / scatter.error_of_mean[0])
+        plain += steady_part(1.0 + white).rates.size
+    assert hold(shares(np.array(z).ravel()), trials).all()
+    assert plain <= 3
+
+
+def test_steady_part_keeps_what_is_slower_than_the_average():
+    slow = 1.0 + 0.1 * np.cos(np.pi * np.arange(40) / 40)[:, None, None] * np.ones((1, 2))
+    found = steady_part(slow + 0j)
+    np.testing.assert_allclose(found.mean, slow.mean(axis=0), atol=0.02)

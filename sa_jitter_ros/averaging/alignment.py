@@ -32,6 +32,10 @@ FloatArray = NDArray[np.float64]
 
 # Relative step of a precision, in the derivative of a covariance.
 _STEP = 1e-3
+# The negative frequency of a line, farther from an order than the line, makes noise in phase with
+# the order and across it differ by this share (a line a third of the order beside it).
+_UNLIKE = 0.3
+_LAGS = 8  # cycles over which the noise is taken to go on
 # What noise leaves of an aligned amplitude at least: beyond, its square says nothing.
 _LEAST = 0.5
 _TINY = float(np.finfo(np.float64).tiny)
@@ -86,19 +90,17 @@ def _in_phase(problem: PulseErrorProblem, fit: PulseErrorFit
     response = model.response(fit.expected, fit.ripple, problem.chosen)
     residual = model.coefficients - response.signal @ real_parts(
         least_squares(response.signal, model.coefficients))
-    weighted = residual * fit.weight**2
     size = 2.0 * np.pi * fit.orders[:, None] * fit.amplitudes * problem.significant
-    turned = np.zeros((2, len(residual), *size.shape))
+    slope, weighted = real_parts(size), residual * fit.weight**2
     pull = np.zeros(len(residual) + 1)
-    for i, of_order in enumerate(size):
-        parts = np.stack((of_order.real, of_order.imag))
-        both, last = (item[:, :, [i, half + i]] @ parts
-                      for item in (response.signal, response.late))
-        for number, item in enumerate((both - last, last)):
-            turned[number, :, i] = np.einsum('kdc,kdc->kc', item, residual)
-            pull[number:len(residual) + number] += np.einsum('kdc,kdc->k', item, weighted)
+    turned = []
+    for number, unit_orders in enumerate((response.signal - response.late, response.late)):
+        both = np.matmul(unit_orders.transpose(0, 2, 1), residual) * slope
+        turned.append(both[:, :half] + both[:, half:])
+        pull[number:len(residual) + number] += np.einsum(
+            'kdc,kdc->k', unit_orders @ slope, weighted)
     unit = np.mean(np.sum(response.signal[:, :, :half] ** 2, axis=1), axis=0)
-    return turned, pull, unit
+    return np.array(turned), pull, unit
 
 
 def _mean_square(covariance: FloatArray) -> float:
@@ -110,6 +112,7 @@ def _mean_square(covariance: FloatArray) -> float:
 def _shrunk(series: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the mean of a series (cycle, ...), smaller where it is uncertain, and its error."""
     mean = series.mean(axis=0)
-    variance = long_run_variance(series - mean) / len(series)
+    variance = long_run_variance(series - mean, _LAGS) / len(series)
     sure = np.maximum(1.0 - variance / np.maximum(mean**2, _TINY), 0.0)
-    return np.asarray(sure * mean), np.sqrt(variance)
+    found = sure * mean
+    return np.asarray(found), np.sqrt(variance + (_UNLIKE * found) ** 2)

@@ -26,10 +26,11 @@ from sa_jitter_ros.averaging.cycle import cycle_grid, CycleSamples
 from sa_jitter_ros.averaging.displaced_pulses import displacements
 from sa_jitter_ros.averaging.envelope import Envelope, residual_envelope
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
-from sa_jitter_ros.averaging.noise import attenuation, without_leakage
+from sa_jitter_ros.averaging.noise import attenuation, leaks_apart, without_leakage
 from sa_jitter_ros.averaging.pulse_error_fit import variance_within
 from sa_jitter_ros.averaging.recovery import PulseErrorRecovery, recover_pulse_errors
 from sa_jitter_ros.averaging.shaft import ShaftAverager
+from sa_jitter_ros.averaging.steady_part import steady_part
 from sa_jitter_ros.pulses.resampling import periodic
 
 FloatArray = NDArray[np.float64]
@@ -49,6 +50,8 @@ _CLEAR, _WEAK, _CAUTION = 0.0118, 0.015, 3.0
 _SURE, _AMBIGUOUS = 0.05, 0.3
 # Evidence that noise has by chance, how fast more of it is rarer, and what noise never has.
 _DOUBT, _DECAY, _EVIDENT = 2.0, 3.0, 10.0
+# Share of a leakage at an unknown angle that lies along the radius.
+_RADIAL = math.sqrt(0.5)
 _TINY = 1e-150  # whose square is not 0
 _U, _U_WEIGHT = (0.5 * (item + shift) for item, shift in zip(legendre.leggauss(6), (1.0, 0.0)))
 
@@ -232,22 +235,41 @@ def correct_average(raw: Average, cycles: list[CycleSamples], settings: AverageS
     if reason:
         return replace(_uncorrected(raw, reason), standard_errors=recovery.standard_errors)
     corrected = _average_again(raw, cycles, settings, raw.pulses - recovery.expected)
-    amplitudes, unsure, whole = _amplitudes(raw, corrected, recovery)
+    aligned, scatter = _steady(corrected, settings)
+    amplitudes, unsure, whole = _amplitudes(raw, replace(corrected, amplitudes=aligned), recovery)
     begins = np.flatnonzero(raw.used)
     errors = recovery.expected * settings.cycle_length / np.mean(periods)
     turned = _mean_phasor(raw.orders, errors[begins], errors[begins + 1])
-    cycles_again = corrected.cycle_amplitudes
     gain = corrected.gain
-    scatter = Scatter.of(*_resampled(corrected, cycles_again, settings))
     ratio, error = attenuation(raw.amplitudes, amplitudes, scatter.error_of_mean / gain, turned)
+    # The raw amplitude holds what is not steady.
+    apart = _RADIAL * np.abs(corrected.amplitudes - aligned) / np.maximum(abs(amplitudes), _TINY)
     return Correction(
         corrected.waveform, amplitudes, corrected.noise,
         np.where(recovery.resolved, recovery.errors, np.nan), recovery.standard_errors, True, '',
-        ratio, np.hypot(error, ratio * unsure), cycles_again, corrected_errors(
+        ratio, np.hypot(np.hypot(error, apart), ratio * unsure), corrected.cycle_amplitudes,
+        corrected_errors(
             scatter, raw.orders, amplitudes=amplitudes * gain, unsure=unsure, largest=whole * gain,
             jitter=_in_cycles(recovery.std, raw, settings)).over(gain),
         corrected.parts, recovery.std, refitted,
         _envelope(corrected, _between(raw, cycles, corrected.pulses), settings))
+
+
+def _steady(average: Average, settings: AverageSettings) -> tuple[ComplexArray, Scatter]:
+    """
+    Return the amplitudes (channel, order) of an average without what leaks into its cycles.
+
+    That are the other orders, as far as the cycles keep them apart, and the lines of other shafts.
+    The second result is the scatter of the cycles about them.
+    """
+    cycles, clean = _resampled(average, average.cycle_amplitudes, settings)
+    if average.discarded_cycles or not leaks_apart(
+            settings.orders, settings.cycle_length, len(cycles)):
+        return average.amplitudes, Scatter.of(cycles, clean)
+    steady = steady_part(clean)
+    scatter = Scatter.of(steady.cycles, steady.cycles).inflated(steady.inflation, steady.lost)
+    leaked = cycles.mean(axis=0) - steady.mean
+    return average.amplitudes - leaked * (1.0 / average.gain), scatter
 
 
 def _envelope(average: Average, cycles: Sequence[CycleSamples], settings: AverageSettings

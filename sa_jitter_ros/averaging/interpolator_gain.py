@@ -56,6 +56,8 @@ class InterpolatorGain:
         `gains` (cycle, order) are those of all cycles, `speed` (Hz) is that of the shaft.
         """
         least = gains.min(axis=0)
+        if least.min() >= LEAST_GAIN:
+            return {}
         return {float(order): self._reason(float(left), speed)
                 for order, left in zip(orders, least) if not left >= LEAST_GAIN}
 
@@ -78,7 +80,8 @@ class InterpolatorGain:
 
 def mean_gain(gains: FloatArray, orders: ArrayLike, refused: Mapping[float, str]) -> FloatArray:
     """Return the mean (order,) of `gains` (cycle, order), NaN of orders that are refused."""
-    return np.where(np.isin(orders, list(refused)), np.nan, gains.mean(axis=0))
+    mean = gains.mean(axis=0)
+    return np.where(np.isin(orders, list(refused)), np.nan, mean) if refused else mean
 
 
 def without_amplitude(refused: Mapping[float, str]) -> str:

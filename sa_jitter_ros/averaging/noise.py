@@ -27,6 +27,8 @@ ComplexArray = NDArray[np.complex128]
 # The orders that leak contain leakage of each other: iterations until this is negligible.
 _PASSES = 6
 _ORTHOGONAL = 1e-12  # leakage that is rounding: of whole orders over whole fundamental cycles
+# Share of others in an order, up to which its own part follows from the mean of all cycles.
+_APART = 0.5
 # Lines of the average next to an order that show the noise: beyond the main lobe of the window.
 _LOBE, _AROUND = 3, 150
 _OUTLIER = 3.0  # times the noise
@@ -73,6 +75,22 @@ def without_leakage(cycles: ComplexArray, orders: tuple[float, ...], length: flo
         leaked = np.concatenate((mean, np.conj(mean)), axis=-1) @ share
         clean = cycles - leaked / turn
     return np.asarray(clean)
+
+
+def leaks_apart(orders: tuple[float, ...], length: float, count: int) -> bool:
+    """
+    Whether the mean of `count` consecutive cycles keeps orders apart, so that leakage is known.
+
+    >>> leaks_apart((2.0, 3.0), 0.4, 50), leaks_apart((2.0, 2.1), 0.4, 5)
+    (True, False)
+    """
+    share = np.abs(_leaking(orders, length))
+    turn = np.pi * length * (np.concatenate((orders, np.negative(orders)))[:, None]
+                             - np.array(orders))
+    once = np.sin(turn)
+    near = np.abs(once) < _ORTHOGONAL
+    mean = np.where(near, 1.0, np.abs(np.sin(count * turn) / np.where(near, 1.0, count * once)))
+    return bool(np.max(np.sum(share * mean, axis=0)) < _APART)
 
 
 def attenuation(raw: ComplexArray, corrected: ComplexArray, noise: FloatArray,
@@ -207,10 +225,14 @@ def _without_lines(power: FloatArray) -> FloatArray:
     return np.asarray(floor)
 
 
-def long_run_variance(series: FloatArray) -> FloatArray:
-    """Return count times the variance of the mean over the first axis (Newey and West 1987)."""
+def long_run_variance(series: FloatArray, lags: int | None = None) -> FloatArray:
+    """
+    Return count times the variance of the mean over the first axis (Newey and West 1987).
+
+    The series have no mean. So many `lags` count, at most a quarter of the series, None for that.
+    """
     count = len(series)
-    lags = count // 4
+    lags = count // 4 if lags is None else min(lags, count // 4)
     total = np.sum(series**2, axis=0)
     for lag in range(1, lags + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * np.sum(series[lag:] * series[:-lag], axis=0)

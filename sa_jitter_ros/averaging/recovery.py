@@ -32,7 +32,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.alignment import alignment
+from sa_jitter_ros.averaging.alignment import Alignment, alignment
 from sa_jitter_ros.averaging.grid_cycles import GridCycles
 from sa_jitter_ros.averaging.pulse_error_fit import (ComplexArray, compress, FloatArray, nodes_for,
                                                      PulseErrorFit, PulseErrorProblem)
@@ -193,7 +193,8 @@ def recover_pulse_errors(grid: GridCycles, *, periods: FloatArray, cycle_length:
                       LineSearch.of(grid, cycle_length).gain(fit.expected, found.clear))
     if reason:
         errors, expected = np.zeros_like(errors), np.zeros_like(errors)
-    beside_lines = alignment(problem, fit)
+    beside_lines = (Alignment(fit.aligned, np.zeros(fit.aligned.shape), 0.0, 0.0) if reason
+                    else alignment(problem, fit))
     # of the orders that determine the errors, each with its weight
     power = np.sum(np.abs(fit.amplitudes / fit.noise) ** 2, axis=1)
     order = np.sqrt(np.sum(fit.orders**4 * power) / np.sum(fit.orders**2 * power))
