@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.indicators import GearSettings, INDICATORS, RunningIndicators
 from sa_jitter_ros.averaging.jackknife import WaveformParts
+from scipy.signal import lfilter
 
 FloatArray = NDArray[np.float64]
 
@@ -54,6 +55,46 @@ class Case:
     jitter: float
     normal: bool = False
     correct: bool = True
+
+
+@dataclass(frozen=True)
+class Setting:
+    """
+    A machine whose corrected amplitudes are asked for, beside what disturbs them.
+
+    Its `orders` have peak amplitudes `size`. The jitter turns the second one by `jitter` rad. With
+    `another_shaft`, three harmonics of a random order of amplitudes 0.3 to 0.5 are no orders of
+    the shaft, and at least two turns of the average away from one. With `quality`, noise of a
+    resonance of this quality factor is within half an order of order 16. White noise of 0.05 is in
+    every sample.
+    """
+
+    name: str
+    cycles: int = 40
+    ratio: float = 1.0
+    jitter: float = 0.3
+    orders: tuple[float, ...] = STRONG
+    size: tuple[float, ...] = AMPLITUDES
+    another_shaft: bool = False
+    quality: float = 0.0
+
+    @property
+    def points(self) -> int:
+        """Return the samples in a trigger cycle."""
+        return round(POINTS * max(self.ratio, 1.0))
+
+
+#: Orders up to 0.4 of the sampling rate, and their amplitudes.
+BAND = (16.0, 40.0, 60.0, 64.0), (0.5, 1.0, 0.4, 0.3)
+SETTINGS = (
+    Setting('orders 16, 40, 60, 64: 0.1, 0.25, 0.375, 0.4 of the sampling rate',
+            orders=BAND[0], size=BAND[1]),
+    *(Setting(f'another shaft, N_t {cycles}, r {ratio:g}', cycles, ratio, another_shaft=True)
+      for cycles in (12, 40, 120) for ratio in (1.0, 0.3137, 2.40789)),
+    *(Setting(f'noise of a resonance, Q {quality:g}', quality=quality)
+      for quality in (10.0, 50.0, 200.0)),
+    *(Setting(f'jitter {jitter:g} rad', jitter=jitter) for jitter in (0.05, 0.2, 0.5, 1.0)),
+    *(Setting(f'r {ratio:g}', ratio=ratio) for ratio in (0.3137, 2.40789)))
 
 
 @dataclass(frozen=True)
@@ -115,6 +156,75 @@ def averages(case: Case, orders: tuple[float, ...], size: FloatArray, trials: in
                 correct_jitter=case.correct, keyphasor_rate=1.0 / (np.sqrt(12.0) * std),
                 interval_tolerance=0.45)
         yield average, turn
+
+
+def setting_distances(setting: Setting, trials: int, seed: int
+                      ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """
+    Return distances over standard errors (average, order) of corrected and of raw amplitudes.
+
+    Those of corrected ones are from the truth, of raw ones from their mean. The third result
+    (average, order) says whether the true amplitude is below `upper_95`. Averages whose correction
+    is refused are not in them.
+    """
+    rng = np.random.default_rng(seed)
+    size = np.array(setting.size)
+    found = []
+    for _ in range(trials):
+        average = setting_average(setting, rng)
+        correction = average.correction
+        assert correction is not None
+        if correction.accepted:
+            errors = correction.amplitude_errors
+            found.append((np.abs(correction.amplitudes[0]), errors.amplitude[0],
+                          errors.upper_95[0], np.abs(average.amplitudes[0]),
+                          average.amplitude_errors.amplitude[0]))
+    corrected, error, limit, raw, raw_error = np.array(found).transpose(1, 0, 2)
+    return (corrected - size) / error, (raw - raw.mean(axis=0)) / raw_error, limit >= size
+
+
+def setting_average(setting: Setting, rng: np.random.Generator) -> sa.Average:
+    """Return a corrected average of a setting."""
+    orders, size, cycles = np.array(setting.orders), np.array(setting.size), setting.cycles
+    rate, speed = setting.points / PERIOD, setting.ratio / PERIOD
+    times = np.arange((cycles + 4 + _SPARE) * setting.points) / rate
+    pulses = PERIOD * (2.0 + rng.uniform() / setting.points + np.arange(cycles + 1.0 + _SPARE))
+    angle = speed * (times - pulses[0])
+    samples = 0.05 * rng.standard_normal(times.size)
+    if setting.another_shaft:
+        apart = 0.0
+        while apart < 2.0 / (cycles * setting.ratio):
+            others = rng.uniform(4.0, 15.0) * np.arange(1.0, 4.0)
+            apart = float(np.abs(others[:, None] - orders).min())
+        orders = np.append(orders, others)
+        size = np.append(size, rng.uniform(0.3, 0.5, others.size))
+    if setting.quality:
+        at = (STRONG[1] + rng.uniform(-0.5, 0.5)) * speed
+        pole = np.exp((2j * np.pi - np.pi / setting.quality) * at / rate)
+        ringing = lfilter([1.0], np.poly([pole, np.conj(pole)]).real,
+                          rng.standard_normal(2 * times.size))[times.size:]
+        samples += 0.3 * ringing / ringing.std()
+    samples += np.cos(2.0 * np.pi * (np.outer(orders, angle).T + rng.uniform(size=orders.size))
+                      ) @ size
+    std = setting.jitter / (2.0 * np.pi * setting.orders[1] * speed)
+    late = pulses + std * rng.uniform(-1.0, 1.0, pulses.size) * np.sqrt(3.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        average, *_ = sa.average(
+            samples, rate, late, orders=setting.orders, ratio=setting.ratio,
+            trigger_cycles=cycles, correct_jitter=True, interval_tolerance=0.45,
+            keyphasor_rate=1.0 / (np.sqrt(12.0) * std))
+    return average
+
+
+def setting_table(trials: int) -> Iterator[str]:
+    """Iterate over the lines of the table of `SETTINGS`; orders count together."""
+    yield '| | corrections accepted | corrected | below `upper_95` | raw |'
+    yield '|' + '---|' * 5
+    for number, setting in enumerate(SETTINGS):
+        corrected, raw, below = setting_distances(setting, trials, seed=3000 + number)
+        yield (f'| {setting.name} | {100.0 * len(corrected) / trials:.0f} % | {shares(corrected)} '
+               f'| {100.0 * below.mean():.1f} | {shares(raw)} |')
 
 
 def _coverage(columns: list[NDArray[np.complex128]], truth: FloatArray | None,
@@ -263,7 +373,11 @@ def main() -> None:
     parser.add_argument('--trials', type=int, default=900, help='averages of a row; 0: no table')
     parser.add_argument('--indicators', type=int, default=1500, help='channels; 0: no table')
     parser.add_argument('--shapes', type=int, default=20000, help='averages of a row; 0: no table')
+    parser.add_argument('--settings', type=int, default=400,
+                        help='averages of a setting; 0: no table')
     options = parser.parse_args()
+    if options.settings:
+        print('\n'.join(setting_table(options.settings)), '', sep='\n', flush=True)
     if options.trials:
         print('\n'.join(amplitude_table(options.trials)), '', sep='\n', flush=True)
         print('\n'.join(limit_table(options.trials)), '', sep='\n', flush=True)

@@ -75,6 +75,32 @@ def test_a_corrected_amplitude_is_no_worse_and_not_biased(benchmark, values):
         assert raw[1] < -0.01
 
 
+@pytest.mark.machines
+def test_intervals_of_corrected_amplitudes_hold_in_every_setting(benchmark):
+    """
+    Over all settings together to 3 points, each within the error of few averages.
+
+    Lines of another shaft that a few cycles do not tell make intervals too safe.
+    """
+    campaign, trials = benchmark('interval_coverage'), 24
+    inside = np.zeros((2, 0))
+    for number, setting in enumerate(campaign.SETTINGS):
+        corrected, _, below = campaign.setting_distances(setting, trials, seed=5000 + number)
+        assert len(corrected) > 0.9 * trials
+        for width, wanted in ((1.0, 0.683), (1.96, 0.95)):
+            share = np.mean(np.abs(corrected) < width)
+            assert share > wanted - 0.03 - 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
+            if not setting.another_shaft:
+                assert share < wanted + 0.03 + 3.0 * np.sqrt(wanted * (1.0 - wanted) / trials)
+        assert below.mean() > 0.92 - 3.0 * np.sqrt(0.05 * 0.95 / trials)
+        if not setting.another_shaft:
+            inside = np.concatenate((inside, [
+                np.abs(corrected).ravel() < width for width in (1.0, 1.96)]), axis=1)
+    wanted = np.array([0.683, 0.95])
+    error = np.sqrt(wanted * (1.0 - wanted) / trials / (len(campaign.SETTINGS) - 9))
+    assert np.all(np.abs(inside.mean(axis=1) - wanted) < 0.03 + 3.0 * error)
+
+
 @pytest.mark.campaign
 def test_recordings_with_different_keyphasors_share_one_scale(benchmark, tmp_path):
     scale = benchmark('fleet_scale')
