@@ -131,7 +131,7 @@ def check_report(text: str) -> str:
     if (verdict == 'none') != (not effects) and verdict != 'unexplained':
         raise WrongResidualError(f'verdict {verdict!r} with the effects {effects}')
     for effect in effects:
-        if not (effect['name'] and effect['evidence'] and 0.0 <= effect['p_value'] <= 1.0 and all(
+        if not (effect['name'] and effect['evidence'] and effect['p_value'] is None and all(
                 item['value'] is not None for item in effect['parameters'].values())):
             raise WrongResidualError(f'missing_effect names {effect}')
     return str(verdict)

@@ -171,7 +171,7 @@ def judge(effects: tuple[str, ...], seed: int, folder: Path, *, only_declared: b
         errors={f'{one["name"]}.{name}': _standard_errors(value, truth[one['name']][name])
                 for one in found for name, value in one['parameters'].items()
                 if name in truth.get(one['name'], {}) and value['standard_error'] is not None},
-        probabilities=report['probabilities'])
+        probabilities=trace.probabilities)
 
 
 def _oracle(trace: Trace, recording: Recording, truth: Mapping[str, Mapping[str, Any]]

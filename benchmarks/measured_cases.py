@@ -61,8 +61,15 @@ class Case:
         """Return the names of the effects that were added."""
         return ', '.join(item['name'] for item in self.content['missing_effects']) or '-'
 
+    @property
+    def refinements(self) -> str:
+        """Return what the recording adds to the declared model."""
+        return ', '.join(dict.fromkeys(
+            item['name'] for item in self.content['declared_changes']
+            if item['declared'] is None)) or '-'
+
     def value(self, when: str, key: str) -> float:
-        """Return a number of the residual, NaN without one; `when` is before or after."""
+        """Return a number of the residual, NaN without one; `when` is as_declared or after."""
         value = self.content[f'error_{when}'][key]
         return float('nan' if value is None else value)
 
@@ -153,28 +160,29 @@ def transfer_table(period_std: float, data: Path) -> str:
     for clock in CLOCKS:
         if clock != FITTED:
             without, fitted = (run(case, data) for case in transferred(clock, period_std))
-            lines.append(f'| {without.title} | {without.value("before", "rms"):.4f} | '
-                         f'{fitted.value("before", "rms"):.4f} |')
+            lines.append(f'| {without.title} | {without.value("as_declared", "rms"):.4f} | '
+                         f'{fitted.value("as_declared", "rms"):.4f} |')
     return '\n'.join(lines)
 
 
 def table(cases: Sequence[Case], first: str) -> str:
     """Return the outcomes in Markdown."""
-    lines = [f'| {first} | held out | verdict | added | unsteadiness | RMS before | after '
-             '| chi2/dof before | after | p before | after |', f'|{"---|" * 11}']
+    lines = [f'| {first} | held out | verdict | effects | refined by | unsteadiness '
+             '| RMS as declared | after | chi2/dof as declared | after |', f'|{"---|" * 10}']
     for case in cases:
         if case.error:
-            lines.append(f'| {case.title} | - | not used {"| " * 8}|')
+            lines.append(f'| {case.title} | - | not used {"| " * 7}|')
             continue
         if not case.content['lines']:
             lines.append(f'| {case.title} | {case.content["acquisitions"]["held_out"]} | '
-                         f'{case.content["verdict"]} | {case.effects} {"| - " * 7}|')
+                         f'{case.content["verdict"]} | {case.effects} | {case.refinements} '
+                         f'{"| - " * 5}|')
             continue
         numbers = [f'{case.value(when, key):.{digits}}'
-                   for key, digits in (('rms', '4f'), ('chi2_per_dof', '3g'), ('p_value', '2g'))
-                   for when in ('before', 'after')]
+                   for key, digits in (('rms', '4f'), ('chi2_per_dof', '3g'))
+                   for when in ('as_declared', 'after')]
         lines.append(f'| {case.title} | {case.content["acquisitions"]["held_out"]} | '
-                     f'{case.content["verdict"]} | {case.effects} | '
+                     f'{case.content["verdict"]} | {case.effects} | {case.refinements} | '
                      f'{case.content["unsteadiness"]:.1%} | {" | ".join(numbers)} |')
     return '\n'.join(lines)
 
@@ -212,27 +220,27 @@ def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
              title='Errors of a steady machine repeat')
     left.legend(fontsize='small', loc='upper right', ncols=2)
     lines = [line for case in cases if case.effects != '-' for line in case.content['lines']]
-    for when, colour, label in (('before', BEFORE, 'declared: independent errors'),
-                                ('after', AFTER, 'with keyphasor_quantisation')):
+    for when, colour, label in (('as_declared', BEFORE, 'declared: independent errors'),
+                                ('after', AFTER, 'with the ticks of the clock')):
         right.plot([line[f'predicted_{when}'] for line in lines],
                    [line['observed'] for line in lines], 'o', color=colour, markersize=4,
                    label=label)
     right.axline((0.5, 0.5), slope=1.0, color='0.4', linewidth=0.8)
     right.set(xlabel='predicted attenuation', ylabel='observed, held-out acquisitions',
-              title='All lines, where the effect was added')
+              title='All lines, without and with the ticks')
     right.legend(fontsize='small')
     return figure
 
 
 def error_figure(cases: Sequence[Case]) -> Figure:
-    """Draw the held-out error of every case that could be used, before and after."""
+    """Draw the held-out error of every case that could be used, as declared and after."""
     used = [case for case in cases if case.content.get('lines')]
     place = np.arange(len(used))
     figure = Figure(figsize=(10.0, 3.4), layout='constrained')
     axes = figure.subplots()
-    for when, colour, shift in (('before', BEFORE, -0.2), ('after', AFTER, 0.2)):
+    for when, colour, shift in (('as_declared', BEFORE, -0.2), ('after', AFTER, 0.2)):
         axes.bar(place + shift, [case.value(when, 'rms') for case in used], 0.38, color=colour,
-                 label=f'{when} the loop')
+                 label=when.replace('_', ' ') + ' the loop' * (when == 'after'))
     axes.set_xticks(place, [case.title.replace(', ', ',\n') for case in used], fontsize='small')
     axes.set(ylabel='RMS of observed minus\npredicted attenuation', yscale='log', ylim=(1e-4, 1.0))
     axes.grid(axis='y', alpha=0.3)

@@ -416,7 +416,7 @@ def run(title: str, parts: Sequence[Bench], name: str, change: float, declared: 
             'limit': [(item['upper_95'], item['lower_95']) for item in report['limits']
                       if item['name'] == name],
             'before': report['error_before']['rms'], 'after': report['error_after']['rms'],
-            'p_value': report['error_after']['p_value'], 'cpu': time.process_time() - start}
+            'gain': report['gain'], 'cpu': time.process_time() - start}
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -257,8 +257,8 @@ def test_measured_cases_are_run_as_a_user_does(benchmark, tmp_path):
     assert 'fitting and scoring take at least 4' in short.content['remarks'][-1]
     assert 'do not make an acquisition' in refused.error
     lines = cases.table([used, short, refused], 'machine').splitlines()
-    assert {line.count('|') for line in lines} == {12}
-    assert lines[2].startswith('| used | 5 | none | - | 0.0% |')
+    assert {line.count('|') for line in lines} == {11}
+    assert lines[2].startswith('| used | 5 | none | - | - | 0.0% |')
     assert cases.error_figure([used]).axes
 
 

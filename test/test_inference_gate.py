@@ -222,8 +222,8 @@ def test_keyphasor_on_the_ticks_of_the_declared_clock_suffices(fluctuation, tmp_
 def test_mesh_of_another_shaft_is_no_tone_of_the_supply(rng):
     rate, seconds = 10_000.0, 16.0
     time = np.arange(int(rate * seconds)) / rate
-    waves = 0.02 * SPEED * sum(5e-4 * np.sin(2.0 * np.pi * f * time + f) / f
-                               for f in (0.13, 0.41, 0.87))
+    waves = SPEED * sum(4e-4 * np.sin(2.0 * np.pi * f * time + f) / (2.0 * np.pi * f)
+                        for f in (0.13, 0.41, 0.87))  # a speed that wanders by 5e-4
     turns = SPEED * time + waves - 0.25
     true = CubicSpline(turns, time)(np.arange(1, int(turns[-1])))
     vibration = sum(size * np.cos(2.0 * np.pi * order * turns + order) for order, size in (

@@ -313,7 +313,7 @@ class Average:
 
     @property
     def gain(self) -> FloatArray:
-        """Return the mean gain (order,) of the interpolator, NaN of a refused order."""
+        """Return what the interpolator leaves of each order (order,), NaN if refused."""
         return mean_gain(self.gains, self.orders, self.refused)
 
     @property

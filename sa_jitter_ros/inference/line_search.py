@@ -40,6 +40,7 @@ _MOST_LINES = 60  # undeclared ones, half of them before bends and gains are fre
 # it must not be far below the strongest, which may leave images of itself.
 FALSE, _MARGIN, _SHARE = 1e-3, 1.25, 0.3
 _HANN = 1.5  # bins of noise in one of the window
+_MISSED = 1e-3  # share of the power of a tone that the frequencies tried for it may miss
 _SHARPER = 1.3  # in power, over angle than over time or the reverse
 _FEWEST_SIDES = 3  # lines as far from declared ones that show a shaft
 #: Bins between lines, or cycles in a stretch between waves, that are told apart.
@@ -303,7 +304,8 @@ def with_a_shaft(states: States) -> BoolArray:
     found = np.zeros(states.amplitudes.shape[1], np.bool_)
     if states.orders.size > states.declared:
         over_angle, over_time, _ = _both_ways(states)
-        found[states.declared:states.orders.size] = over_angle > over_time + ODDS
+        found[states.declared:states.orders.size] = (
+            over_angle > (1.0 + _MISSED) * over_time + ODDS)
     return found
 
 

@@ -51,6 +51,8 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
     lines = [{
         'channel': observation.channel_names[c], 'order': orders[g], 'level': trace.level[i],
         'observed': trace.attenuation[list(trace.held_out), i].mean(),
+        'predicted_as_declared': (trace.attenuation[list(trace.held_out), i].mean()
+                                  - trace.as_declared.mean[i]),
         'predicted_before': trace.prediction_before.attenuation[list(trace.held_out), i].mean(),
         'predicted_after': trace.prediction_after.attenuation[list(trace.held_out), i].mean(),
         'standard_error': trace.after.standard_error[i],
