@@ -260,12 +260,8 @@ def main() -> None:
     print(table(gearbox, 'gearbox, clock'), flush=True)
     source = run(Case('', [gear0(FITTED, _FIRST_HALF)], {**GEAR0, 'keyphasor_rate': FITTED}),
                  options.data)
-    effect, = (item for item in source.content['missing_effects']
-               if item['name'] == 'keyphasor_quantisation')
-    period_std = effect['parameters']['period_std']['value']
-    shown = gearbox[CLOCKS.index(FITTED)]
-    for item in shown.content['missing_effects']:
-        print(f'\n{shown.title}: {item["name"]}: {item["evidence"]}')
+    period_std, = (item['value'] for item in source.content['declared_changes']
+                   if item['parameter'] == 'period_std')
     print(f'\nperiod_std = {period_std:.3g} s, fitted at {FITTED:.0f} Hz on channels 0 to 2, then '
           'declared; channels 3 to 5:\n')
     print(transfer_table(period_std, options.data), flush=True)

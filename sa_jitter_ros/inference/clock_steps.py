@@ -183,4 +183,4 @@ def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, floa
                          (at + 1, min(last, at + 1 + 2 * _BESIDE))) - usual
     sudden = all(phasors.likelihood(at, _SUDDEN, size + usual) > phasors.likelihood(
         at, _SUDDEN, part * size + usual) for part in (0.0, 0.5))
-    return (at, size, error) if sudden else None
+    return (at, size, error) if sudden and abs(size) > _CLEAR * error else None

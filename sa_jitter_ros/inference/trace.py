@@ -233,6 +233,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     noise: tuple[float, float] | None = None
     gained, harmful, unsteady = NO_GAIN, list[Finding](), tuple[UnsteadyLine, ...]()
     tried: list[Candidate] = []
+    most = ''
 
     def change(others: Sequence[Effect], effect: Effect) -> float:
         return _published_change(observation, others, [*others, effect])
@@ -250,6 +251,9 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         by_how_much = partial(bench.change, chosen=_few(bench))
         tried = candidates_of_lines(bench, ())
         found = [item.finding for item in tried if not item.rejected_because]
+        events = _events(bench, found)
+        if events is not None:
+            found, most = [item for item in found if item.name != _GAIN], events.text
         found, harmful, gained = passed(
             found, _predicting(bench, bench.unsteadiness(_effects(found))))
         unsteady = bench.unsteady_lines(_effects(found))
@@ -260,7 +264,7 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
     undecided = tuple(row.name for row in rows if row.name in {
         *open_, *_undecided(by_how_much, declared, rows)})
     tested = {*(item.name for item in found), *(item.name for item in tried)}
-    left_over = _left_over(observation, '', harmful, unsteady)
+    left_over = _left_over(observation, most, harmful, unsteady)
     return Trace(
         observation, tuple(declared), Lines(none, none), np.zeros(0), fit, held_out, tuple(found),
         tuple(present), tuple(_without_harmful(tried, harmful)), UNDEFINED, UNDEFINED, (), (),
@@ -272,6 +276,15 @@ def _nothing_compared(observation: Observation, declared: Sequence[Effect], reas
         reason, noise, gain=gained, remains=left_over, unsteady=unsteady,
         not_testable={name: reason for name in EFFECTS if name not in tested},
         clock=NO_CLOCK if bench is None else bench.clock)
+
+
+def _events(bench: Bench, found: Sequence[Finding]) -> Check | None:
+    """Return what shows that a modulation that was found is a change of single events, or None."""
+    if _GAIN not in {item.name for item in found}:
+        return None
+    checks = [check_gain(bench.scatter), check_channels(bench.scatter)]
+    surest = min(checks, key=lambda item: item.p_value)
+    return surest if surest.p_value < FALSE_ALARM / len(checks) else None
 
 
 def _published_change(observation: Observation, without: Sequence[Effect],
@@ -480,7 +493,8 @@ def _refined(bench: Bench, chosen: list[Finding], present: list[Finding]
     Return the bench with the ticks of the declared clock, these, and the other findings.
 
     A keyphasor that is sampled at the declared rate has them: they are no effect that the declared
-    model lacks. Where acquisitions are predicted worse with them, they are left out.
+    model lacks. Where acquisitions are predicted worse with them, beside the effects that were
+    chosen, they are left out.
     """
     ticks = [item for item in (*chosen, *present)
              if isinstance(item.effect, KeyphasorQuantisation)
@@ -489,10 +503,11 @@ def _refined(bench: Bench, chosen: list[Finding], present: list[Finding]
     if not ticks:
         return bench, [], chosen, present
     refined = bench.declaring(_effects(ticks))
-    own = refined.unsteadiness(())
-    worse = gain(_predicting(bench, own)([]), _predicting(refined, own)([]), of_mean=True).worse
     chosen, present = ([item for item in items if item not in ticks]
                        for items in (chosen, present))
+    own = refined.unsteadiness(_effects(chosen))
+    worse = gain(*(_predicting(item, own)(chosen) for item in (bench, refined)),
+                 of_mean=True).worse
     return (bench, [], chosen, present) if worse else (refined, ticks, chosen, present)
 
 
