@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.inference.cycle_reader import CycleReader
+from sa_jitter_ros.inference.line_search import top_between
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -143,8 +144,9 @@ class _Phasors:
         if near.size < 3:
             return float(self.delays[best])
         near = near[np.argsort(self.delays[near])]
-        bend = np.polyfit(self.delays[near] - self.delays[near[1]], likely[near], 2)
-        return float(self.delays[near[1]] - (0.5 * bend[1] / bend[0] if bend[0] < 0.0 else 0.0))
+        low, middle, high = likely[near]
+        off = top_between(likely[near]) if low + high < 2.0 * middle else 0.0
+        return float(self.delays[near[1]] + off * (self.delays[near[1]] - self.delays[near[0]]))
 
     def likelihood(self, at: int, beside: int, delay: float) -> float:
         """Return how well a `delay` (s) in cycle `at` fits some cycles on either side."""
@@ -170,13 +172,14 @@ def _clearest(phasors: _Phasors, edges: Sequence[int]) -> tuple[int, float, floa
         return None
     usual = float(np.median(delays))
     apart = np.array(delays) - usual
-    size = apart[np.argmax(np.abs(apart))]
-    away = np.abs(np.array(places) - places[int(np.argmax(np.abs(apart)))]) > _BESIDE
+    largest = int(np.argmax(np.abs(apart)))
+    size = apart[largest]
+    away = np.abs(np.array(places) - places[largest]) > _BESIDE
     error = float(np.sqrt(np.mean(apart[away] ** 2))) if away.any() else math.inf
     if not abs(size) > _CLEAR * error:
         return None
-    near = [at for at in places if not away[places.index(at)]]
-    at = max(near, key=lambda place: phasors.likelihood(place, _FEWEST, size + usual))
+    at = max(np.array(places)[~away].tolist(),
+             key=lambda place: phasors.likelihood(place, _FEWEST, size + usual))
     first, last = max(edge for edge in edges if edge <= at), min(
         edge for edge in edges if edge > at)
     size = phasors.delay((max(first, at - 2 * _BESIDE), at),

@@ -58,7 +58,7 @@ class HeldOut:
     @property
     def rms(self) -> float:
         """Return the RMS over lines of the mean difference."""
-        return float(np.sqrt(np.mean(self.difference.mean(axis=0) ** 2)))
+        return _rms(self.difference)
 
     def beside(self, other: 'HeldOut') -> 'HeldOut':
         """Return the prediction of these lines and of those of another one, not compared."""
@@ -106,7 +106,8 @@ def gain(before: HeldOut, after: HeldOut, *, of_mean: bool) -> Gain:
     if count < 2:
         return Gain(float(apart.mean()), math.inf, after.rms - before.rms, math.inf, of_mean)
     every = np.arange(count)
-    without = [_rms_without(after, every == i) - _rms_without(before, every == i) for i in every]
+    without = [_rms(after.difference[every != i]) - _rms(before.difference[every != i])
+               for i in every]
     error = max(float(np.std(apart, ddof=1)), _expected_scatter(before, after)) / math.sqrt(count)
     return Gain(float(apart.mean()), error, after.rms - before.rms,
                 float(np.std(without) * math.sqrt(count - 1)), of_mean)
@@ -141,6 +142,6 @@ def _expected_scatter(before: HeldOut, after: HeldOut) -> float:
     return float(np.mean(np.sqrt(0.5 * (1.0 - ratio) ** 2 + moved), axis=(1, 2)).sum())
 
 
-def _rms_without(item: HeldOut, left_out: Array) -> float:
-    """Return the RMS without some acquisitions."""
-    return float(np.sqrt(np.mean(item.difference[~left_out].mean(axis=0) ** 2)))
+def _rms(difference: Array) -> float:
+    """Return the RMS over lines of the mean over acquisitions (acquisition, line)."""
+    return float(np.sqrt(np.mean(difference.mean(axis=0) ** 2)))

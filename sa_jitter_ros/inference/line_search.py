@@ -160,7 +160,7 @@ def new_lines(states: States) -> tuple[list[float], list[float]]:
         for peak in peaks[(order > 3.0 / span) & (order < states.highest)]:
             near = other[max(peak - 8, 0):peak + 9].max()
             if power[peak] > near * (_SHARPER if tone else 1.0 / _SHARPER):
-                place = _between(np.log(ratio[peak - 1:peak + 2])) + peak
+                place = top_between(np.log(ratio[peak - 1:peak + 2])) + peak
                 found.append((power[peak], place / (duration if tone else span), tone))
     found.sort(reverse=True)
     orders: list[float] = []
@@ -356,7 +356,7 @@ def _both_ways(states: States) -> tuple[Array, Array, Array]:
         found = np.abs(tried @ beside.T) ** 2 @ weights
         best = int(np.argmax(found))
         near = np.log(found[best - 1:best + 2])
-        off = step * (best - reach + (_between(near) if near.size == 3 else 0.0))
+        off = step * (best - reach + (top_between(near) if near.size == 3 else 0.0))
         over_time[k] = weights @ np.abs(beside @ np.exp(-2j * np.pi * off * middle)) ** 2
         tones[k] = states.orders[i] * states.frequency + off
     return over_angle, over_time, tones
@@ -389,7 +389,7 @@ def _medians(power: Array, reach: int) -> Array:
                   constant_values=(medians[0], medians[-1]))
 
 
-def _between(values: Array) -> float:
+def top_between(values: Array) -> float:
     """Return where a parabola through three values has its top, from the middle one."""
     left, middle, right = values
     return float(0.5 * (left - right) / (left - 2.0 * middle + right))
