@@ -219,7 +219,7 @@ def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
     left.set(xlabel='revolution', ylabel='pulse error in periods of the clock', ylim=(-0.05, 1.25),
              title='Errors of a steady machine repeat')
     left.legend(fontsize='small', loc='upper right', ncols=2)
-    lines = [line for case in cases if case.effects != '-' for line in case.content['lines']]
+    lines = [line for case in cases for line in case.content['lines']]
     for when, colour, label in (('as_declared', BEFORE, 'declared: independent errors'),
                                 ('after', AFTER, 'with the ticks of the clock')):
         right.plot([line[f'predicted_{when}'] for line in lines],

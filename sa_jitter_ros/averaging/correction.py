@@ -266,7 +266,7 @@ def _steady(average: Average, settings: AverageSettings) -> tuple[ComplexArray, 
     if average.discarded_cycles or not leaks_apart(
             settings.orders, settings.cycle_length, len(cycles)):
         return average.amplitudes, Scatter.of(cycles, clean)
-    steady = steady_part(clean)
+    steady = steady_part(clean, settings.cycle_length * np.asarray(settings.orders))
     scatter = Scatter.of(steady.cycles, steady.cycles).inflated(steady.inflation, steady.lost)
     leaked = cycles.mean(axis=0) - steady.mean
     return average.amplitudes - leaked * (1.0 / average.gain), scatter

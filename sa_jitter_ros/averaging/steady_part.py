@@ -12,46 +12,48 @@
 The steady part of order amplitudes that turn or change from cycle to cycle.
 
 The lines of another shaft leak into the amplitudes of single trigger cycles, and turn there at a
-steady rate, the same for all orders. A few cycles do not average them out: their mean holds what
-the turns leave, and no interval of normal errors is that of a sine. Such tones are found one by
-one by an F test, along the radius of the amplitudes and across it, and fitted together with the
-means.
+steady rate. A few cycles do not average them out: their mean holds what the turns leave, and no
+interval of normal errors is that of a sine. A line of p orders leaks into order g as two tones: of
+p - g orders, and by its negative frequency of -p - g. All orders show the same p, up to whole
+turns in a cycle. Lines are looked for one by one, those found are tested together by an F test,
+and fitted together with the means.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.synchronous_orders import shares_of_tones
-from scipy.fft import rfft
+from scipy.fft import fft
 from scipy.special import betainc
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-# Cycles from which on a tone in them can be told, and cycles for each of them.
+# Cycles from which on a line in them can be told, and cycles for each of them.
 _LEAST_CYCLES, _OF_EACH = 8, 4
-_MOST_TONES = 8
-# Probability that noise alone passes for a tone.
+_MOST_LINES = 8
+# Probability that noise alone passes for a line.
 _FALSE_ALARM = 1e-3
-# Share of the scatter of an order below which a tone costs the mean less than to fit it does.
+# Share of the scatter of an order below which a line costs the mean less than to fit it does.
 _LEAST_SHARE = 0.25
-# Turns of a tone in all cycles, from which on its fit hardly disturbs that of the mean, and by
-# which it must differ from a tone that alternates, of which one phase does not show.
-_LEAST_TURNS, _LEAST_BESIDE = 2.0, 1.0
+# Turns of a tone in all cycles, from which on its fit hardly disturbs that of the mean or of
+# another tone.
+_LEAST_TURNS = 2.0
 _REFINED = 2  # rounds of the search for a rate, each eight times as fine as the one before
+# Turns of a tone in a cycle that are none, and digits of turns in which orders are alike.
+_WHOLE, _DIGITS = 1e-9, 9
 _TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
 class SteadyPart:
     """
-    The `mean` (channel, order) of cycles (cycle, channel, order) without their `rates` of tones.
+    The `mean` (channel, order) of cycles (cycle, channel, order) without their `rates` of lines.
 
     `cycles` are without them, too, and scatter as much as their noise does. The variance of the
     mean is `inflation` (channel, order) times that of the mean of so many cycles with the variance
-    that they show; `lost` (channel, order) degrees of freedom are the tones'. Rates are in turns a
-    cycle. What tones hardly disturb keeps its mean.
+    that they show; `lost` (channel, order) degrees of freedom are the lines'. Rates are in turns a
+    cycle. What lines hardly disturb keeps its mean.
     """
 
     mean: ComplexArray
@@ -61,100 +63,175 @@ class SteadyPart:
     lost: FloatArray
 
 
-def steady_part(cycles: ComplexArray) -> SteadyPart:
+def steady_part(cycles: ComplexArray, turns: FloatArray) -> SteadyPart:
     """
     Return the steady part of consecutive amplitudes (cycle, channel, order).
+
+    `turns` (order,) are those of the orders in a cycle.
 
     >>> rng = np.random.default_rng(1)
     >>> tone = 0.2 * np.exp(2j * np.pi * 0.23 * np.arange(20))[:, None, None]
     >>> noise = rng.normal(0.0, 1e-3, (20, 1, 3)) + 1j * rng.normal(0.0, 1e-3, (20, 1, 3))
-    >>> found = steady_part(1.0 + tone * np.array([1.0, 0.3, 0.1]) + noise)
+    >>> found = steady_part(1.0 + tone * np.array([1.0, 0.3, 0.1]) + noise, np.arange(1.0, 4.0))
     >>> found.rates.round(2), bool(abs(found.mean - 1.0).max() < 2e-3)
     (array([0.23]), True)
     """
-    count = len(cycles)
-    mean = cycles.mean(axis=0)
-    rates: FloatArray = np.empty(0)
-    if count >= _LEAST_CYCLES:
-        turned = cycles * np.exp(-1j * np.angle(mean))
-        known = np.isfinite(mean) & (np.ptp(turned.real, axis=0) > 0.0)
-        if known.any():
-            parts = turned[:, known]
-            rates = _rates(np.concatenate((parts.real, parts.imag), axis=1))
-    if not rates.size:
-        return SteadyPart(mean, cycles, rates, np.ones(mean.shape), np.zeros(mean.shape))
-    design = _design(rates, count)
-    inverse = np.linalg.inv(design.T @ design)
-    fitted = inverse @ (design.T @ cycles.reshape(count, -1))
-    tones = (design[:, 1:] @ fitted[1:]).reshape(cycles.shape)
-    alone, steady = fitted[0].reshape(mean.shape), cycles - tones
-    left, scatter = (np.sum(np.abs(item - about) ** 2, axis=0)
-                     for item, about in ((steady, alone), (cycles, mean)))
-    disturbed = left < (1.0 - _LEAST_SHARE) * scatter
-    unknowns = design.shape[1]
-    inflation = count * inverse[0, 0] * (count - 1.0) / (count - unknowns)
-    return SteadyPart(
-        np.where(disturbed, alone, mean), np.where(disturbed, steady, cycles), rates,
-        np.where(disturbed, inflation, 1.0), np.where(disturbed, unknowns - 1.0, 0.0))
+    count, mean = len(cycles), cycles.mean(axis=0)
+    inflation, lost = np.ones(mean.shape), np.zeros(mean.shape)
+    deviations = cycles - mean
+    scatter = np.sum(np.abs(deviations) ** 2, axis=0)
+    told = scatter > 0.0  # not those of a silent channel, or NaN
+    channels = told.any(axis=1)
+    known = np.flatnonzero(told[channels].all(axis=0))
+    if count < _LEAST_CYCLES or not channels.any() or not known.size:
+        return SteadyPart(mean, cycles, np.empty(0), inflation, lost)
+    turns = np.mod(np.round(turns, _DIGITS), 1.0)
+    rates = _Lines(deviations[:, channels][..., known], turns[known]).rates()
+    steady = cycles.copy()
+    for order in known if rates.size else ():
+        design = _design(rates, count, turns[order])
+        unknowns = design.shape[1]
+        inverse = np.linalg.inv(design.conj().T @ design)
+        fitted = inverse @ (design.conj().T @ cycles[..., order])
+        left = cycles[..., order] - design[:, 1:] @ fitted[1:]
+        better = np.sum(np.abs(left - fitted[0]) ** 2, axis=0) < (
+            1.0 - _LEAST_SHARE) * scatter[:, order]
+        mean[better, order] = fitted[0, better]
+        steady[:, better, order] = left[:, better]
+        inflation[better, order] = (
+            count * inverse[0, 0].real * (count - 1.0) / (count - unknowns))
+        lost[better, order] = unknowns - 1.0
+    return SteadyPart(mean, steady, rates, inflation, lost)
 
 
-def _design(rates: FloatArray, count: int) -> FloatArray:
-    """Return columns (cycle, 1 + 2 rates): a constant, and cosine and sine of each rate."""
-    turns = 2.0 * np.pi * np.multiply.outer(np.arange(count), rates)
-    return np.concatenate((np.ones((count, 1)), np.cos(turns), np.sin(turns)), axis=1)
+def _apart(rate: FloatArray, turn: FloatArray) -> FloatArray:
+    """Return how far (turns a cycle) tones of these rates are from one another."""
+    return np.asarray(np.abs(np.mod(rate - turn + 0.5, 1.0) - 0.5))
 
 
-def _rates(series: FloatArray) -> FloatArray:
-    """Return the rates of the tones in series (cycle, column)."""
-    count = len(series)
-    rates: FloatArray = np.empty(0)
-    most = min(_MOST_TONES, count // _OF_EACH - 1)
-    while rates.size < most:
-        left = _without(series, rates)
-        place, chance = _strongest(left, 2 * rates.size)
-        within = _LEAST_TURNS / count <= place <= 0.5 - _LEAST_BESIDE / count
-        if not (within and chance < _FALSE_ALARM / count
-                and _largest_share(left, place) > _LEAST_SHARE):
-            break
-        rates = np.append(rates, _refined(left, place))
-    for i in range(rates.size if rates.size > 1 else 0):
-        rates[i] = _refined(_without(series, np.delete(rates, i)), rates[i])
-    return rates
+def _told(rates: FloatArray, turns: FloatArray, count: int
+          ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """
+    Return which tones (rate, order) `count` cycles tell from an order and from each other.
+
+    The first result is that of a line's own frequency, the second of its negative one.
+    """
+    own, negative = (_apart(sign * rates[:, None], turns) >= _LEAST_TURNS / count
+                     for sign in (1.0, -1.0))
+    twice = _apart(rates, -rates)[:, None] < 1.0 / count
+    return own, negative & ~(own & twice)
 
 
-def _without(series: FloatArray, rates: FloatArray) -> FloatArray:
-    """Return series (cycle, column) without their means and tones."""
-    design = _design(rates, len(series))
-    return np.asarray(series - design @ np.linalg.solve(design.T @ design, design.T @ series))
+def _design(rates: FloatArray, count: int, turn: float) -> ComplexArray:
+    """Return columns (cycle, tone): a constant, and what lines of `rates` are in an order."""
+    own, negative = _told(rates, np.array([turn]), count)
+    tones = np.concatenate(([turn], rates[own[:, 0]], -rates[negative[:, 0]]))
+    return np.asarray(np.exp(2j * np.pi * np.multiply.outer(np.arange(count), tones - turn)))
 
 
-def _strongest(series: FloatArray, lost: int) -> tuple[float, float]:
-    """Return the rate of the strongest tone in series without means, and its chance in noise."""
-    count, columns = series.shape
-    rates = np.arange(1, count) / (2.0 * count)
-    lines = rfft(series, 2 * count, axis=0)[1:-1]
-    shares = shares_of_tones(series, rates, lines)
-    place = int(np.argmax(shares))
-    freedom = max(count - 3 - lost, 1)
-    return float(rates[place]), float(betainc(
-        0.5 * columns * freedom, columns, 1.0 - shares[place]))
+def _sum_of(turns: FloatArray, count: int) -> ComplexArray:
+    """Return the sums over the cycles of tones that turn by `turns` in each."""
+    slow = _apart(turns, np.zeros(())) < _WHOLE
+    half = np.pi * np.where(slow, 0.25, turns)
+    sums = np.exp(1j * half * (count - 1)) * np.sin(half * count) / np.sin(half)
+    return np.asarray(np.where(slow, count, sums))
 
 
-def _largest_share(series: FloatArray, rate: float) -> float:
-    """Return the largest share of the variance of a column that a tone of this rate has."""
-    left = _without(series, np.array([rate]))
-    return 1.0 - float(np.min(np.sum(left**2, axis=0) / np.maximum(
-        np.sum(series**2, axis=0), _TINY)))
+class _Lines:
+    """Lines in the deviations (cycle, channel, order) of orders that make `turns` in a cycle."""
+
+    def __init__(self, deviations: ComplexArray, turns: FloatArray) -> None:
+        self._deviations, self._turns = deviations, turns
+        # In this frame an order turns, and a line has one rate in all orders.
+        self._frame = np.exp(2j * np.pi * np.multiply.outer(np.arange(len(deviations)), turns)
+                             )[:, None]
+
+    def rates(self) -> FloatArray:
+        """Return the rates of the lines, in turns a cycle."""
+        count = len(self._deviations)
+        rates, found = np.empty((2, 0))
+        least = np.log(_FALSE_ALARM)
+        grid = np.arange(count + 1) / (2.0 * count)
+        left = self._deviations
+        # Of a few lines in a few cycles each alone may be no more than noise makes.
+        while rates.size < min(_MOST_LINES, count // _OF_EACH):
+            sums = fft(left * self._frame, 2 * count, axis=0)
+            shares = self._shares(left, grid, sums[:count + 1], sums[-np.arange(count + 1)])
+            place = _strongest(shares)
+            if not np.nanmax(shares[place], initial=0.0) > _LEAST_SHARE:
+                break
+            rates = np.append(rates, self._refined(left, grid[place]))
+            for i in range(rates.size if rates.size > 1 else 0):
+                rates[i] = self._refined(self._without(np.delete(rates, i)), rates[i])
+            left = self._without(rates)
+            chance = self._chance(rates, left) + rates.size * np.log(2.0 * count)
+            if chance < least:
+                least, found = chance, rates.copy()
+        return found
+
+    def _chance(self, rates: FloatArray, left: ComplexArray) -> float:
+        """Return the logarithm of the probability that noise has as little `left` as lines."""
+        count = len(left)
+        unknowns = sum(item.sum(axis=0) for item in _told(rates, self._turns, count))
+        share = np.sum(np.abs(left) ** 2, axis=0) / np.maximum(
+            np.sum(np.abs(self._deviations) ** 2, axis=0), _TINY)
+        freedom = float(len(share) * np.sum(np.maximum(count - 1 - unknowns, 0)))
+        lost = float(len(share) * np.sum(unknowns))
+        return float(np.log(max(betainc(freedom, lost, float(share.mean())), _TINY)
+                            )) if lost and freedom else 0.0
+
+    def _without(self, rates: FloatArray) -> ComplexArray:
+        """Return the deviations without their means and lines."""
+        if not rates.size:
+            return self._deviations
+        left = np.empty_like(self._deviations)
+        for turn in np.unique(self._turns):
+            same = self._turns == turn
+            part = self._deviations[..., same]
+            design = _design(rates, len(left), turn)
+            fitted = np.linalg.lstsq(design, part.reshape(len(left), -1), rcond=None)[0]
+            left[..., same] = part - (design @ fitted).reshape(part.shape)
+        return left
+
+    def _shares(self, left: ComplexArray, rates: FloatArray, own: ComplexArray,
+                negative: ComplexArray) -> FloatArray:
+        """
+        Return the shares (rate, channel, order) that lines of these rates have of deviations.
+
+        `own` and `negative` (rate, channel, order) are Fourier sums in the frame of the lines, at
+        the rates and at their negative. NaN where the cycles do not tell a line from the order.
+        """
+        count, whole = len(left), np.maximum(np.sum(np.abs(left) ** 2, axis=0), _TINY)
+        told = [item[:, None] for item in _told(rates, self._turns, count)]
+        mean_own, mean_negative = (_sum_of(self._turns - sign * rates[:, None], count)
+                                   for sign in (1.0, -1.0))
+        # Tones without their means, multiplied with one another.
+        first, second = (np.where(item, count - np.abs(mean[:, None]) ** 2 / count, 1.0)
+                         for item, mean in zip(told, (mean_own, mean_negative)))
+        both = np.where(told[0] & told[1], (_sum_of(-2.0 * rates, count)[:, None]
+                                            - mean_own * np.conj(mean_negative) / count)[:, None],
+                        0.0)
+        own, negative = np.where(told[0], own, 0.0), np.where(told[1], negative, 0.0)
+        power = (second * np.abs(own) ** 2 + first * np.abs(negative) ** 2
+                 - 2.0 * (np.conj(own) * both * negative).real
+                 ) / (first * second - np.abs(both) ** 2)
+        return np.where(told[0] | told[1], np.minimum(power / whole, 1.0), np.nan)
+
+    def _refined(self, left: ComplexArray, rate: float) -> float:
+        """Return the rate near `rate` at which a line has most of deviations without means."""
+        count = len(left)
+        flat, step = (left * self._frame).reshape(count, -1), 0.5 / count
+        for _ in range(_REFINED):
+            near = rate + np.linspace(-step, step, 17)
+            waves = np.exp(-2j * np.pi * np.multiply.outer(near, np.arange(count)))
+            own, negative = ((item @ flat).reshape(-1, *left.shape[1:])
+                             for item in (waves, np.conj(waves)))
+            rate = float(near[_strongest(self._shares(left, near, own, negative))])
+            step /= 8.0
+        return rate
 
 
-def _refined(series: FloatArray, rate: float) -> float:
-    """Return the rate near `rate` at which a tone has most of series without means."""
-    count = len(series)
-    step = 0.5 / count
-    for _ in range(_REFINED):
-        near = np.clip(rate + np.linspace(-step, step, 17), 0.5 * _LEAST_TURNS / count,
-                       0.5 - 0.25 / count)
-        waves: ComplexArray = np.exp(-2j * np.pi * np.multiply.outer(near, np.arange(count)))
-        rate = float(near[int(np.argmax(shares_of_tones(series, near, waves @ series)))])
-        step /= 8.0
-    return rate
+def _strongest(shares: FloatArray) -> int:
+    """Return the place of the line that has most of the deviations, of shares (rate, ...)."""
+    flat = shares.reshape(len(shares), -1)
+    return int(np.argmax(np.nansum(flat, axis=1)))
