@@ -12,8 +12,9 @@
 Behaviour of the loop as decisions: whether it is right on machines whose truth is known.
 
 `run` closes the loop on the rows of `decision_machines` and writes a line of JSON for each;
-`compare` tells two such files apart, pair by pair (McNemar's exact test); `table` counts by class;
-`publish` writes `decisions.json` beside this file, which the tests compare with.
+`compare` tells two such files apart, pair by pair (McNemar's exact test); `table` counts rows by
+class, source or verdict; `publish` writes `decisions.json` beside this file, which the tests
+compare with.
 
     python benchmarks/decisions.py run --output now.jsonl
     python benchmarks/decisions.py run --output before.jsonl --package ../other_checkout
@@ -201,9 +202,9 @@ def _short(row: Result) -> str:
 
 
 def table(options: argparse.Namespace) -> int:
-    """Print how the rows of each source and class ended."""
+    """Print how the rows of each class, source or verdict ended."""
     found = _read(options.results)
-    wrong = {row[options.by] for row in found if not row['right']}
+    wrong = {_title(row, options.by) for row in found if not row['right']}
     print(markdown(found, by=options.by, only=wrong if options.wrong else None))
     return 0
 
@@ -212,15 +213,20 @@ def markdown(found: Sequence[Result], *, by: str = 'class', only: set[str] | Non
     """Return how rows ended, open and reserved ones apart, as a table; `only` of some classes."""
     lines = [f'| {by} | rows | ' + ' | '.join(OUTCOMES) + ' |', '|---|' + '---|' * (
         len(OUTCOMES) + 1)]
-    titles = dict.fromkeys(row[by] for row in found)
+    titles = dict.fromkeys(_title(row, by) for row in found)
     for title in (*(item for item in titles if only is None or item in only), ''):
-        halves = [[row for row in found if title in ('', row[by]) and row['reserved'] == reserved]
-                  for reserved in (False, True)]
+        halves = [[row for row in found if title in ('', _title(row, by))
+                   and row['reserved'] == reserved] for reserved in (False, True)]
         cells = [', '.join(str(count(half, outcome)) for half in halves)
                  for outcome in OUTCOMES]
         lines.append(f'| {title or "all"} | {", ".join(str(len(half)) for half in halves)} | '
                      + ' | '.join(cells) + ' |')
     return '\n'.join([*lines, '', _probabilities(found)])
+
+
+def _title(row: Result, by: str) -> str:
+    """Return the class, source or verdict of a row; one that was refused has no verdict."""
+    return row[by] or 'refused'
 
 
 def _probabilities(found: Sequence[Result]) -> str:
@@ -291,7 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     two.set_defaults(command=compare)
     three = commands.add_parser('table', help='count the rows that are right')
     three.add_argument('results', type=Path)
-    three.add_argument('--by', choices=('class', 'source'), default='class')
+    three.add_argument('--by', choices=('class', 'source', 'verdict'), default='class')
     three.add_argument('--wrong', action='store_true', help='only classes with a wrong row')
     three.set_defaults(command=table)
     four = commands.add_parser('publish', help=f'write {PUBLISHED.name}')

@@ -246,6 +246,8 @@ def test_two_files_of_results_are_compared(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert '| a | 2 | 1, 2 | 1 | 0 | 1 |' in printed
     assert '* a 1: none (verdict none) -> none' in printed
+    decisions.main(['table', '--by', 'verdict', str(tmp_path / 'one')])
+    assert '| none | 1, 1 | 1, 0 |' in capsys.readouterr().out
     decisions.main(['table', str(tmp_path / 'one')])
     assert '| a | 1, 1 | 1, 0 | 0, 0 | 0, 0 | 0, 1 | 0, 0 | 0, 0 |' in capsys.readouterr().out
 
