@@ -77,7 +77,7 @@ class TachDetector(MonitoringNode):
         self._rate = 0.0  # of the run that the detector follows
         self._epoch = 0
         self._pulses = self._unsendable = 0
-        self._too_close = self._unused = 0  # of earlier detectors
+        self._too_close = self._unused = self._spikes = 0  # of earlier detectors
         self._waiting: deque[float] = deque()
         self._output = PulseOutput(self, values['tach_type'])
         if self._joint:  # several publishers may send the joints of a robot
@@ -104,6 +104,7 @@ class TachDetector(MonitoringNode):
         state = self._detector.state
         self._too_close += state.too_close
         self._unused += state.waiting
+        self._spikes += state.spikes
         self._detector = detector_of(values)
 
     def _on_waveform(self, message: Any) -> None:
@@ -169,7 +170,7 @@ class TachDetector(MonitoringNode):
             pulses_dropped=self._too_close + state.too_close + self._unsendable,
             gaps=samples.gaps, restarts=samples.restarts,
             clock_deviation=samples.clock_deviation, repeats=samples.repeats,
-            samples_lost=samples.samples_lost)
+            samples_lost=samples.samples_lost, spikes=self._spikes + state.spikes)
         if self._joint:
             joint = self._joint.crossings.state
             self.counts.update(samples_dropped=joint.dropped, gaps=joint.gaps,
@@ -183,6 +184,7 @@ class TachDetector(MonitoringNode):
                           'subscribers': str(self._output.subscribers)}
         state = self._detector.state
         values = {key: f'{getattr(state, key):.6g}' for key in ('low', 'high', 'threshold')}
+        values['polarity'] = state.polarity
         values['pulses'] = str(self._pulses)
         values['subscribers'] = str(self._output.subscribers)
         if self._timeline.layout is None:

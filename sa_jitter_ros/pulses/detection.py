@@ -33,15 +33,21 @@ __all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_puls
            'pulses_in_blocks']
 
 FloatArray = npt.NDArray[np.float64]
-Polarity = Literal['positive', 'negative']
+Polarity = Literal['positive', 'negative', 'auto']
 Edge = Literal['rising', 'falling', 'centre']
 _NONE: FloatArray = np.empty(0)
-# Fraction of the level difference. Smaller changes of the middle level leave the threshold as it
-# is, because every change of it shifts the later pulses against the earlier ones.
-_DEAD_BAND = 0.1
+Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first sample, samples
 # Fraction of the level difference. After two windows with levels that agree, a smaller difference
 # is the noise of a stopped machine.
 _STOPPED = 0.1
+# Earlier levels that are taken up again at once.
+_TRUSTED = 2
+# Part of a window that one event may take.
+_EVENT = 0.25
+# Part of a lobe that a signal must pass on either side of the resting level.
+_PASSED = 0.4
+# Share of the samples above the middle from which on pulses are taken for negative.
+_MOSTLY = 0.55
 
 
 @dataclass(frozen=True)
@@ -52,6 +58,8 @@ class KeyphasorState:
     `waiting` counts samples that are searched for pulses when the levels are known; `too_close`
     pulses dropped because of `minimum_interval`, `gaps` interruptions of the sample times and
     `windows_without_levels` learning windows in which the waveform did not have two levels.
+    `spikes` counts the samples far beyond the levels that were bridged. `polarity` is that of the
+    pulses: positive or negative, auto as long as it is not decided.
     """
 
     low: float
@@ -63,6 +71,8 @@ class KeyphasorState:
     too_close: int
     gaps: int
     windows_without_levels: int
+    spikes: int
+    polarity: str
 
 
 class KeyphasorDetector:
@@ -71,11 +81,18 @@ class KeyphasorDetector:
 
     The detector learns the two state levels from the first `learning_time` seconds that show them,
     and updates them once per window of that length. Samples wait until then, so that no pulse is
-    lost. With a `threshold` and `hysteresis` 0 it learns nothing.
+    lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows have
+    agreed on change only where the next two agree on others, so that no single event, whatever its
+    size, moves them for longer. Samples beyond all others by more than these are apart are
+    spikes and are bridged. If no `threshold` is given, pulses with a lobe on either side of the
+    resting level, as a variable reluctance sensor makes them, have the time of the steep crossing
+    between the lobes.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference.
     :param polarity: 'negative' for pulses below the resting level; their first edge is 'rising'.
+        'auto': decided from the first levels; the state in which the signal is less often is the
+        pulse, the upper one where they are about equal.
     :param edge: the pulse's 'rising' (first) edge, its 'falling' edge or the 'centre' of the two.
     :param interpolate: False gives the time of the first sample past the threshold.
     :param minimum_interval: pulses that follow sooner (s) are dropped and counted.
@@ -102,8 +119,8 @@ class KeyphasorDetector:
         if not 0.0 <= hysteresis < 1.0:
             raise ParameterError(f'hysteresis {hysteresis} is outside 0 <= hysteresis < 1: '
                                  'give a fraction of the difference of the state levels')
-        if polarity not in ('positive', 'negative'):
-            raise ParameterError(f"polarity '{polarity}': use 'positive' or 'negative'")
+        if polarity not in ('positive', 'negative', 'auto'):
+            raise ParameterError(f"polarity '{polarity}': use 'positive', 'negative' or 'auto'")
         if edge not in ('rising', 'falling', 'centre'):
             raise ParameterError(f"edge '{edge}': use 'rising', 'falling' or 'centre'")
         if not 0.0 < learning_time < np.inf:
@@ -112,30 +129,36 @@ class KeyphasorDetector:
                             ('minimum_difference', minimum_difference)):
             if not 0.0 <= value < np.inf:
                 raise ParameterError(f'{name} {value} must be finite and not negative')
-        self._sign = 1.0 if polarity == 'positive' else -1.0
-        self._fixed_threshold = None if threshold is None else self._sign * threshold
+        self._polarity = polarity
+        self._given_threshold = threshold
         self._hysteresis = hysteresis
         self._edge = edge
         self._interpolate = interpolate
         self._minimum_interval = minimum_interval
         self._learning_time = learning_time
         self._minimum_difference = minimum_difference
-        self._learns = threshold is None or hysteresis > 0.0
+        self._learns = threshold is None or hysteresis > 0.0 or polarity == 'auto'
         self.reset()
 
     def reset(self) -> None:
         """Forget the levels, the waiting samples, the time and the counts."""
+        self._sign = -1.0 if self._polarity == 'negative' else 1.0
+        self._decided = self._polarity != 'auto'
         self._rate = 0.0
         self._origin = np.nan
         self._index = 0
-        self._window: list[tuple[float, int, FloatArray]] = []
+        self._window: list[Piece] = []
         self._levels: StateLevels | None = None
         self._confirmed = False
+        self._pending: StateLevels | None = None
+        self._trusted: list[StateLevels] = []  # earlier ones that windows agreed on
+        self._bridge = np.nan  # the last sample that is no spike
         self._trigger = SchmittTrigger(interpolate=self._interpolate)
         self._trigger_origin = np.nan
         self._leading: float | None = None
         self._last_pulse = -np.inf
         self._samples = self._pulses = self._too_close = self._gaps = self._levelless = 0
+        self._spikes = 0
 
     @property
     def state(self) -> KeyphasorState:
@@ -147,7 +170,9 @@ class KeyphasorDetector:
             low=low, high=high, threshold=self._sign * self._threshold(levels),
             samples=self._samples, waiting=waiting, pulses=self._pulses,
             too_close=self._too_close,
-            gaps=self._gaps, windows_without_levels=self._levelless)
+            gaps=self._gaps, windows_without_levels=self._levelless, spikes=self._spikes,
+            polarity='auto' if not self._decided else (
+                'positive' if self._sign > 0.0 else 'negative'))
 
     def update(self, samples: npt.ArrayLike, start_time: float, sample_rate: float) -> FloatArray:
         """
@@ -168,7 +193,7 @@ class KeyphasorDetector:
         window = max(round(self._learning_time * sample_rate), 8) if self._learns else block.size
         while block.size:
             piece, block = np.split(block, [window - sum(part.size for *_, part in self._window)])
-            found.append(self._take((self._origin, self._index, piece)))
+            found.append(self._take((self._origin, self._index, self._sign * piece)))
             self._index += piece.size
             if sum(part.size for *_, part in self._window) == window:
                 found.append(self._learn())
@@ -194,14 +219,14 @@ class KeyphasorDetector:
         if not np.isfinite(start_time):
             raise SignalError(f'start time {start_time} s of a block is not finite: give a time '
                               'in s')
-        block = self._sign * given.astype(np.float64)
+        block = given.astype(np.float64)
         if not np.all(np.isfinite(block)):
             bad = int(np.argmin(np.isfinite(block)))
             raise SignalError(f'sample {bad} of the block is {given[bad]}: samples must be '
                               'finite; leave the block out, which makes a gap')
         return block
 
-    def _take(self, piece: tuple[float, int, FloatArray]) -> FloatArray:
+    def _take(self, piece: Piece) -> FloatArray:
         """Keep a piece for learning; return the pulses in it if the levels are known."""
         if self._learns:
             self._window.append(piece)
@@ -210,34 +235,82 @@ class KeyphasorDetector:
     def _learn(self) -> FloatArray:
         """Learn the levels from a full window; return its pulses if they waited for the levels."""
         window = np.concatenate([part for *_, part in self._window])
-        levels, known = state_levels(window), self._levels
+        known = self._levels
+        levels = state_levels(window if known is None else _without_event(window, known), known)
         useful = levels.significant and levels.difference > self._minimum_difference
-        if known and levels.difference < _STOPPED * known.difference and self._confirmed:
+        if known and levels.difference < _STOPPED * known.difference and (
+                self._confirmed and not levels.pulsed):
             useful = False
         if not useful:
             self._levelless += 1
             self._window = [] if known else _last(self._window, window.size // 2)
             return _NONE
         waiting, self._window = self._window, []
-        self._confirmed = known is not None and levels.difference >= _STOPPED * known.difference
-        if known and _same(levels, known):
-            return _NONE
-        self._levels = levels
-        return _NONE if known else np.concatenate([self._detect(piece) for piece in waiting])
+        if known is None:
+            if not self._decided:
+                waiting, levels = self._decide(waiting, levels)
+            self._levels = levels
+            return np.concatenate([self._detect(piece) for piece in waiting])
+        if _alike(levels, known):
+            self._pending = None
+            if not levels.resembles(known):
+                self._levels = levels
+            if not self._confirmed:
+                self._confirmed = True
+                self._trusted = [*self._trusted[-_TRUSTED:], levels]
+        elif not self._confirmed or self._idle(window, known) or any(
+                _alike(levels, item) for item in (*self._trusted, self._pending) if item):
+            self._levels, self._pending, self._confirmed = levels, None, False
+        else:
+            self._pending = levels
+        return _NONE
+
+    def _idle(self, window: FloatArray, known: StateLevels) -> bool:
+        """Return whether the known levels find nothing in a window that has others."""
+        threshold = self._threshold(known)
+        return bool(np.all(window < threshold) or np.all(window >= threshold))
+
+    def _decide(self, waiting: list[Piece], levels: StateLevels
+                ) -> tuple[list[Piece], StateLevels]:
+        """Decide the polarity from the first levels; return what waits with the sign it has."""
+        self._decided = True
+        if levels.steep or levels.share <= _MOSTLY:
+            return waiting, levels
+        self._sign = -1.0
+        return ([(origin, index, -part) for origin, index, part in waiting], levels.negated())
 
     def _threshold(self, levels: StateLevels) -> float:
-        return levels.middle if self._fixed_threshold is None else self._fixed_threshold
+        return (levels.middle if self._given_threshold is None
+                else self._sign * self._given_threshold)
 
-    def _detect(self, piece: tuple[float, int, FloatArray]) -> FloatArray:
+    def _bridged(self, samples: FloatArray, levels: StateLevels) -> FloatArray:
+        """Return the samples with the last sound one in place of spikes, which are counted."""
+        spikes = levels.spikes(samples)
+        if spikes is not None:
+            self._spikes += int(np.count_nonzero(spikes))
+            sound = np.maximum.accumulate(np.where(spikes, -1, np.arange(samples.size)))
+            before = levels.low if np.isnan(self._bridge) else self._bridge
+            samples = np.where(sound < 0, before, samples[sound])
+        self._bridge = float(samples[-1])
+        return samples
+
+    def _detect(self, piece: Piece) -> FloatArray:
         """Return the times of the pulses that end their detection in `piece`."""
         origin, index, samples = piece
         if origin != self._trigger_origin:
             self._trigger = SchmittTrigger(interpolate=self._interpolate)
             self._trigger_origin, self._leading, self._last_pulse = origin, None, -np.inf
+            self._bridge = np.nan
         levels = self._levels or StateLevels(0.0, 0.0, significant=False)
+        band = 0.5 * self._hysteresis * levels.difference
+        if self._levels:
+            samples = self._bridged(samples, levels)
+        steep = levels.steep if self._given_threshold is None else ''
         crossings, rising = self._trigger.update(
-            samples, index, self._threshold(levels), 0.5 * self._hysteresis * levels.difference)
-        if self._edge == 'centre':
+            samples, index, self._threshold(levels), _PASSED * levels.lobe if steep else band)
+        if steep:
+            crossings = crossings[rising == (steep == 'rising')]
+        elif self._edge == 'centre':
             crossings = self._centres(crossings, rising)
         else:
             crossings = crossings[rising == (self._edge == 'rising')]
@@ -270,17 +343,25 @@ class KeyphasorDetector:
         return times
 
 
-def _same(levels: StateLevels, known: StateLevels) -> bool:
-    """Whether new levels differ so little from the known ones that those are kept."""
-    return (abs(levels.middle - known.middle) <= _DEAD_BAND * known.difference
+def _without_event(window: FloatArray, known: StateLevels) -> FloatArray:
+    """Return the samples of a window without a single event far beyond the known levels."""
+    spikes = known.spikes(window)
+    if spikes is None:
+        return window
+    places = np.flatnonzero(spikes)
+    return window[~spikes] if places[-1] - places[0] < _EVENT * window.size else window
+
+
+def _alike(levels: StateLevels, known: StateLevels) -> bool:
+    """Whether levels may be those of the same signal, which has drifted."""
+    return (levels.steep == known.steep
+            and abs(levels.middle - known.middle) <= 0.5 * known.difference
             and 0.5 <= levels.difference / known.difference <= 2.0)
 
 
-def _last(
-    pieces: list[tuple[float, int, FloatArray]], count: int,
-) -> list[tuple[float, int, FloatArray]]:
+def _last(pieces: list[Piece], count: int) -> list[Piece]:
     """Return the last `count` samples of the pieces."""
-    kept: list[tuple[float, int, FloatArray]] = []
+    kept: list[Piece] = []
     for origin, index, samples in reversed(pieces):
         if count > 0:
             skip = max(samples.size - count, 0)
@@ -290,10 +371,21 @@ def _last(
 
 
 def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
-    """Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap."""
+    """
+    Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap.
+
+    A `DataWarning` tells how many samples were spikes.
+    """
     found = [detector.update(part.samples[0], part.start_time, part.sample_rate)
              for block in blocks for part in block.finite_parts()]
-    return np.concatenate([*found, detector.flush()])
+    found.append(detector.flush())
+    spikes = detector.state.spikes
+    if spikes:
+        which = ('1 sample of the keyphasor waveform is a spike' if spikes == 1 else
+                 f'{spikes} samples of the keyphasor waveform are spikes')
+        warnings.warn(f'{which}, far beyond its levels, and was bridged: look at cable and ground '
+                      'of the sensor', DataWarning, stacklevel=2)
+    return np.concatenate(found)
 
 
 def detect_pulses(

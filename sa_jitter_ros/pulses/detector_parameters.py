@@ -19,8 +19,9 @@ DETECTOR_PARAMETERS = (
     Parameter('threshold', 0.0, 'threshold without automatic_threshold [unit of the waveform]'),
     Parameter('hysteresis', 0.1, 'width of the band around the threshold, as a fraction of the '
               'difference between the state levels', minimum=0.0, maximum=0.99),
-    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below',
-              choices=('positive', 'negative')),
+    Parameter('polarity', 'positive', 'positive: a pulse is above the threshold; negative: below; '
+              'auto: decided from the first levels of a run, the rarer state being the pulse',
+              choices=('positive', 'negative', 'auto')),
     Parameter('edge', 'rising', 'edge of the pulse that gives its time',
               choices=('rising', 'falling', 'centre')),
     Parameter('interpolate', True, 'interpolate the time between samples; false: time of the '

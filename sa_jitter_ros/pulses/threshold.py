@@ -12,11 +12,15 @@
 Threshold crossings of a keyphasor waveform, and the state levels between which the threshold is.
 
 The state levels are the modes of the lower and of the upper half of the amplitude histogram (as in
-IEEE Std 181-2011), so that the length of a pulse and a few overshoots do not change them. A
-crossing counts once the signal leaves a band around the threshold (Schmitt trigger).
+IEEE Std 181-2011), so that the length of a pulse and a few overshoots do not change them. Three
+things are told apart first: single spikes, which are far from both levels; a resting level that
+moves with the shaft, between whose range and the pulses there is a gap; and pulses with a lobe on
+either side of the resting level, as variable reluctance makes them. A crossing counts once the
+signal leaves a band around the threshold (Schmitt trigger).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +28,33 @@ import numpy.typing as npt
 __all__ = ['SchmittTrigger', 'StateLevels', 'state_levels']
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 _BINS = 100
 # Difference of the means of both halves over the noise, which follows from the steps between
 # samples. It is 1.6 (normal), 1.7 (uniform) or 2 (one bit) for white noise, but sqrt(n) for a
 # square wave of n samples a period and 1.27/sin(pi/n) for a sine.
 _CONTRAST = 2.4
+# Intervals between pulses of so few samples that their steps look like noise: their least number,
+# and standard deviation over mean. Those of noise have 0.5 and more.
+_INTERVALS, _EVEN = 5, 0.25
+# Fraction of the level difference. Smaller changes of the middle level leave the threshold as it
+# is, because every change of it shifts the later pulses against the earlier ones.
+_DEAD_BAND = 0.1
+# Spikes: the most in a window, or one for so many pulses; samples of one that is as wide as a
+# pulse may be; and how often they are looked for, each time in a smaller range.
+_FEW_SPIKES, _PULSES_EACH, _SHORT, _SIZES = 2, 10, 3, 8
+# A gap between a moving resting level and the pulses: its least width in bins, the share of the
+# samples that may be in one of them, that which must be on either side, and the part of these that
+# all of the gap may have.
+_GAP, _EDGES, _HELD, _PASSING = 10, 0.002, 0.01, 0.3
+# Lobes of a pulse: the smaller over the larger one; the share of samples near the resting level,
+# and how near that is; the part of a lobe that counts; and the time from one lobe to the next in
+# widths of a lobe, beyond which they are pulses of their own.
+_LOBES, _RESTS, _NEAR, _LOBE, _JOINED = 0.25, 0.4, 0.15, 0.5, 2.0
+# A waveform that is so often near one of its levels is no hum: a sine is in 41 % of its samples.
+_AT_LEVELS, _CLOSE = 0.6, 0.1
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
@@ -38,40 +63,92 @@ class StateLevels:
     State levels of a piece of waveform, in the unit of the waveform.
 
     `significant` is True where samples change between two levels, False for a constant or white
-    noise.
+    noise. Pulses with lobes on both sides of a `resting` level (else NaN) cross it between the
+    lobes, the `steep` way: 'rising' or 'falling', '' for pulses with one lobe. `share` is that of
+    the samples above the middle, `pulsed` tells that most samples are near one of the levels.
+    All samples that are no spikes are from `lowest` to `highest`.
     """
 
     low: float
     high: float
     significant: bool
+    resting: float = math.nan
+    steep: str = ''
+    share: float = math.nan
+    pulsed: bool = False
+    lowest: float = math.nan
+    highest: float = math.nan
 
     @property
     def middle(self) -> float:
-        """Return the level half way between the states."""
-        return 0.5 * (self.low + self.high)
+        """Return the level half way between the states, or the resting level between lobes."""
+        return self.resting if self.steep else 0.5 * (self.low + self.high)
 
     @property
     def difference(self) -> float:
         """Return the difference of the two levels."""
         return self.high - self.low
 
+    @property
+    def lobe(self) -> float:
+        """Return the size of the smaller lobe beside the resting level."""
+        return min(self.high - self.resting, self.resting - self.low)
 
-def state_levels(samples: FloatArray) -> StateLevels:
+    def resembles(self, known: 'StateLevels') -> bool:
+        """Return whether these levels differ so little from known ones that those are kept."""
+        return (self.steep == known.steep
+                and abs(self.middle - known.middle) <= _DEAD_BAND * known.difference
+                and 0.5 <= self.difference / known.difference <= 2.0)
+
+    def negated(self) -> 'StateLevels':
+        """Return the levels of the waveform with the other sign."""
+        steep = {'rising': 'falling', 'falling': 'rising'}.get(self.steep, '')
+        return replace(self, low=-self.high, high=-self.low, resting=-self.resting, steep=steep,
+                       share=1.0 - self.share, lowest=-self.highest, highest=-self.lowest)
+
+    def spikes(self, samples: FloatArray) -> BoolArray | None:
+        """Return which samples (n,) are farther from all others than these are apart, or None."""
+        reach = self.highest - self.lowest
+        if samples.max() <= self.highest + reach and samples.min() >= self.lowest - reach:
+            return None
+        return np.asarray((samples > self.highest + reach) | (samples < self.lowest - reach))
+
+
+def state_levels(samples: FloatArray, known: StateLevels | None = None) -> StateLevels:
     """
     Return the state levels of finite samples (n,).
 
-    A level is the mean of the samples in the most frequent histogram bin.
+    A level is the mean of the samples in the most frequent histogram bin. Levels that are `known`
+    already are returned where the samples have nearly the same.
 
-    >>> state_levels(np.tile([0.0, 0.1, 5.0, 5.0, 0.0, 0.0], 20))
-    StateLevels(low=0.0, high=5.0, significant=True)
+    >>> levels = state_levels(np.tile([0.0, 0.1, 5.0, 5.0, 0.0, 0.0], 20))
+    >>> levels.low, levels.high, levels.significant
+    (0.0, 5.0, True)
     """
+    if known and not known.steep:
+        levels = _modes(samples)
+        if levels.significant and levels.resembles(known):
+            return known
+    kept = _without_spikes(samples)
+    levels = _lobes(kept) or _beside_motion(kept) or _modes(kept)
+    if not levels.significant:
+        return levels
+    near = _CLOSE * levels.difference
+    at_levels = np.count_nonzero(kept < levels.low + near) + np.count_nonzero(
+        kept > levels.high - near)
+    return replace(levels, share=float(np.mean(kept > levels.middle)),
+                   pulsed=bool(levels.steep) or bool(at_levels > _AT_LEVELS * kept.size),
+                   lowest=float(kept.min()), highest=float(kept.max()))
+
+
+def _modes(samples: FloatArray) -> StateLevels:
+    """Return the modes of both halves of the amplitudes."""
     low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
     half = 0.5 * (low + high)
     upper = samples > half
     if samples.size < 3 or not low < half < high:
         return StateLevels(low, high, significant=False)
     contrast = float(samples[upper].mean() - samples[~upper].mean())
-    noise = float(np.diff(samples).std()) / np.sqrt(2.0)
     counts, edges = np.histogram(samples, bins=_BINS, range=(low, high))
     # Of equally frequent bins the outer one is taken.
     lower_mode = int(np.argmax(counts[:_BINS // 2]))
@@ -79,12 +156,111 @@ def state_levels(samples: FloatArray) -> StateLevels:
     low = _mean_between(samples, edges[lower_mode], edges[lower_mode + 1])
     high = _mean_between(samples, edges[upper_mode], edges[upper_mode + 1])
     # If the machine starts late in these samples, both modes are at its resting level.
-    significant = contrast > _CONTRAST * noise and high - low > 0.5 * contrast
+    significant = high - low > 0.5 * contrast and (
+        _contrast(samples, upper) > _CONTRAST or _regular(_runs(upper)[0]))
     return StateLevels(low, high, significant=bool(significant))
 
 
 def _mean_between(samples: FloatArray, low: float, high: float) -> float:
     return float(samples[(samples >= low) & (samples <= high)].mean())
+
+
+def _runs(inside: BoolArray) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Return begin and end (run,) of runs of samples that are `inside`."""
+    change = np.flatnonzero(np.diff(inside.view(np.int8), prepend=0, append=0))
+    return change[::2], change[1::2]
+
+
+def _regular(begin: npt.NDArray[np.intp]) -> bool:
+    """Return whether runs `begin` at even intervals, as those of noise do not."""
+    intervals = np.diff(begin)
+    return bool(intervals.size >= _INTERVALS and intervals.std() < _EVEN * intervals.mean())
+
+
+def _without_spikes(samples: FloatArray) -> FloatArray:
+    """
+    Return the samples without spikes: a few short runs that alone make the range so large.
+
+    Without them there are many more pulses, in a smaller range.
+    """
+    kept = samples
+    for _ in range(_SIZES):
+        if kept.size < 3:
+            break
+        low, high = float(kept.min()), float(kept.max())
+        outside = kept > 0.5 * (low + high)
+        if 2 * np.count_nonzero(outside) > kept.size:
+            outside = ~outside
+        begin, end = _runs(outside)
+        rest = kept[~outside]
+        levels = _lobes(rest) or _modes(rest)
+        if not levels.significant:
+            break
+        above = rest > 0.5 * (levels.low + levels.high)
+        pulses, over = _runs(above if 2 * np.count_nonzero(above) < rest.size else ~above)
+        short = max(_SHORT, 0.5 * float(np.median(over - pulses))) if pulses.size else 0.0
+        if begin.size > max(_FEW_SPIKES, pulses.size // _PULSES_EACH) or (
+                pulses.size <= begin.size) or np.max(end - begin) > short:
+            break
+        kept = rest
+    return kept
+
+
+def _beside_motion(samples: FloatArray) -> StateLevels | None:
+    """Return the levels on either side of a gap between pulses and a resting level that moves."""
+    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+    if not low < high:
+        return None
+    counts, edges = np.histogram(samples, bins=_BINS, range=(low, high))
+    begin, end = _runs(counts <= _EDGES * samples.size)
+    total = np.append(0, np.cumsum(counts))
+    side = np.minimum(total[begin], samples.size - total[end])
+    held = (side > _HELD * samples.size) & (end - begin >= _GAP) & (
+        total[end] - total[begin] < _PASSING * side)
+    if not held.any():
+        return None
+    widest = int(np.argmax(np.where(held, end - begin, 0)))
+    beside = StateLevels(float(edges[begin[widest]]), float(edges[end[widest]]), significant=True)
+    modes = _modes(samples)
+    pulses, fewer = (_runs(samples > item.middle)[0].size for item in (modes, beside))
+    clear = _contrast(samples, samples > beside.middle) > 2.0 * _CONTRAST
+    return beside if clear and pulses > fewer > 1 else None
+
+
+def _contrast(samples: FloatArray, upper: BoolArray) -> float:
+    """Return the difference of the means of `upper` samples and the others over the noise."""
+    noise = float(np.diff(samples).std()) / math.sqrt(2.0)
+    return float(samples[upper].mean() - samples[~upper].mean()) / max(noise, _TINY)
+
+
+def _lobes(samples: FloatArray) -> StateLevels | None:
+    """Return the levels of pulses with a lobe on either side of the resting level, or None."""
+    low, high = (float(samples.min()), float(samples.max())) if samples.size else (0.0, 0.0)
+    if not low < high:
+        return None
+    resting = float(np.median(samples))
+    up, down = high - resting, resting - low
+    if min(up, down) < _LOBES * max(up, down) or np.mean(
+            np.abs(samples - resting) < _NEAR * min(up, down)) < _RESTS:
+        return None
+    first, first_end = _runs(samples > resting + _LOBE * up)
+    second, second_end = _runs(samples < resting - _LOBE * down)
+    if first.size < 2 or abs(first.size - second.size) > 1:
+        return None
+    width = float(np.median(np.concatenate((first_end - first, second_end - second))))
+    pause = {'falling': _pause(first_end, second), 'rising': _pause(second_end, first)}
+    steep = min(pause, key=lambda way: pause[way])
+    if pause[steep] <= _JOINED * width + 1.0:
+        return StateLevels(low, high, significant=True, resting=resting, steep=steep)
+    # Lobes apart from each other: those above are the pulses.
+    return StateLevels(resting, high, significant=True) if _regular(first) else None
+
+
+def _pause(end: npt.NDArray[np.intp], begin: npt.NDArray[np.intp]) -> float:
+    """Return the largest number of samples from the `end` of a lobe to the next `begin`."""
+    place = np.searchsorted(begin, end)
+    known = place < begin.size
+    return float(np.max(begin[place[known]] - end[known])) if known.any() else math.inf
 
 
 class SchmittTrigger:
@@ -102,7 +278,7 @@ class SchmittTrigger:
 
     def update(
         self, samples: FloatArray, index: int, threshold: float, band: float,
-    ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    ) -> tuple[FloatArray, BoolArray]:
         """
         Return the crossings that these samples (n,) confirm and which of them rise, (c,) each.
 
