@@ -354,6 +354,12 @@ def corrupted(wave, rate, rng):
     return wave, hit
 
 
+def far(times, bad, reach):
+    """Return the times that are farther than `reach` from any bad one."""
+    after = np.searchsorted(bad, times)
+    return times[np.minimum(times - bad[after - 1], bad[after] - times) > reach]
+
+
 def test_spoilt_samples_cost_only_the_pulses_near_them():
     """Whatever their number, place and size: all but those within 1 s or 10 turns are the same."""
     wrong, trials = 0, 120
@@ -369,11 +375,7 @@ def test_spoilt_samples_cost_only_the_pulses_near_them():
         clean, found = (detect(gain * (item + 20.0), **options)[0] for item in (wave, spoilt))
         bad = np.concatenate(([-1e9], t[hit], [1e9]))
 
-        def far(times):
-            after = np.searchsorted(bad, times)
-            return times[np.minimum(times - bad[after - 1], bad[after] - times) > reach]
-
-        clean, found = far(clean), far(found)
+        clean, found = far(clean, bad, reach), far(found, bad, reach)
         wrong += clean.size != found.size or not np.allclose(clean, found, atol=2.0 / rate)
     # a long piece at the beginning, where no level is known yet, may cost more
     assert wrong <= 0.02 * trials
