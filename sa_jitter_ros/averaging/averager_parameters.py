@@ -46,8 +46,8 @@ PARAMETERS = (
     Parameter('maximum_missing', 3, 'largest number of consecutive missing pulses; more are taken '
               'for a standstill', minimum=0, maximum=1000),
     Parameter('interval_tolerance', 0.0, 'largest accepted change from one pulse interval to the '
-              'next, as a fraction of the interval; 0: learnt from the scatter of the intervals',
-              minimum=0.0, maximum=0.49),
+              'next, as a fraction of the interval; 0: learnt from the scatter of the intervals; '
+              'below 0.5, or 1: accept every pulse', minimum=0.0, maximum=1.0),
     Parameter('minimum_interval', 0.0, 'a pulse that follows another within this time is dropped',
               unit='s', minimum=0.0),
     Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, of filters and '

@@ -444,7 +444,8 @@ class IntervalJudge:
         old, new = math.exp(before), math.exp(after)
         if self._rehearses or gap > _SHORT * max(old, new) or abs(after - before) < _CHANGED:
             return
-        why = 'did another keyphasor take over, or the pulses of several marks become visible?'
+        why = ('did another keyphasor take over, or the pulses of several marks become visible? '
+               'interval_tolerance 1 accepts every pulse of a machine that turns so unevenly')
         if abs(new / old - 0.5) < _NEAR:
             why = ('twice as many pulses come: is there a second keyphasor of the same name, or '
                    'are both edges of a mark detected?')

@@ -29,6 +29,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.pulses.every_pulse import EveryPulse
 from sa_jitter_ros.pulses.interval_judge import IntervalJudge, JudgeOptions
 from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
@@ -95,7 +96,7 @@ class PulseValidator:
     :param missing_pulses: 'bridge' interpolates missing pulses between their neighbours, 'break'
         discards the trigger cycle.
     :param interval_tolerance: of an interval, as a fraction of the expected one; 0 learns it from
-        the scatter of the intervals.
+        the scatter of the intervals, 1 accepts every pulse (`every_pulse`).
     :param maximum_missing: more missing pulses than this in a row are a standstill.
     :param minimum_interval: pulses that follow an accepted one sooner (s) are doubles.
     :param time_tolerance: time (s) by which a pulse may be early before a new run begins.
@@ -134,9 +135,15 @@ class PulseValidator:
                 raise ParameterError(f'{name} {number} must be a whole number, {least} or more')
         if missing_pulses not in ('break', 'bridge'):
             raise ParameterError(f"missing_pulses '{missing_pulses}': use 'break' or 'bridge'")
-        if not 0.0 <= interval_tolerance < 0.5:
-            raise ParameterError(f'interval_tolerance {interval_tolerance} must be 0 (learnt) or '
-                                 'below 0.5: from 0.5 on a missing pulse looks like a late one')
+        every = interval_tolerance == 1.0
+        if not (every or 0.0 <= interval_tolerance < 0.5):
+            raise ParameterError(
+                f'interval_tolerance {interval_tolerance} must be 0 (learnt), below 0.5 (from '
+                'there on a missing pulse looks like a late one), or 1 (accept every pulse)')
+        if every and missing_teeth:
+            raise ParameterError(
+                'interval_tolerance 1 accepts every pulse, so that the gap of missing_teeth '
+                f'{missing_teeth} does not show: set 0 (learnt)')
         for name, value in (('minimum_interval', minimum_interval),
                             ('time_tolerance', time_tolerance)):
             if not 0.0 <= value < np.inf:
@@ -158,10 +165,13 @@ class PulseValidator:
         given = _given_angles(target_geometry, target_angles, target.marks, teeth)
         if target_geometry != 'none' and target.marks > 1:
             self._sink = self._corrector = MarkCorrector(self._counter, count=teeth, given=given)
-        self._judge = IntervalJudge(target, self._sink, JudgeOptions(
+        options = JudgeOptions(
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
-            pulses_per_trigger=per_trigger))
+            pulses_per_trigger=per_trigger)
+        self._judge: IntervalJudge | EveryPulse = (
+            EveryPulse(self._sink, options) if every
+            else IntervalJudge(target, self._sink, options))
         self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
