@@ -32,7 +32,7 @@ NO_ORDERS = (1.0, 10.0, 100.0)
 _CYCLES = 40  # in the average whose loss is given
 _MANY_STRAYS = 0.2
 _CLEAR_MARK = 5.0  # standard errors
-_VISIBLE = 1e-3  # loss
+_VISIBLE, _INVISIBLE = 1e-3, 1e-6  # loss
 _UNSTEADY = 0.005  # loss
 _MEMORY = 0.2
 _HALF = 40  # pulses in which a pattern can be seen
@@ -85,6 +85,8 @@ def _of_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> li
         return []
     late = pattern.marks / pattern.teeth  # revolutions
     loss = [1.0 - abs(np.mean(np.exp(2j * math.pi * g * ratio * late))) for g in orders]
+    if max(loss) < _INVISIBLE:
+        return []
     worst = int(np.argmax(np.abs(pattern.marks)))
     return [Warn(
         'uneven_marks', f'the marks stand unevenly, mark {worst} by {360.0 * late[worst]:.3g} '
