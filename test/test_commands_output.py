@@ -67,9 +67,9 @@ def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypat
     command = [str(tmp_path / 'rig.npz'), '--output', str(tmp_path), '--params',
                str(shipped('machine.yaml'))]
     parser = check_keyphasor.make_parser()
-    found = check_keyphasor.run(parser.parse_args(command))
+    found, _ = check_keyphasor.run(parser.parse_args(command))
     assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (2.40789, 18.0, 1)
-    found = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
+    found, _ = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
     assert (found.ratio, found.orders[0]) == (3.0, 18.0)
 
 

@@ -11,6 +11,7 @@
 """Recordings averaged into files: what they hold, what is left out, and what bad input costs."""
 
 import csv
+import json
 import os
 from pathlib import Path
 import signal
@@ -20,7 +21,8 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS
-from sa_jitter_ros.commands import average
+from sa_jitter_ros.commands import average, check_keyphasor
+from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation import AdditiveNoise, DeclaredJitter, Gearbox, mesh
@@ -240,3 +242,32 @@ def test_unusable_input_is_one_line_and_status_2(
     assert captured.err.startswith('average: ')
     assert says in captured.err
     assert not list(tmp_path.glob('out/*'))
+
+
+def test_what_was_repaired_is_drawn(tmp_path):
+    """A stray pulse, a lost one and a spike of the tach: `average` and `check_keyphasor` show."""
+    rate, rng = 5000.0, np.random.default_rng(1)
+    turn = 20.0 * np.arange(100_000) / rate - 0.3
+    tach = 5.0 * (turn % 1.0 < 0.1) + 0.02 * rng.standard_normal(turn.size)
+    lost = round((100.0 + 0.3) / 20.0 * rate)
+    tach[lost - 5:lost + 60] = 0.0
+    tach[50_030:50_034], tach[80_000] = 5.0, 60.0
+    np.savez(tmp_path / 'shop.npz', vibration=np.cos(6.0 * np.pi * turn), sample_rate=rate,
+             tach=tach, tach_rate=rate)
+    checked, averaged = tmp_path / 'checked', tmp_path / 'averaged'
+    assert check_keyphasor.main([str(tmp_path / 'shop.npz'), '--output', str(checked),
+                                 '--quiet']) == 0
+    assert average.main([
+        str(tmp_path / 'shop.npz'), '--params', str(checked / 'machine.yaml'), '--output',
+        str(averaged), '--quiet']) == 0
+    for folder in (checked, averaged / 'shop'):
+        assert imread(folder / 'repairs.png').shape[1] > 600
+    assert '1 sample of the keyphasor waveform is a spike' in (
+        averaged / 'recordings.csv').read_text(encoding='utf-8')
+    codes = {item['code'] for item in json.loads(
+        (checked / 'keyphasor.json').read_text(encoding='utf-8'))['warnings']}
+    assert {'spikes', 'spurious', 'missing'} <= codes
+    validator = PulseValidator()
+    validator.update([0.0, 1.0, 2.0, 3.0, 3.3, 4.0, 6.0, 7.0, 8.0])
+    validator.flush()
+    assert validator.rejected == [(3.3, 'doubles'), (5.0, 'missing')]

@@ -23,6 +23,7 @@ from pathlib import Path
 import sys
 from typing import Any
 
+import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, Parser, read_options, require_writable, show)
@@ -33,7 +34,9 @@ from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
+from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.recording import Recording
 
 
 def make_parser() -> Parser:
@@ -44,7 +47,7 @@ def make_parser() -> Parser:
                         help='.npz, .mat, .wav, .csv or rosbag2; a .npz or .mat with pulse times '
                         'only is examined without vibration')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
-                        help='folder for keyphasor.json, machine.yaml and the figure')
+                        help='folder for keyphasor.json, machine.yaml and the figures')
     parser.add_argument('--teeth', type=int, nargs='+', default=(), metavar='N',
                         help='numbers of teeth of gears in the machine, to find the ratio')
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
@@ -66,8 +69,8 @@ def _machine_fields(params: Path | None) -> dict[str, Any]:
                      if model.pulses_per_trigger else {})
 
 
-def run(options: argparse.Namespace) -> KeyphasorCheck:
-    """Check the recording; raises SaJitterError."""
+def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
+    """Check the recording, and return both; raises SaJitterError."""
     def progress(text: str) -> None:
         if not options.quiet:
             print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
@@ -76,7 +79,7 @@ def run(options: argparse.Namespace) -> KeyphasorCheck:
                      **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
-    return check_keyphasor(recording, teeth=options.teeth, progress=progress)
+    return check_keyphasor(recording, teeth=options.teeth, progress=progress), recording
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -85,7 +88,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         require_writable(options.output)
         use_one_thread()
-        found = run(options)
+        found, recording = run(options)
         options.output.mkdir(parents=True, exist_ok=True)
         report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
         (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
@@ -93,11 +96,17 @@ def main(args: Sequence[str] | None = None) -> int:
             machine_file(found, options.recording.name), encoding='utf-8')
         check_figure(found, options.recording.name).savefig(
             options.output / 'keyphasor.png', dpi=110)
+        fitted = found.fitted
+        files = ['keyphasor.json', 'machine.yaml', 'keyphasor.png']
+        files += ['repairs.png'] * write_repairs(
+            options.output, options.recording.name, recording,
+            np.union1d(fitted.true, fitted.strays),
+            [*((time, 'early') for time in fitted.strays.tolist()),
+             *((time, 'missing') for time in fitted.lost.tolist())])
     except (SaJitterError, OSError) as error:
         print(f'check_keyphasor: {" ".join(str(error).split())}', file=sys.stderr)
         return 2
-    written = ', '.join(str(options.output / name)
-                        for name in ('keyphasor.json', 'machine.yaml', 'keyphasor.png'))
+    written = ', '.join(str(options.output / name) for name in files)
     return show('check_keyphasor', found, f'written: {written}')
 
 

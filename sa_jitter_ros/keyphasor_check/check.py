@@ -34,6 +34,7 @@ from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, patterns
+from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
 from sa_jitter_ros.pulses.unit_check import find_mistakes
 from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
@@ -159,7 +160,10 @@ class _Check:
         """Return the pulse times in s on the clock of the vibration."""
         self._check_tach_rate()
         recording = self._recording
-        times = recording.keyphasor_pulses()
+        detector = KeyphasorDetector()
+        times = recording.keyphasor_pulses(detector=detector)
+        if spikes := spikes_text(detector.state.spikes):
+            self._warnings.append(Warn('spikes', spikes))
         self._largest = float(np.max(np.abs(times), initial=0.0))
         whose = f'{times.size} pulses in {recording.duration:.4g} s'
         if times.size < FEWEST:

@@ -30,6 +30,7 @@ from sa_jitter_ros.offline.files import (
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
 from sa_jitter_ros.offline.settings import averager_values, detector_values, MachineFile
 from sa_jitter_ros.parameters import Values
+from sa_jitter_ros.pulses.detection import spikes_text
 from sa_jitter_ros.pulses.detector_parameters import detector_of
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
@@ -94,7 +95,9 @@ class RecordingAverager:
         self._stream = streaming_averager(values, buffer_seconds=math.inf)
         self._results = {name: ShaftResults(gear_settings(values, name))
                          for name in values['shafts']}
-        self._pulses = recording.keyphasor_pulses(detector=detector_of(detector))
+        waveform = detector_of(detector)
+        self._pulses = recording.keyphasor_pulses(detector=waveform)
+        self._spikes = spikes_text(waveform.state.spikes)
         self.refused = 0
         self.ended_early = ''
 
@@ -102,6 +105,11 @@ class RecordingAverager:
     def stream(self) -> StreamingAverager:
         """Return the averager, for its counts."""
         return self._stream
+
+    @property
+    def pulses(self) -> FloatArray:
+        """Return the times (pulse,) in s of all pulses of the keyphasor."""
+        return self._pulses
 
     def results(self, progress: Progress | None = None
                 ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
@@ -159,7 +167,7 @@ class RecordingAverager:
             weak.append(weak_orders(
                 self._recording, self._pulses, item.orders.tolist(),
                 ratio=settings.cycle_length / settings.revolutions_per_trigger, **target))
-        return (*found, *(weak[0] if all(weak) else ()))
+        return (*filter(None, [self._spikes]), *found, *(weak[0] if all(weak) else ()))
 
     def _arrays(self, averages: list[tuple[str, Average]]
                 ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
@@ -226,6 +234,9 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
             from sa_jitter_ros.offline.figures import write_figures
             write_figures(folder, signals, series, {
                 name: gear_settings(values, name) for name in values['shafts']})
+            from sa_jitter_ros.offline.repairs_figure import write_repairs
+            write_repairs(folder, job.name, recording, averager.pulses,
+                          averager.stream.validator.rejected)
     return row
 
 

@@ -30,7 +30,7 @@ from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLe
 from sa_jitter_ros.samples import SampleBlock
 
 __all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_pulses',
-           'pulses_in_blocks']
+           'pulses_in_blocks', 'spikes_text']
 
 FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative', 'auto']
@@ -371,21 +371,20 @@ def _last(pieces: list[Piece], count: int) -> list[Piece]:
 
 
 def pulses_in_blocks(detector: KeyphasorDetector, blocks: Iterable[SampleBlock]) -> FloatArray:
-    """
-    Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap.
-
-    A `DataWarning` tells how many samples were spikes.
-    """
+    """Return the pulse times (s) that a detector finds in all blocks, NaN and infinity a gap."""
     found = [detector.update(part.samples[0], part.start_time, part.sample_rate)
              for block in blocks for part in block.finite_parts()]
-    found.append(detector.flush())
-    spikes = detector.state.spikes
-    if spikes:
-        which = ('1 sample of the keyphasor waveform is a spike' if spikes == 1 else
-                 f'{spikes} samples of the keyphasor waveform are spikes')
-        warnings.warn(f'{which}, far beyond its levels, and was bridged: look at cable and ground '
-                      'of the sensor', DataWarning, stacklevel=2)
-    return np.concatenate(found)
+    return np.concatenate([*found, detector.flush()])
+
+
+def spikes_text(count: int) -> str:
+    """Return what users should know of so many spikes, '' for none."""
+    if not count:
+        return ''
+    which = ('1 sample of the keyphasor waveform is a spike' if count == 1 else
+             f'{count} samples of the keyphasor waveform are spikes')
+    return (f'{which}, far beyond its levels, and was bridged: look at cable and ground of the '
+            'sensor')
 
 
 def detect_pulses(
@@ -399,8 +398,8 @@ def detect_pulses(
 
     The first sample is at `start_time`, `sample_rate` in Hz; the other keywords are those of
     `KeyphasorDetector`. Samples that are NaN or infinite are a gap, across which no pulse is
-    found. If there is no pulse at all, a `DataWarning` says why. Raises `ParameterError` for
-    options and `SignalError` for an array or a rate that cannot be used.
+    found. If there is no pulse at all, or there are spikes, a `DataWarning` says so. Raises
+    `ParameterError` for options and `SignalError` for an array or a rate that cannot be used.
 
     One pulse per revolution of a shaft at 25 Hz. With `interpolate=False` each pulse has the time
     of a sample, as from a keyphasor that is sampled at 2 kHz:
@@ -428,6 +427,8 @@ def detect_pulses(
         detector.update(samples, start_time, sample_rate)  # raises the error
     block = SampleBlock(samples.astype(np.float64)[None], start_time, sample_rate, 0)
     pulses = pulses_in_blocks(detector, [block])
+    if spikes := spikes_text(detector.state.spikes):
+        warnings.warn(spikes, DataWarning, stacklevel=2)
     if not pulses.size:
         state = detector.state
         why = (f'its levels are {state.low:g} and {state.high:g}, the threshold is '

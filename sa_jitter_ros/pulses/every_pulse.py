@@ -10,9 +10,10 @@
 
 """Pulses of which nobody doubts any: all but doubles are true, whatever their intervals."""
 
+from collections import deque
 import math
 
-from sa_jitter_ros.pulses.interval_judge import JudgeOptions
+from sa_jitter_ros.pulses.interval_judge import JudgeOptions, REMEMBERED
 from sa_jitter_ros.pulses.trigger_counter import PulseSink
 
 
@@ -28,6 +29,7 @@ class EveryPulse:
         self._counter, self._least = counter, options.minimum_interval
         self.counts = dict.fromkeys(('accepted', 'doubles'), 0)
         self.messages: list[str] = []
+        self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
         self.waiting = 0
         self.forget()
 
@@ -43,6 +45,7 @@ class EveryPulse:
         for pulse in pulses:
             if pulse - self.last < self._least or pulse == self.last:
                 self.counts['doubles'] += 1
+                self.rejected.append((pulse, 'doubles'))
             else:
                 kept.append(pulse)
                 self.last = pulse

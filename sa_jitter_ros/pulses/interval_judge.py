@@ -31,6 +31,7 @@ several follow each other regularly. A target with several marks is learnt for f
 that the uneven angles between its marks are known before the first pulse is judged; none is lost.
 """
 
+from collections import deque
 from dataclasses import dataclass, replace
 import math
 
@@ -67,6 +68,8 @@ _FITS = 0.1  # tolerance with which a pulse after a step of time fits
 # logarithm; near a factor of two; and the number of reports that wait.
 _SHORT, _CHANGED, _NEAR, _MESSAGES = 5.0, 0.3, 0.03, 10
 _NEVER = 1 << 62
+#: Latest pulses that were rejected, or are missing, of which times and reasons are kept.
+REMEMBERED = 2000
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,8 @@ class IntervalJudge:
     Judge pulses in order of time and pass the valid ones on to a trigger counter.
 
     `last` is the latest pulse (s) not dropped, `confirmed` the latest that was accepted.
+    `rejected` are the latest pulses (s) that were not taken as they came, each with the count that
+    it is in, and where pulses are missing.
     """
 
     def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions) -> None:
@@ -104,6 +109,7 @@ class IntervalJudge:
             ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
              'unlocked', 'relearnt'), 0)
         self.messages: list[str] = []
+        self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
         block = 64 if target.marks >= _LARGE_BLOCK else 8
         self._model = IntervalModel(
             given=options.tolerance, pulses_per_trigger=options.pulses_per_trigger, block=block,
@@ -150,6 +156,7 @@ class IntervalJudge:
         for pulse in pulses:
             if pulse - last < least or pulse == last:
                 self.counts['doubles'] += 1
+                self.rejected.append((pulse, 'doubles'))
             else:
                 self._queue.append(pulse)
                 last = pulse
@@ -189,7 +196,9 @@ class IntervalJudge:
 
     def _drop(self, kind: str, at: int = 0) -> None:
         """Drop a waiting pulse."""
-        self._remember(self._queue.pop(at))
+        pulse = self._queue.pop(at)
+        self._remember(pulse)
+        self.rejected.append((pulse, kind))
         self.counts[kind] += 1
         if kind != 'unlocked':
             self._counter.drop()
@@ -396,6 +405,8 @@ class IntervalJudge:
         if mark > 1 and regular and known:
             kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
             self.counts[kind] += mark - 1
+            self.rejected += [(self.confirmed + gap * number / mark, 'missing')
+                              for number in range(1, min(mark, _MOST_WAITING))]
             pulse = self._next(slots, level)
             model.accept([level])
             if self._lacks_alike(mark, gap):
@@ -406,6 +417,7 @@ class IntervalJudge:
                 self._counter.begin(pulse, 0, passed=steps)
             return
         self.counts['late'] += 1
+        self.rejected.append((self._queue[0], 'late'))
         if mark == 1:
             model.refuse(deviation)
         if not known and mark == 1 and after is not None:

@@ -186,6 +186,16 @@ class PulseValidator:
             geometry_refused=0 if self._corrector is None else self._corrector.refused)
 
     @property
+    def rejected(self) -> list[tuple[float, str]]:
+        """
+        Return the latest pulses that were not taken as they came, and the missing ones.
+
+        Each has its time in s, with the path delay, and the reason: the name of a count, or
+        'missing'. There are 2000 at most.
+        """
+        return [(time + self._path_delay, why) for time, why in self._judge.rejected]
+
+    @property
     def corrects_marks(self) -> bool:
         """Whether the geometry of the target is taken from the pulses, as far as it is known."""
         return self._corrector is not None
