@@ -394,3 +394,34 @@ def test_measured_engines(shared_data, name, missing):
     assert values(check, 'spurious', 'missing') == (
         {'count': 0, 'times': []}, {'count': 0, 'times': []})
     assert 'uneven_marks' in codes(check)
+
+
+@pytest.mark.parametrize(('ripple', 'late'), [(3.4, 0.0), (0.5, 0.0), (0.0, 2.0), (0.0, 0.5)])
+def test_the_vibration_tells_uneven_marks_from_a_speed_that_ripples(ripple, late):
+    """The pulses of both are alike; degrees. A crank gets trigger cycles from mark to mark."""
+    rng, rate, teeth, missing = np.random.default_rng(3), 20e3, 60, 2
+    time = np.arange(round(16 * rate)) / rate
+    even = 5.0 * time + 0.01 * np.sin(2.0 * np.pi * 0.3 * time)
+    angle = even + ripple / 360.0 * np.sin(4.0 * np.pi * even)
+    number = np.arange(1, int(angle[-1] * teeth))
+    number = number[number % teeth < teeth - missing]
+    pattern = late / 360.0 * np.sin(4.0 * np.pi * np.arange(teeth) / teeth)
+    pulses = np.interp(number / teeth + pattern[number % teeth], angle, time)
+    wave = sum(size * np.cos(2.0 * np.pi * g * angle)
+               for g, size in ((1, 1.0), (20, 0.5), (40, 0.25)))
+    found = check_keyphasor(Recording(
+        ArraySource((wave + 0.02 * rng.standard_normal(time.size))[None]), rate,
+        pulse_times=pulses))
+    marks = np.array(found.findings['marks'].value)
+    averager = machine_parameters(found)['synchronous_averager']
+    assert found.findings['orders'].value[0] == 1.0
+    if ripple:
+        assert not marks.any()
+        assert 'target_angles' not in averager
+        if ripple > 1.0:  # it costs more than 1 % of an order
+            assert found.findings['orders'].value == [1.0, 20.0, 40.0]
+            assert averager['pulses_per_trigger'] == 1
+            assert 'pulses_per_trigger to 1' in ' '.join(item.text for item in found.warnings)
+    else:
+        assert np.ptp(marks) > 1.5 * np.radians(late)
+        assert 'target_angles' in averager

@@ -28,7 +28,8 @@ from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import costs
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
-    ENCODERS, find_lines, Lines, marks_evidence, on_orders, ratio_evidence, usual_marks)
+    ENCODERS, find_lines, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
+    usual_marks)
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses
 from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
@@ -130,6 +131,11 @@ class _Check:
         fitted = fit_pulses(numbered, count, tick=tick)
         if count == 1:
             fitted = first
+        even = samples is not None and speed_ripples(samples, self._start, self._rate, fitted)
+        if even and samples is not None:
+            fitted = fitted.with_even_marks()
+            lines = find_lines(samples.T, self._start, self._rate, fitted.true,
+                               fitted.numbers.astype(np.float64))
         _require_wheel(fitted, numbered)
         per_revolution = None if lines is None else lines.scaled(float(count))
         ratio, orders = self._ratio(per_revolution)
@@ -142,7 +148,7 @@ class _Check:
             'missing_teeth': Finding(
                 count - fitted.pattern.present,
                 decided_by='teeth without a pulse in every revolution' if decided else ''),
-            'marks': self._target(fitted, decided),
+            'marks': self._target(fitted, decided, even),
             'clock_rate': self._clock(clock, times),
             **self._jitter(fitted, averages.get(True, ())),
             'missing': _counted(fitted.lost, 'marks without a pulse'),
@@ -306,10 +312,14 @@ class _Check:
         return replace(marks, decided_by=f'{marks.decided_by}; the sampling rate may be '
                        f'{self._other_rate:.10g} Hz: {decides}')
 
-    def _target(self, fitted: FittedPulses, shown: bool) -> Finding:
+    def _target(self, fitted: FittedPulses, shown: bool, even: bool) -> Finding:
         pattern = fitted.pattern
         scale = 2.0 * math.pi / pattern.teeth
         errors = np.nan_to_num(pattern.errors * scale, nan=0.0)
+        if even:
+            return Finding([0.0] * pattern.present, errors.tolist(), 'rad', (), 'the lines of the '
+                           'vibration are sharper between even marks: the speed changes with the '
+                           'revolution')
         return Finding(
             (pattern.marks * scale).tolist(), errors.tolist() if pattern.teeth > 1 else None,
             'rad', (), 'mean place of each mark over the revolutions, late positive; a ripple of '

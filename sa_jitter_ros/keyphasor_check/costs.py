@@ -34,6 +34,9 @@ _MANY_STRAYS = 0.2
 _CLEAR_MARK = 5.0  # standard errors
 _VISIBLE, _INVISIBLE = 1e-3, 1e-6  # loss
 _UNSTEADY = 0.005  # loss
+# Marks that show the motion within a revolution; the loss from which on trigger cycles from mark
+# to mark are proposed, and the part of it that they may leave.
+_SEVERAL, _DEAR, _SAVED = 4, 0.01, 0.3
 _MEMORY = 0.2
 _HALF = 40  # pulses in which a pattern can be seen
 _MOST_PULSES = 5000
@@ -125,8 +128,43 @@ def _of_jitter(findings: Mapping[str, Finding], fitted: FittedPulses, ratio: flo
     return found
 
 
+def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]
+             ) -> tuple[FloatArray, FloatArray] | None:
+    """
+    Return the losses (order,) of trigger cycles of a revolution, and of those from mark to mark.
+
+    None where trigger cycles from mark to mark save too little to be proposed, or with few marks.
+    """
+    if fitted.pattern.present < _SEVERAL:
+        return None
+    within = fitted.within_turns
+    turn = _of_errors(within[np.abs(within) < 0.5], ratio, orders)
+    pitch = np.diff(fitted.true) / np.diff(fitted.numbers)
+    change = np.diff(pitch) / pitch[1:]
+    # Pulse errors change the speed to and fro, motion for longer.
+    steady = 0.5 * (change[1:] + change[:-1])
+    place = np.linspace(0.0, 1.0, 9)
+    mark = _of_errors(0.5 / fitted.pattern.teeth * steady[:, None] * place * (1.0 - place), ratio,
+                      orders)
+    return (turn, mark) if max(turn) > _DEAR and max(mark) < _SAVED * max(turn) else None
+
+
+def _of_errors(error: FloatArray, ratio: float, orders: Sequence[float]) -> FloatArray:
+    """Return the losses (order,) by errors of the angle in revolutions."""
+    return np.array([1.0 - abs(np.mean(np.exp(2j * math.pi * g * ratio * error)))
+                     if error.size else 0.0 for g in orders])
+
+
 def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> list[Warn]:
     """Return what a speed costs that changes within a revolution, with the linear angle law."""
+    losses = by_marks(fitted, ratio, orders)
+    if losses is not None:
+        turn, mark = losses
+        return [Warn(
+            'unsteady_speed', 'the speed changes within a revolution: set pulses_per_trigger to '
+            '1, so that trigger cycles go from mark to mark; no order here then loses more than '
+            f'{100.0 * max(mark):.2g} % by it, whatever the angle_law',
+            _percent(orders, turn.tolist()))]
     speed = fitted.speed[::max(1, fitted.pattern.present)]
     if speed.size < 4:
         return []
@@ -134,14 +172,13 @@ def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> li
     # Pulse errors change the speed of revolutions to and fro, motion for longer.
     steady = 0.5 * (change[1:] + change[:-1])
     place = np.linspace(0.0, 1.0, 33)
-    error = 0.5 * steady[:, None] * place * (1.0 - place)
-    loss = [1.0 - abs(np.mean(np.exp(2j * math.pi * g * ratio * error))) for g in orders]
+    loss = _of_errors(0.5 * steady[:, None] * place * (1.0 - place), ratio, orders)
     if max(loss) < _UNSTEADY:
         return []
     return [Warn(
         'unsteady_speed', f'the speed changes by {100.0 * float(np.std(steady)):.2g} % from '
         'revolution to revolution: set angle_law to quadratic or spline, or use more marks a '
-        'revolution', _percent(orders, loss))]
+        'revolution', _percent(orders, loss.tolist()))]
 
 
 def _of_changes(times: FloatArray) -> list[Warn]:

@@ -24,6 +24,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 from sa_jitter_ros.pulses.resampling import interpolate
 from scipy.fft import next_fast_len, rfft
 
@@ -55,6 +56,9 @@ _USUAL_MARKS = {1: 0.45, 2: 0.1, 3: 0.03, 4: 0.06, 5: 0.02, 6: 0.05, 8: 0.05, 10
 ENCODERS = (100, 128, 180, 200, 250, 256, 300, 360, 400, 500, 512, 600, 720, 900, 1000, 1024, 1200,
             1250, 1500, 1800, 2000, 2048, 2500, 3600, 4096)
 _OTHER_MARKS = 0.002
+# Marks that may be uneven, by at least so many revolutions; revolutions and orders whose lines are
+# compared, and by how much sharper one of two is.
+_SEVERAL_MARKS, _EVEN, _MOST_TURNS, _MOST_ORDERS, _SHARPER = 4, 1e-4, 200, 200, 1.001
 
 
 @dataclass(frozen=True)
@@ -280,3 +284,38 @@ def _normalised(log: dict[float, float], step: float) -> list[tuple[float, float
             merged.append([ratio, math.exp(max(value - top, -700.0))])
     total = sum(item[1] for item in merged)
     return [(ratio, weight / total) for ratio, weight in merged if weight / total > 1e-3][:6]
+
+
+def speed_ripples(samples: FloatArray, start: float, rate: float, fitted: FittedPulses) -> bool:
+    """
+    Return whether uneven pulses are those of even marks on a shaft whose speed changes in a turn.
+
+    The two are alike in the pulse times. The vibration (channel, sample) from `start` (s) decides:
+    its lines over the angle are sharper with the right one.
+    """
+    pattern, turned = fitted.pattern, fitted.revolutions
+    uneven = float(np.ptp(pattern.marks)) / pattern.teeth
+    if pattern.present < _SEVERAL_MARKS or uneven < _EVEN or fitted.breaks.size:
+        return False
+    end = start + (samples.shape[-1] - 1) / rate
+    inside = (fitted.true >= start) & (fitted.true <= end)
+    if np.count_nonzero(inside) < 4 * pattern.present:
+        return False
+    first, last = math.ceil(turned[inside][0]), math.floor(turned[inside][-1])
+    last = min(last, first + _MOST_TURNS)
+    highest = min(int(0.4 * rate / fitted.mean_speed), _MOST_ORDERS)
+    if last - first < 4 or highest < 2:
+        return False
+    points = 3 * highest * (last - first)
+    grid = first + np.arange(points) * (last - first) / points
+    times = start + np.arange(samples.shape[-1]) / rate
+
+    def sharpness(pulses: FloatArray) -> float:
+        """Return the sum of squared powers of whole orders over the square of their sum."""
+        at = np.interp(grid, turned, pulses)
+        lines = np.array([np.fft.rfft(np.interp(at, times, row)) for row in samples])
+        power = np.sum(np.abs(lines[:, (last - first):(highest + 1) * (last - first):(
+            last - first)]) ** 2, axis=0)
+        return float(np.sum(power**2) / max(np.sum(power) ** 2, np.finfo(np.float64).tiny))
+
+    return sharpness(fitted.measured) > _SHARPER * sharpness(fitted.true)

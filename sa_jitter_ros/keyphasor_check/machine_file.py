@@ -15,6 +15,7 @@ import math
 from typing import Any
 
 import numpy as np
+from sa_jitter_ros.keyphasor_check.costs import by_marks
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
@@ -26,6 +27,7 @@ _SHAFT = 'shaft'
 _DISCARDED = 0.5  # of the trigger cycles of an average
 _COARSE, _TICKS, _WIDEST = 0.02, 2.5, 0.45  # of an interval
 _CLEAR = 4.0  # standard errors of a delay that is corrected
+_SHOWS = 1e-4  # rad, of the highest order, by which a mark is uneven enough
 
 
 def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
@@ -41,6 +43,8 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
         'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0),
         f'{_SHAFT}.orders': [float(g) for g in found['orders'] or _DEFAULT_ORDERS],
         'pulses_per_revolution': count, 'trigger_cycles': cycles, 'keyphasor_rate': float(rate)}
+    if by_marks(check.fitted, common[f'{_SHAFT}.ratio'], common[f'{_SHAFT}.orders']) is not None:
+        common |= {'pulses_per_trigger': 1, 'trigger_cycles': cycles * count}
     jitter: dict[str, Any] = {'jitter_distribution': 'uniform'}
     if not rounded and std:
         jitter = {'jitter_distribution': 'normal', 'jitter_std': float(std)}
@@ -57,7 +61,9 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
             _WIDEST, _TICKS * tick / pitch)
     target = TargetGeometry(np.array(check.findings['marks'].value),
                             np.array(check.findings['marks'].standard_error or 0.0))
-    if target.standard_errors.all() and target.significant:
+    turn = np.abs(target.angles).max() * common[f'{_SHAFT}.ratio'] * max(
+        common[f'{_SHAFT}.orders'])
+    if target.standard_errors.all() and target.significant and turn > _SHOWS:
         nodes['synchronous_averager'] |= {
             'target_geometry': 'given', 'target_angles': target.angles.tolist()}
     delay = check.findings['path_delay']

@@ -44,7 +44,8 @@ class FittedPulses:
     """
     Pulses of a known target.
 
-    `true` (n,) are their times in s with the marks corrected, `numbers` (n,) count teeth.
+    `true` (n,) are their times in s with the marks corrected, `measured` (n,) without that,
+    `numbers` (n,) count teeth.
     `strays` (m,) and `lost` (k,) in s are the pulses that belong to no mark, and the times at
     which a mark has no pulse. `speed` (n - 1,) is that of the tach shaft in Hz between pulses.
     """
@@ -55,6 +56,29 @@ class FittedPulses:
     breaks: IntArray
     strays: FloatArray
     lost: FloatArray
+    measured: FloatArray
+
+    def with_even_marks(self) -> 'FittedPulses':
+        """Return the pulses of even marks, which the speed alone makes early and late."""
+        pattern = replace(self.pattern, marks=np.zeros_like(self.pattern.marks))
+        return replace(self, pattern=pattern, true=self.measured)
+
+    @property
+    def within_turns(self) -> FloatArray:
+        """
+        Return by how much (n,) the angle of each pulse is ahead of an even turn, in revolutions.
+
+        Those of a revolution are compared with the line from its first mark to the next one's.
+        """
+        turned, start = self.revolutions, np.arange(
+            math.ceil(self.revolutions[0]), math.floor(self.revolutions[-1]) + 1.0)
+        if start.size < 2:
+            return np.zeros(0)
+        begun = np.interp(start, turned, self.true)
+        inside = (turned >= start[0]) & (turned < start[-1])
+        number = np.floor(turned[inside] - start[0]).astype(np.intp)
+        even = (self.true[inside] - begun[number]) / np.diff(begun)[number]
+        return np.asarray(turned[inside] % 1.0 - even)
 
     @property
     def revolutions(self) -> FloatArray:
@@ -129,7 +153,7 @@ def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> Fitt
     pitch = np.interp(absent, pulses.numbers, pulses.pitch)
     lost = np.interp(absent, pulses.numbers, true) + pattern.late()[pattern.tooth(absent)] * pitch
     return FittedPulses(pattern, true, pulses.numbers, pulses.breaks, pulses.strays,
-                        np.asarray(lost))
+                        np.asarray(lost), pulses.times)
 
 
 def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
