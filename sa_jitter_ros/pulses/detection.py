@@ -83,10 +83,10 @@ class KeyphasorDetector:
     and updates them once per window of that length. Samples wait until then, so that no pulse is
     lost. With a `threshold` and `hysteresis` 0 it learns nothing. Levels that two windows have
     agreed on change only where the next two agree on others, so that no single event, whatever its
-    size, moves them for longer. Samples beyond all others by more than these are apart are
-    spikes and are bridged. If no `threshold` is given, pulses with a lobe on either side of the
-    resting level, as a variable reluctance sensor makes them, have the time of the steep crossing
-    between the lobes.
+    size, moves them for longer. Up to three samples that are farther from all others than these
+    are apart are a spike, and are bridged. If no `threshold` is given, pulses with a lobe on
+    either side of the resting level, as a variable reluctance sensor makes them, have the time of
+    the steep crossing between the lobes.
 
     :param threshold: in the waveform's unit; None for half way between the state levels.
     :param hysteresis: width of the band around the threshold, a fraction of the level difference.
@@ -285,7 +285,7 @@ class KeyphasorDetector:
 
     def _bridged(self, samples: FloatArray, levels: StateLevels) -> FloatArray:
         """Return the samples with the last sound one in place of spikes, which are counted."""
-        spikes = levels.spikes(samples)
+        spikes = levels.short_spikes(samples)
         if spikes is not None:
             self._spikes += int(np.count_nonzero(spikes))
             sound = np.maximum.accumulate(np.where(spikes, -1, np.arange(samples.size)))

@@ -113,6 +113,17 @@ class StateLevels:
             return None
         return np.asarray((samples > self.highest + reach) | (samples < self.lowest - reach))
 
+    def short_spikes(self, samples: FloatArray) -> BoolArray | None:
+        """Return which samples (n,) are in spikes that are too short for pulses, None for none."""
+        spikes = self.spikes(samples)
+        if spikes is None:
+            return None
+        begin, end = _runs(spikes)
+        for first, last in zip(begin.tolist(), end.tolist()):
+            if last - first > _SHORT:
+                spikes[first:last] = False
+        return spikes if spikes.any() else None
+
 
 def state_levels(samples: FloatArray, known: StateLevels | None = None) -> StateLevels:
     """
