@@ -17,6 +17,7 @@ Synchronous averaging of vibration, and what jitter of the keyphasor does to it.
 |---|---|
 | `read` | open a recording |
 | `detect_pulses` | find the pulses of a keyphasor in its waveform |
+| `pulses_from_angle` | find when a sampled angle or a counter passes the marks of a target |
 | `average`, `Averager` | average vibration synchronously with a shaft, at once or on line |
 | `predict` | predict what jitter does to the order amplitudes of an average |
 | `design` | find how fast the keyphasor must be sampled, and how many cycles averaged |
@@ -42,13 +43,15 @@ if TYPE_CHECKING:
     from sa_jitter_ros.prediction.design import Design, design
     from sa_jitter_ros.prediction.prediction import Prediction
     from sa_jitter_ros.pulses.detection import detect_pulses
+    from sa_jitter_ros.pulses.sampled_angle import pulses_from_angle
     from sa_jitter_ros.recordings.reading import read
     from sa_jitter_ros.recordings.recording import Recording
 
 __all__ = [
     'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'MessageError',
     'ModelError', 'ParameterError', 'Prediction', 'Recording', 'RecordingError', 'SaJitterError',
-    'SignalError', 'average', 'close_loop', 'design', 'detect_pulses', 'predict', 'read']
+    'SignalError', 'average', 'close_loop', 'design', 'detect_pulses', 'predict',
+    'pulses_from_angle', 'read']
 
 # Modules are loaded when a name of theirs is first used: importing the package costs nothing.
 _HOMES = {
@@ -61,6 +64,7 @@ _HOMES = {
     'prediction.design': ('Design', 'design'),
     'prediction.prediction': ('Prediction',),
     'pulses.detection': ('detect_pulses',),
+    'pulses.sampled_angle': ('pulses_from_angle',),
     'recordings.reading': ('read',),
     'recordings.recording': ('Recording',),
 }

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.detection import counter_pulses, KeyphasorDetector
+from sa_jitter_ros.pulses.detection import KeyphasorDetector
 from scipy.signal import butter, lfilter
 
 RATE = 10_000.0
@@ -219,18 +219,6 @@ def test_bad_options_are_refused(options):
         KeyphasorDetector(**options)
 
 
-def test_counter():
-    assert counter_pulses([3, 3, 4, 4, 6], start_time=1.0, sample_rate=10.0) == pytest.approx(
-        [1.2, 1.35, 1.4])
-    assert counter_pulses(np.empty(0, int), sample_rate=1.0).size == 0
-    with pytest.raises(SignalError, match='falls from 4 to 2 at sample 1'):
-        counter_pulses([4, 2], sample_rate=1.0)
-    with pytest.raises(SignalError, match='float64'):
-        counter_pulses([0.5], sample_rate=1.0)
-    with pytest.raises(SignalError, match='sample rate'):
-        counter_pulses([1], sample_rate=0.0)
-
-
 @pytest.mark.parametrize(('name', 'speed', 'jitter'), [
     ('motor_10V_100kHz', 19.6, 6e-6), ('motor_30V_100kHz', 94.4, 0.25e-6)])
 def test_motor_tacho(shared_data, name, speed, jitter):
@@ -262,14 +250,6 @@ def test_one_bit_optical_mark(shared_data, name):
     for row in tach:
         pulses, _ = detect(row, rate=rate, polarity='negative', interpolate=False)
         assert pulses * rate == pytest.approx(np.flatnonzero(np.diff(row) < 0.0) + 1, abs=1e-6)
-
-
-def test_revolution_counter(shared_data):
-    with np.load(shared_data / 'uia_bearing_rig_1.npz') as data:
-        counts, rate = data['tach_count'], float(data['tach_rate'])
-    pulses = counter_pulses(counts, sample_rate=rate)
-    assert pulses.size == counts[-1] - counts[0]
-    assert 1.0 / np.diff(pulses).mean() == pytest.approx(4.19, rel=2e-3)
 
 
 def tach(kind, rng, *, rate=5000.0, seconds=10.0, speed=20.0):

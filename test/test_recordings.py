@@ -175,12 +175,34 @@ def test_a_revolution_counter_becomes_pulses(tmp_path):
 def test_a_revolution_counter_that_is_reset_goes_on(tmp_path, kind):
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
                 tach_count=np.array([254, 255, 0, 1, 1, 2]).astype(kind), tach_rate=10.0)
-    np.testing.assert_allclose(read(path).pulse_times, [0.1, 0.3, 0.5])
+    np.testing.assert_allclose(read(path).pulse_times, [0.1, 0.2, 0.3, 0.5])
+
+
+def test_a_counter_of_a_turn_counts_on_and_says_what_was_left_out(tmp_path):
+    counts = np.arange(1000) * 7 % 100
+    counts[505] = 0
+    path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
+                tach_count=counts, tach_rate=10.0, pulses_per_revolution=100)
+    recording = read(path)
+    assert recording.pulse_times.size == 999 * 7
+    assert recording.remarks == (
+        'tach_count: 1 samples where the shaft cannot be are left out',)
+    path = save(tmp_path / 'down.npz', vibration=np.ones(100), sample_rate=RATE,
+                tach_count=-7 * np.arange(1000), tach_rate=10.0, pulses_per_revolution=100)
+    np.testing.assert_allclose(read(path).pulse_times, recording.pulse_times, atol=0.2)
+    counts = np.arange(1000) + 5000 * (np.arange(1000) > 400)
+    path = save(tmp_path / 'jump.npz', vibration=np.ones(100), sample_rate=RATE,
+                tach_count=counts, tach_rate=10.0)
+    recording = read(path)
+    assert recording.pulse_times.size == 998
+    assert recording.remarks == (
+        'tach_count: 1 jumps that are no overflow begin to count anew',)
 
 
 @pytest.mark.parametrize(('counts', 'message'), [
     ([0.0, 0.5, 1.0], 'fractions'), ([0.0, np.nan], 'NaN'), ([0.0, 1e17], '2.53'),
-    ([0, 2**40], 'counts 1099511627776 pulses: at most'), ([[0, 1], [0, 1]], 'one row')])
+    ([0, 2**40], 'passes 1099511627775 marks from 0 s to 0.1 s, at most'),
+    ([[0, 1], [0, 1]], 'one row')])
 def test_a_revolution_counter_that_counts_nothing_is_refused(tmp_path, counts, message):
     path = save(tmp_path / 'count.npz', vibration=np.ones(100), sample_rate=RATE,
                 tach_count=np.array(counts), tach_rate=10.0)

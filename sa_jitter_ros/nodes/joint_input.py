@@ -58,7 +58,7 @@ class JointInput:
         state = self.crossings.state
         values = {name: f'{getattr(state, name):.6g}' for name in (
             'pulse_error_std', 'angle_resolution', 'stamp_noise_std')}
-        values |= {name: str(getattr(state, name)) for name in ('reversals', 'stops')}
+        values |= {name: str(getattr(state, name)) for name in ('reversals', 'stops', 'glitches')}
         values |= {'joint': self.joint, 'messages_of_others': str(self.others)}
         if not state.samples:
             of = f' of joint {self.joint}' if self.joint else ''
@@ -67,4 +67,5 @@ class JointInput:
             return f'joint {self.joint} has not passed a mark yet: does it turn?', values
         error = ('' if np.isnan(state.pulse_error_std) else
                  f', each with an error of {1e6 * state.pulse_error_std:.3g} us')
-        return f'{state.pulses} marks of joint {self.joint} passed{error}', values
+        bridged = f'; {state.glitches} samples of glitches bridged' if state.glitches else ''
+        return f'{state.pulses} marks of joint {self.joint} passed{error}{bridged}', values

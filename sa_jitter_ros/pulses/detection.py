@@ -29,8 +29,8 @@ from sa_jitter_ros.parameters import number
 from sa_jitter_ros.pulses.threshold import SchmittTrigger, state_levels, StateLevels
 from sa_jitter_ros.samples import SampleBlock
 
-__all__ = ['KeyphasorDetector', 'KeyphasorState', 'counter_pulses', 'detect_pulses',
-           'pulses_in_blocks', 'spikes_text']
+__all__ = ['KeyphasorDetector', 'KeyphasorState', 'detect_pulses', 'pulses_in_blocks',
+           'spikes_text']
 
 FloatArray = npt.NDArray[np.float64]
 Polarity = Literal['positive', 'negative', 'auto']
@@ -438,36 +438,3 @@ def detect_pulses(
                'and that the sensor is connected')
         warnings.warn(f'the keyphasor waveform has no pulses: {why}', DataWarning, stacklevel=2)
     return pulses
-
-
-def counter_pulses(
-    counts: npt.ArrayLike, *, start_time: float = 0.0, sample_rate: float,
-) -> FloatArray:
-    """
-    Return the pulse times (s) of a sampled pulse counter (n,): each increase by 1 is a pulse.
-
-    A pulse has the time of the first sample that counts it. Several pulses in one sample are
-    spaced evenly over the time since the sample before.
-
-    :raises SignalError: not one channel of integers, or the counter decreases.
-
-    >>> counter_pulses([7, 7, 8, 8, 10], sample_rate=10.0)
-    array([0.2 , 0.35, 0.4 ])
-    """
-    values = np.asarray(counts)
-    if values.ndim != 1 or values.dtype.kind not in 'iu':
-        raise SignalError(f'a counter has type {values.dtype} and shape {values.shape}: '
-                          'give integers of one channel')
-    if not (np.isfinite(sample_rate) and sample_rate > 0.0):
-        raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
-    values = values.astype(np.int64)
-    steps = np.diff(values)
-    if np.any(steps < 0):
-        bad = int(np.argmax(steps < 0)) + 1
-        raise SignalError(f'the counter falls from {values[bad - 1]} to {values[bad]} at sample '
-                          f'{bad}: add the range of the counter after each overflow')
-    total = np.arange(1, int(steps.sum()) + 1)
-    level = values - values[:1]
-    sample = np.searchsorted(level, total)
-    fraction = (level[sample] - total) / steps[sample - 1]
-    return np.asarray(start_time + (sample - fraction) / sample_rate)

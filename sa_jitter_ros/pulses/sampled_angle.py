@@ -9,32 +9,44 @@
 # the License.
 
 """
-From the sampled angle of a shaft, as joints of robots have it, to the times of virtual marks.
+From the sampled angle of a shaft, of a joint or a counter, to the times of virtual marks.
 
 The angle may wrap or not. Around the crossing of a mark, a parabola through six samples gives its
 time; what they leave is the noise of stamps and the quantisation of the angle, from which the
-error of the pulses follows. No crossing is interpolated over a gap, a stop or a reversal.
+error of the pulses follows. No crossing is interpolated over a gap, a stop or a reversal, or over
+a jump of the angle; the few samples of a glitch are left out.
 """
 
 from dataclasses import dataclass
 import math
-from typing import Any
+from typing import Any, cast
+import warnings
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
+from sa_jitter_ros.parameters import number
+from sa_jitter_ros.pulses.angle_runs import AngleRuns
 
 FloatArray = NDArray[np.float64]
 
 _TURN = 2.0 * math.pi
 _BEFORE, _AFTER = 3, 3  # samples around a crossing
 _KEPT = 32  # samples before the next crossing
-_GAP = 6.0  # usual intervals of samples without a sample
 # Within so many seconds a shaft that turns passes this part of the pitch of its marks.
 _STOPPED, _PROGRESS = 1.0, 0.02
+_SEEN = 0.1  # of the pitch, from which a run that ends has a direction
 _STEPS = 512  # steps of the angle, from which its resolution follows
 _MULTIPLE, _MOST = 0.02, 0.9  # of a step; share of the steps that are multiples of the resolution
 _MEMORY = 0.98  # weight of the errors before, at each crossing
+_DITHER = 1.5  # counts; less back is no reversal of a counter
+_REGISTERS = (2.0**8, 2.0**16, 2.0**32)  # ranges of counters
+_MOST_BEFORE = 1 << 14  # samples before the shaft turns
+_MOST_AT_ONCE = 50_000_000  # pulses
+_LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
+_USUALLY = 0.98  # of the counts are within the range of a counter
+_SAME_RANGE = 1.2  # of two ranges
+_EXACT = 2.0**53  # the largest count that is exact
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,9 @@ class AngleState:
     Counts so far, and the errors of the latest pulses.
 
     `pulse_error_std` in s is the standard deviation of a pulse, made of `angle_resolution` in rad
-    (0 if it is not seen) and of the rest, `stamp_noise_std` in s; NaN while unknown.
+    (0 if it is not seen) and of the rest, `stamp_noise_std` in s; NaN while unknown. `glitches`
+    are samples that the shaft cannot have reached, which are left out. A run begins anew after
+    `gaps`, and after jumps of the angle or of time: `restarts`.
     """
 
     samples: int
@@ -53,6 +67,7 @@ class AngleState:
     stops: int
     reversals: int
     restarts: int
+    glitches: int
     pulse_error_std: float
     angle_resolution: float
     stamp_noise_std: float
@@ -64,6 +79,9 @@ class AngleCrossings:
 
     :param marks: number of marks on a revolution; one is at angle 0.
     :param time_tolerance: time (s) by which a sample may be early before a new run begins.
+    :param runs: of the angle; those of an angle in rad if it is None.
+    :param turn: a revolution, in the unit of the angle.
+    :param counted: the angle is a counter, and a pulse has the time of the sample that counts it.
     :raises ParameterError: an option is out of range.
 
     A shaft at 20 Hz, sampled at 1 kHz with 12 bits a revolution:
@@ -78,17 +96,22 @@ class AngleCrossings:
     1.0
     """
 
-    def __init__(self, *, marks: int = 1, time_tolerance: float = 0.01) -> None:
+    def __init__(self, *, marks: int = 1, time_tolerance: float = 0.01,
+                 runs: AngleRuns | None = None, turn: float = _TURN, counted: bool = False
+                 ) -> None:
         if marks != int(marks) or marks < 1:
             raise ParameterError(f'marks {marks} must be a whole number, 1 or more')
         if not 0.0 <= time_tolerance < np.inf:
             raise ParameterError(f'time_tolerance {time_tolerance} s must be finite and not '
                                  'negative')
-        self._pitch = _TURN / int(marks)
+        self._pitch = turn / int(marks)
+        self._counted = counted
+        self._back = max(0.5 * self._pitch, _DITHER if counted else 0.0)  # of a reversal
         self._tolerance = time_tolerance
+        self._runs = runs or AngleRuns(_TURN, moduli=(_TURN,))
         self._samples = self._dropped = self._pulses = 0
-        self._gaps = self._stops = self._reversals = self._restarts = 0
-        self._unwrapped = False
+        self._stops = self._reversals = self._restarts = 0
+        self._latest = -math.inf  # time of the latest sample
         self._steps = np.empty(0)
         self._left = self._freedom = self._leverage = self._slowness = 0.0
         self._begin()
@@ -96,12 +119,10 @@ class AngleCrossings:
     def _begin(self) -> None:
         """Forget the samples: the next one begins a run."""
         self._time, self._angle = np.empty(0), np.empty(0)  # of the run, continuous
-        self._raw = math.nan  # latest angle as it came
         self._direction = 0
         self._next = 0  # number of the next mark, in the direction
         self._standing = False
         self._moved, self._place = math.inf, math.nan  # when and where it last moved on
-        self._interval = math.nan
 
     @property
     def state(self) -> AngleState:
@@ -113,8 +134,10 @@ class AngleCrossings:
             error = math.sqrt(variance * self._leverage)
             rounding = resolution * self._slowness / math.sqrt(12.0)
             noise = math.sqrt(max(variance - rounding**2, 0.0))
-        return AngleState(self._samples, self._dropped, self._pulses, self._gaps, self._stops,
-                          self._reversals, self._restarts, error, resolution, noise)
+        runs = self._runs
+        return AngleState(self._samples, self._dropped, self._pulses, runs.gaps, self._stops,
+                          self._reversals, self._restarts + runs.jumps, runs.glitches, error,
+                          resolution, noise)
 
     def update(self, times: ArrayLike, angles: ArrayLike) -> FloatArray:
         """
@@ -134,73 +157,71 @@ class AngleCrossings:
         self._samples += time.size
         self._dropped += int(np.count_nonzero(~good))
         time, angle = time[good], angle[good]
-        found = []
+        found: list[FloatArray] = []
         while time.size:
-            last = self._time[-1] if self._time.size else -math.inf
-            reached = np.maximum.accumulate(np.append(last, time))[:-1]
+            reached = np.maximum.accumulate(np.append(self._latest, time))[:-1]
             back = np.flatnonzero(time < reached - self._tolerance)
             stop = int(back[0]) if back.size else time.size
             later = time[:stop] > reached[:stop]
             self._dropped += int(np.count_nonzero(~later))
-            found += self._take(time[:stop][later], angle[:stop][later])
+            self._take(time[:stop][later], angle[:stop][later], found, ends=back.size > 0)
+            self._latest = max(self._latest, float(time[:stop].max(initial=-math.inf)))
             if back.size:
                 self._restarts += 1
-                self._begin()
+                self._latest = -math.inf
             time, angle = time[stop:], angle[stop:]
+        return self._counted_pulses(found)
+
+    def flush(self) -> FloatArray:
+        """Return the pulse times (s) up to the last sample; the next one begins a run."""
+        found: list[FloatArray] = []
+        self._take(np.empty(0), np.empty(0), found, ends=True)
+        self._latest = -math.inf
+        return self._counted_pulses(found)
+
+    def _counted_pulses(self, found: list[FloatArray]) -> FloatArray:
         pulses = np.concatenate(found) if found else np.empty(0)
         self._pulses += pulses.size
         return pulses
 
-    def _take(self, time: FloatArray, angle: FloatArray) -> list[FloatArray]:
-        """Take samples in order of time; return pulse times, run by run."""
-        found: list[FloatArray] = []
-        while time.size:
-            intervals = np.diff(time, prepend=self._time[-1:] if self._time.size else time[:1])
-            if math.isnan(self._interval) and time.size + self._time.size > 2:
-                known = np.diff(np.append(self._time, time))
-                self._interval = float(np.median(known))
-            gap = np.flatnonzero(intervals > _GAP * self._interval) if np.isfinite(
-                self._interval) else np.empty(0, int)
-            first = gap[gap > 0] if not self._time.size else gap
-            stop = int(first[0]) if first.size else time.size
-            if stop:
-                self._append(time[:stop], angle[:stop])
-                found += self._crossings()
-            if first.size:
-                self._gaps += 1
-                interval = self._interval
+    def _take(self, time: FloatArray, angle: FloatArray, found: list[FloatArray], *, ends: bool
+              ) -> None:
+        """Take samples in order of time, `ends` if none follow in the run; add pulse times."""
+        for piece in self._runs.update(time, angle, ends=ends):
+            if piece.begins:
+                found += self._crossings(ends=True)
                 self._begin()
-                self._interval = interval
-            time, angle = time[stop:], angle[stop:]
-        return found
+            size = self._angle.size
+            self._time = np.concatenate((self._time, piece.time))
+            self._angle = np.concatenate((self._angle, piece.angle))
+            steps = np.abs(np.diff(self._angle[max(size - 1, 0):]))
+            self._steps = np.concatenate((self._steps, steps[steps != 0.0]))[-_STEPS:]
+            found += self._crossings()
+        if ends:
+            found += self._crossings(ends=True)
+            self._begin()
 
-    def _append(self, time: FloatArray, angle: FloatArray) -> None:
-        """Make the angle continuous and add it to the run."""
-        self._unwrapped |= bool(np.max(np.abs(angle)) > 1.01 * _TURN)
-        steps = np.diff(angle, prepend=angle[0] if math.isnan(self._raw) else self._raw)
-        if not self._unwrapped:
-            steps -= _TURN * np.rint(steps / _TURN)
-        start = self._angle[-1] if self._angle.size else angle[0]
-        self._raw = float(angle[-1])
-        self._time = np.append(self._time, time)
-        self._angle = np.append(self._angle, start + np.cumsum(steps))
-        moved = np.abs(steps[steps != 0.0])
-        self._steps = np.append(self._steps, moved)[-_STEPS:]
+    def _crossings(self, *, ends: bool = False) -> list[FloatArray]:
+        """
+        Return the pulse times of the marks that were passed; forget what is not needed.
 
-    def _crossings(self) -> list[FloatArray]:
-        """Return the pulse times of the marks that were passed; forget what is not needed."""
+        No sample follows those of a run that `ends`.
+        """
         found: list[FloatArray] = []
+        if not self._angle.size:
+            return found
         if not self._direction:
             moved = self._angle - self._angle[0]
-            if np.max(np.abs(moved)) < 0.5 * self._pitch:
+            if np.max(np.abs(moved)) < (_SEEN if ends else 0.5) * self._pitch:
+                self._thin(moved)
                 return found
             self._set_direction(1 if moved[np.argmax(np.abs(moved))] > 0.0 else -1)
         while True:
             turned = self._direction * self._angle
             reached = np.maximum.accumulate(turned)
-            back = np.flatnonzero(reached - turned > 0.5 * self._pitch)
+            back = np.flatnonzero(reached - turned > self._back)
             stop = int(back[0]) if back.size else turned.size
-            found.append(self._passed(reached[:stop], turned[:stop], ended=back.size > 0))
+            found.append(self._passed(reached[:stop], turned[:stop], ended=ends or back.size > 0))
             self._watch_standstill(self._time[:stop], reached[:stop])
             if not back.size:
                 break
@@ -212,6 +233,15 @@ class AngleCrossings:
         keep = max(min(needed, reached.size) - _KEPT, 0)
         self._time, self._angle = self._time[keep:], self._angle[keep:]
         return found
+
+    def _thin(self, moved: FloatArray) -> None:
+        """Forget most samples of a shaft that has stood for long before it turns."""
+        if moved.size > _MOST_BEFORE:
+            kept = np.zeros(moved.size, bool)
+            for each in (moved, -moved):
+                kept |= np.diff(np.maximum.accumulate(each), prepend=-1.0) > 0.0
+            kept[-_KEPT:] = True
+            self._time, self._angle = self._time[kept], self._angle[kept]
 
     def _set_direction(self, direction: int) -> None:
         self._direction, self._moved, self._place = direction, float(self._time[0]), math.nan
@@ -236,9 +266,14 @@ class AngleCrossings:
         if known < 1:
             return np.empty(0)
         last = math.floor(reached[known] / self._pitch)
+        if last - self._next > _MOST_AT_ONCE:
+            raise SignalError(
+                f'the angle passes {last - self._next} marks from {self._time[0]:g} s to '
+                f'{self._time[known]:g} s, at most {_MOST_AT_ONCE} are read: check its unit and '
+                'the number of marks')
         marks = np.arange(self._next, last + 1) * self._pitch
         self._next = max(self._next, last + 1)
-        index = np.searchsorted(reached, marks)
+        index = np.minimum(np.searchsorted(reached, marks), reached.size - 1)  # to rounding
         marks, index = marks[index > 0], index[index > 0]
         if not marks.size:
             return np.empty(0)
@@ -246,7 +281,7 @@ class AngleCrossings:
         share = (marks - low) / np.where(high > low, high - low, 1.0)
         straight = self._time[index - 1] + np.clip(share, 0.0, 1.0) * (
             self._time[index] - self._time[index - 1])
-        whole = (index >= _BEFORE) & (index + _AFTER <= reached.size)
+        whole = (index >= _BEFORE) & (index + _AFTER <= reached.size) & (not self._counted)
         if whole.any():
             straight[whole] = self._fitted(index[whole], marks[whole], turned, straight[whole])
         return np.asarray(np.maximum.accumulate(straight))
@@ -292,3 +327,132 @@ class AngleCrossings:
             return 0.0
         multiples = self._steps / step
         return step if np.mean(np.abs(multiples - np.rint(multiples)) < _MULTIPLE) > _MOST else 0.0
+
+
+def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> AngleRuns:
+    """
+    Return the runs of a counter of `turn` counts a revolution.
+
+    It may overflow a register of 8, 16 or 32 bits, wrap at `modulus` or at a turn, or be reset at
+    the end of the range in which `counts` return again and again.
+    """
+    size = float(np.quantile(np.abs(counts), _USUALLY)) if counts.size else 0.0
+    registers = [each for each in (turn, *_REGISTERS) if each >= max(size, _LEAST_MODULUS)]
+    span = float(np.ptp(counts)) + 1.0 if counts.size else 0.0
+    falls = np.diff(counts)
+    falls = falls[np.abs(falls) > 0.5 * span]
+    if falls.size > 1 and abs(np.sum(np.sign(falls))) == falls.size and not any(
+            span <= each <= _SAME_RANGE * span for each in registers):
+        registers.append(span)
+    return AngleRuns(turn, moduli=(modulus,) if modulus else (), registers=tuple(registers),
+                     counts=True)
+
+
+def counter_pulses(
+    counts: ArrayLike, *, start_time: float = 0.0, sample_rate: float,
+    pulses_per_revolution: int = 1,
+) -> tuple[FloatArray, AngleState]:
+    """
+    Return the pulse times (s) of a sampled pulse counter (n,), and its state at the end.
+
+    Each count is a pulse, `pulses_per_revolution` are a turn. A pulse has the time of the first
+    sample that counts it; several pulses in one sample are spaced evenly over the time since the
+    sample before. The counter may count down, overflow or be reset each turn.
+
+    :raises SignalError: not one channel of integers.
+
+    >>> counter_pulses([7, 7, 8, 8, 10], sample_rate=10.0)[0]
+    array([0.2 , 0.35, 0.4 ])
+    >>> counter_pulses([2, 1, 0, 0, 255], sample_rate=10.0)[0]
+    array([0.1, 0.2, 0.4])
+    """
+    values = np.asarray(counts)
+    if values.ndim != 1 or values.dtype.kind not in 'iu':
+        raise SignalError(f'a counter has type {values.dtype} and shape {values.shape}: '
+                          'give integers of one channel')
+    if not (np.isfinite(sample_rate) and sample_rate > 0.0):
+        raise SignalError(f'sample rate {sample_rate} Hz must be above 0, and finite')
+    times = np.arange(values.size) / sample_rate
+    marks = int(pulses_per_revolution)
+    angle = values.astype(np.float64)
+    crossings = AngleCrossings(marks=marks, turn=float(marks), counted=True,
+                               runs=counter_runs(angle, float(marks)))
+    pulses = np.append(crossings.update(times, angle), crossings.flush())
+    return start_time + pulses, crossings.state
+
+
+def pulses_from_angle(
+    times: ArrayLike, angle: ArrayLike, *, pulses_per_revolution: int = 1,
+    modulus: float | None = None,
+) -> FloatArray:
+    """
+    Return the pulse times (pulse,) in s of a sampled angle (sample,), as from a target on it.
+
+    The `angle` of a resolver or joint is in rad and may wrap at any multiple of 2 pi, or at
+    `modulus`, in rad. An angle of integers, or with a whole `modulus`, is in counts. A turn is
+    then `modulus` counts, if `pulses_per_revolution` divides it; otherwise each count is a pulse,
+    and `pulses_per_revolution` counts are a turn. For a register that holds some turns, `modulus`
+    may be the counts of one turn; overflows of 8, 16 and 32 bits are seen in any case.
+
+    One of the marks is at angle 0. The shaft may turn in either direction. Samples where it cannot
+    be are bridged, and a `DataWarning` says how many; a jump of the angle that is no wrap, lost
+    samples and a reversal end a run. Samples that are not finite are left out. Raises
+    `ParameterError` for options and `SignalError` for arrays that cannot be used.
+
+    A shaft at 25 Hz, sampled at 1 kHz; an absolute encoder of 12 bits on it; and an incremental
+    one of 500 counts a turn:
+
+    >>> import numpy as np
+    >>> import sa_jitter_ros as sa
+    >>> time = np.arange(1000) / 1e3
+    >>> turned = 25.0 * time
+    >>> sa.pulses_from_angle(time, 2.0 * np.pi * turned % (2.0 * np.pi))[:3].round(6)
+    array([0.04, 0.08, 0.12])
+    >>> counts = np.floor(4096 * turned).astype(int) % 4096
+    >>> sa.pulses_from_angle(time, counts, modulus=4096).size
+    24
+    >>> counts = np.floor(500 * turned).astype(np.uint16)
+    >>> sa.pulses_from_angle(time, counts, pulses_per_revolution=500).size
+    12487
+    """
+    marks = number('pulses_per_revolution', pulses_per_revolution)
+    if not (marks >= 1.0 and marks.is_integer()):
+        raise ParameterError(f'pulses_per_revolution {marks:g} must be a whole number, 1 or more')
+    values = np.asarray(angle)
+    whole = values.dtype.kind in 'iu'
+    if modulus is not None:
+        modulus = number('modulus', modulus)
+        whole |= modulus.is_integer()
+        least = _LEAST_MODULUS if whole else 0.0
+        if not least <= modulus < np.inf or modulus == 0.0:
+            raise ParameterError(f'modulus {modulus:g} must be finite and '
+                                 + (f'{least:g} counts or more' if whole else 'above 0 rad'))
+    if values.ndim != 1 or values.dtype.kind not in 'fiu':
+        raise SignalError(f'angle of shape {values.shape} and type {values.dtype}: give one row '
+                          'of real numbers, in rad or counts')
+    finite = values[np.isfinite(values)].astype(np.float64)
+    if whole:
+        if np.any(np.abs(finite) > _EXACT):
+            raise SignalError(f'a count of {np.max(np.abs(finite)):.0f} is above 2^53 and not '
+                              'exact: subtract the first one')
+        divides = modulus is not None and modulus % marks == 0.0
+        turn = cast(float, modulus) if divides else marks
+        crossings = AngleCrossings(
+            marks=int(marks), turn=turn, counted=turn == marks,
+            runs=counter_runs(finite, turn, modulus or 0.0))
+    else:
+        crossings = AngleCrossings(marks=int(marks), runs=AngleRuns(
+            _TURN, moduli=(_TURN, modulus) if modulus else (_TURN,)))
+    pulses = np.append(crossings.update(times, values), crossings.flush())
+    state = crossings.state
+    unit = 'counts' if whole else 'rad'
+    if not pulses.size:
+        seen = f' from {finite.min():g} to {finite.max():g} {unit}' if finite.size else ''
+        warnings.warn(f'the angle has no pulses: its {values.size} samples go{seen}; check its '
+                      'unit, the modulus, and that the shaft turns', DataWarning, stacklevel=2)
+    elif state.glitches or state.restarts:
+        warnings.warn(
+            f'{state.glitches} samples of the angle are where the shaft cannot be: bridged; '
+            f'{state.restarts} jumps of angle or time that are no wrap began a new run: check '
+            'sensor and modulus', DataWarning, stacklevel=2)
+    return pulses

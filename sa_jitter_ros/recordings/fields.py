@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.errors import ParameterError, RecordingError
-from sa_jitter_ros.pulses.detection import counter_pulses
+from sa_jitter_ros.errors import ParameterError, RecordingError, SignalError
+from sa_jitter_ros.pulses.sampled_angle import counter_pulses
 from sa_jitter_ros.recordings.recording import ArraySource, FloatArray, MAX_PULSES, Recording
 
 _MAX_SAMPLE_BYTES = 1 << 40
@@ -118,8 +118,8 @@ def recording_from_fields(names: Collection[str], load: Load, *,
     Build a recording from named arrays.
 
     If `tach` has several rows, one for every row of `vibration`, each row is a separate
-    acquisition, and `acquisition` selects one. `tach_count` is a revolution counter sampled at
-    `tach_rate`; each increase by 1 is a pulse.
+    acquisition, and `acquisition` selects one. `tach_count` is a counter sampled at
+    `tach_rate`, of `pulses_per_revolution` counts a turn; each count, up or down, is a pulse.
 
     Parameters
     ----------
@@ -200,7 +200,8 @@ def recording_from_fields(names: Collection[str], load: Load, *,
             raise RecordingError('tach_count without a positive tach_rate: add its rate in Hz')
         values['pulse_times'] = _counted_pulses(
             load(keys['tach_count'][0], size_limit('tach_count')),
-            values.get('start_time', 0.0), tach_rate)
+            values.get('start_time', 0.0), tach_rate, values.get('pulses_per_revolution', 1),
+            remarks)
     return Recording(ArraySource(vibration), tach=None if tach is None else ArraySource(tach),
                      acquisitions=acquisitions, remarks=tuple(remarks), **values)
 
@@ -287,8 +288,9 @@ def _strings(name: str, array: RawArray) -> tuple[str, ...]:
     return tuple(item.strip() for item in array.reshape(-1).tolist())
 
 
-def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatArray:
-    """Return the pulse times (s) of a revolution counter; a decrease is a reset."""
+def _counted_pulses(counter: RawArray, start_time: float, rate: float, a_turn: int,
+                    remarks: list[str]) -> FloatArray:
+    """Return the pulse times (s) of a counter of `a_turn` pulses a revolution."""
     values = _samples('tach_count', counter)
     if len(values) != 1:
         raise RecordingError(f'tach_count of shape {counter.shape}: give one row')
@@ -296,12 +298,21 @@ def _counted_pulses(counter: RawArray, start_time: float, rate: float) -> FloatA
     if not np.all((counts == np.floor(counts)) & (abs(counts) < 2.0**53)):
         raise RecordingError('tach_count contains fractions, NaN or values above 2^53: give '
                              'counts')
-    rises = np.maximum(np.diff(counts), 0.0)
-    if rises.sum() > MAX_PULSES:
-        raise RecordingError(f'tach_count counts {rises.sum():.0f} pulses: at most {MAX_PULSES} '
+    try:
+        pulses, state = counter_pulses(counts.astype(np.int64), start_time=start_time,
+                                       sample_rate=rate, pulses_per_revolution=a_turn)
+    except SignalError as error:
+        raise RecordingError(f'tach_count: {error}') from error
+    if pulses.size > MAX_PULSES:
+        raise RecordingError(f'tach_count counts {pulses.size} pulses: at most {MAX_PULSES} '
                              'are read; split the recording')
-    return counter_pulses(np.append(0.0, np.cumsum(rises)).astype(np.int64),
-                          start_time=start_time, sample_rate=rate)
+    if state.glitches:
+        remarks.append(f'tach_count: {state.glitches} samples where the shaft cannot be are '
+                       'left out')
+    if state.restarts:
+        remarks.append(f'tach_count: {state.restarts} jumps that are no overflow begin to count '
+                       'anew')
+    return pulses
 
 
 # The fields that are not samples, each with its conversion from an array.
