@@ -379,6 +379,18 @@ def test_mat_of_version_73_of_another_make(recording, tmp_path):
     assert opened.remarks == ('rig/acc of shape (5000, 3) is taken as sample x channel',)
 
 
+def test_mat_of_version_73_with_an_array_of_structs(tmp_path):
+    path = save_mat73(tmp_path / 'rig.mat', sample_rate=RATE)
+    h5py = pytest.importorskip('h5py')
+    with h5py.File(path, 'r+') as file:
+        cells = [file.create_dataset('#refs#/a', data=np.arange(90.0)[:, None]).ref,
+                 file.create_dataset('#refs#/b/deep', data=np.ones((90, 1))).parent.ref]
+        file.create_dataset('rig/data', data=np.array([cells], h5py.ref_dtype))
+        file['rig/again'] = file['rig']  # a circle of links
+    np.testing.assert_array_equal(
+        read(path, vibration='rig/0/data,rig/1/data/deep').read(), [np.arange(90.0), np.ones(90)])
+
+
 def test_mat_of_version_73_that_is_broken_or_without_h5py(tmp_path, monkeypatch):
     path = tmp_path / 'new.mat'
     path.write_bytes(b'MATLAB 7.3 MAT-file, Platform: GLNXA64'.ljust(512, b' '))
@@ -408,8 +420,44 @@ def test_large_mat_of_any_number_type_is_mapped(rng, tmp_path, monkeypatch, dtyp
 
 def test_mat_with_a_struct_for_vibration(tmp_path):
     scipy.io.savemat(tmp_path / 'bad.mat', {'vibration': {'x': 1.0}, 'sample_rate': 1.0})
-    with pytest.raises(RecordingError, match='vibration has class 2: give real numbers'):
+    with pytest.raises(RecordingError, match=r'no vibration among the fields .* vibration/x'):
         read(tmp_path / 'bad.mat')
+
+
+@pytest.mark.parametrize('limit', [1000, 1 << 26], ids=['mapped', 'memory'])
+@pytest.mark.parametrize('compress', [False, True])
+def test_mat_with_structs_in_structs(rng, tmp_path, monkeypatch, compress, limit):
+    monkeypatch.setattr(mat_format, 'IN_MEMORY_BYTES', limit)
+    samples = rng.normal(size=(2000, 1))
+    channels = np.array([(samples[:, 0], 'x'), (2.0 * samples[:, 0], 'y')],
+                        dtype=[('data', object), ('name', object)])
+    scipy.io.savemat(tmp_path / 'rig.mat', {
+        'bearing': {'gs': samples, 'sr': 1000.0, 'load': [], 'none': {},
+                    'tach': {'times': np.arange(5.0)}, 'names': np.array(['a', 'b'], object)},
+        'channels': channels, 'sample_rate': 500.0}, do_compression=compress)
+    opened = read(tmp_path / 'rig.mat', vibration='bearing/gs', sample_rate='bearing/sr',
+                  pulse_times='bearing/tach/times')
+    np.testing.assert_array_equal(opened.read(), samples.T)
+    assert opened.sample_rate == 1000.0
+    assert opened.pulse_times.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    opened = read(tmp_path / 'rig.mat', vibration='channels/0/data,channels/1/data',
+                  channel_names='bearing/names')
+    np.testing.assert_array_equal(opened.read(), [samples[:, 0], 2.0 * samples[:, 0]])
+    assert opened.channel_names == ('a', 'b')
+    with pytest.raises(RecordingError, match='no such key; it has bearing/gs, bearing/load'):
+        read(tmp_path / 'rig.mat', vibration='gs')
+
+
+def test_a_broken_struct_spoils_no_other_variable(tmp_path):
+    path = tmp_path / 'rig.mat'
+    scipy.io.savemat(path, {'other': {'long_name': 1.0}, 'vibration': np.ones((1, 90)),
+                            'sample_rate': 1.0})
+    data = path.read_bytes()
+    at = data.index(b'long_name') - 8
+    path.write_bytes(data[:at - 4] + bytes(4) + data[at:])
+    assert read(path).samples == 90
+    with pytest.raises(RecordingError, match=r'other: .* the file is broken'):
+        read(path, vibration='other')
 
 
 def test_mat_bomb_is_refused(tmp_path):

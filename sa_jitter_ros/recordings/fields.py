@@ -156,7 +156,7 @@ def recording_from_fields(names: Collection[str], load: Load, *,
     remarks: list[str] = []
     if 'vibration' in keys:
         vibration = _stacked(keys['vibration'], load, remarks, mapped='vibration' in sources)
-        if len(keys['vibration']) > 1:
+        if len(keys['vibration']) > 1 and 'channel_names' not in sources:
             values.setdefault('channel_names', keys['vibration'])
     elif pulses_suffice:
         vibration = np.full((1, 1), np.nan)

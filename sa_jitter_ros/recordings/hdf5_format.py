@@ -16,7 +16,8 @@ a text is a dataset of character codes, a cell one of references. Large datasets
 chunk into an unnamed temporary file and mapped there, as members of an `.npz` are.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from math import prod
 from pathlib import Path
 import tempfile
@@ -30,6 +31,7 @@ from sa_jitter_ros.recordings.recording import Recording
 
 _ROWS_BYTES = 1 << 24
 _MOST_CELLS = 10_000
+_MOST_KEYS = 100_000
 
 
 def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
@@ -37,7 +39,8 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
     """
     Open a `.mat` recording of version 7.3; fields as in `recording_from_fields`.
 
-    A variable inside a struct has the key `struct/variable`. Raises RecordingError if h5py is not
+    A variable inside a struct has the key `struct/variable`, in element k of an array of structs
+    `struct/k/variable`. Raises RecordingError if h5py is not
     installed, the file is broken, or a variable has the wrong class.
     """
     try:
@@ -47,17 +50,36 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
                              "installed: pip install 'sa_jitter_ros[mat73]' or h5py, or save the "
                              "file with '-v7'") from None
     with h5py.File(path, 'r') as file:
-        keys: list[str] = []
-        file.visititems(lambda name, item: keys.append(name) if isinstance(item, h5py.Dataset)
-                        and not name.startswith('#') else None)
+        variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
         return recording_from_fields(
-            keys, lambda name, limit: _array(file, name, limit), acquisition=acquisition,
-            given=given, pulses_suffice=pulses_suffice)
+            variables, lambda name, limit: _array(file, name, variables[name], limit),
+            acquisition=acquisition, given=given, pulses_suffice=pulses_suffice)
 
 
-def _array(file: Any, name: str, limit: int) -> RawArray:
+def _datasets(file: Any, group: Any, prefix: str, above: tuple[Any, ...]
+              ) -> Iterator[tuple[str, Any]]:
+    """Iterate over keys and datasets of a struct, which is inside the structs `above`."""
+    if group in above:
+        return
+    above = (*above, group)
+    for name, item in group.items():
+        if name.startswith('#'):
+            continue
+        if hasattr(item, 'items'):
+            yield from _datasets(file, item, f'{prefix}{name}/', above)
+        elif item.dtype.kind != 'O' or item.attrs.get('MATLAB_class', b''):
+            yield f'{prefix}{name}', item
+        else:  # a field of an array of structs is a dataset of references
+            for number, reference in enumerate(np.ravel(item[()])):
+                target = file[reference]
+                if hasattr(target, 'items'):
+                    yield from _datasets(file, target, f'{prefix}{number}/{name}/', above)
+                else:
+                    yield f'{prefix}{number}/{name}', target
+
+
+def _array(file: Any, name: str, dataset: Any, limit: int) -> RawArray:
     """Return the array of a dataset, of at most `limit` bytes, as MATLAB has it."""
-    dataset = file[name]
     kind = dataset.attrs.get('MATLAB_class', b'')
     if kind == b'cell':
         if dataset.size > _MOST_CELLS:

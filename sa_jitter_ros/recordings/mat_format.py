@@ -13,8 +13,10 @@ Recordings in MATLAB `.mat` files of version 5 to 7, read with bounded memory.
 
 Those of version 7.3 are HDF5: `hdf5_format` reads them.
 
-Only numbers, text and cells of text are parsed, from a map of the file. A compressed variable is
-unpacked once into an unnamed temporary file. Format: MathWorks, MAT-File Format, chapter 1.
+Only numbers, text, cells of text and structs of these are parsed, from a map of the file. A
+variable in a struct has the key `struct/variable`; in element k of an array of structs it has
+`struct/k/variable`, with k from 0. A compressed variable is unpacked once into an unnamed
+temporary file. Format: MathWorks, MAT-File Format, chapter 1.
 
 scipy.io.loadmat is not used for two reasons. A broken file can end the process: scipy 1.17.1
 crashed (SIGSEGV, SIGBUS) on 23 of 4000 small files in which one to four places were overwritten,
@@ -45,12 +47,15 @@ from sa_jitter_ros.recordings.recording import Recording, recording_errors
 _Buffer = bytes | mmap.mmap
 
 _MATRIX, _COMPRESSED = 14, 15
-_CELL, _CHAR, _NUMERIC = 1, 4, range(6, 16)
+_CELL, _STRUCT, _CHAR, _NUMERIC, _OPAQUE = 1, 2, 4, range(6, 16), 17
 _COMPLEX = 0x0800
 _NUMBERS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 9: 'f8', 12: 'i8',
             13: 'u8'}
 _TEXTS = {1: 'latin-1', 2: 'latin-1', 4: 'utf-16', 16: 'utf-8', 17: 'utf-16', 18: 'utf-32'}
 _HEADER, _HEAD, _STEP = 128, 4096, 1 << 20
+_DEEPEST, _MOST_ELEMENTS = 32, 10_000  # of structs in structs; of an array of structs
+
+_Variables = Iterator[tuple[str, Callable[[int], RawArray]]]
 
 
 @dataclass(frozen=True)
@@ -107,21 +112,61 @@ class _Reader:
     def __init__(self, order: str) -> None:
         self._order = order
 
-    def variables(self, whole: _Buffer) -> Iterator[tuple[str, Callable[[int], RawArray]]]:
-        """Iterate over the names of the variables and what reads the array of each."""
+    def variables(self, whole: _Buffer) -> _Variables:
+        """Iterate over the keys of the variables and what reads the array of each."""
         start = _HEADER
         while start + 8 <= len(whole):
             element = self._element(whole, start, len(whole))
             start = element.stop
             if element.kind == _MATRIX:
                 matrix = self._matrix(whole, element)
-                yield matrix.name, partial(self._array, whole, matrix)
+                yield from _or_refusal(
+                    matrix.name, partial(self._parts, whole, matrix, matrix.name))
             elif element.kind == _COMPRESSED:
                 packed = whole[element.start:min(element.start + _HEAD, element.stop)]
                 head = zlib.decompressobj().decompress(packed, _HEAD)
                 tag = self._element(head, 0, None)
-                yield (self._matrix(head, tag).name,
-                       partial(self._unpacked, whole, element, 8 + tag.stop - tag.start))
+                matrix, size = self._matrix(head, tag), 8 + tag.stop - tag.start
+                if matrix.kind == _STRUCT:
+                    yield from _or_refusal(
+                        matrix.name, partial(self._unpacked_parts, whole, element, size))
+                else:
+                    yield matrix.name, partial(self._unpacked, whole, element, size)
+
+    def _unpacked_parts(self, whole: _Buffer, element: _Element, size: int) -> _Variables:
+        """Iterate over the keys of a compressed struct of `size` bytes."""
+        data = _inflate(whole, element, size)
+        matrix = self._matrix(data, self._element(data, 0, len(data)))
+        yield from self._parts(data, matrix, matrix.name)
+
+    def _parts(self, data: _Buffer, matrix: _Matrix, key: str, depth: int = 0) -> _Variables:
+        """Iterate over the keys below `key`: of a struct those of its fields, else itself."""
+        if matrix.kind != _STRUCT:
+            yield key, partial(self._array, data, matrix)
+            return
+        count = prod(matrix.shape)
+        if depth > _DEEPEST or not 0 <= count <= _MOST_ELEMENTS:
+            raise RecordingError(f'{key} has {count} elements in {depth} structs: at most '
+                                 f'{_MOST_ELEMENTS} in {_DEEPEST} are read')
+        length = self._element(data, matrix.content, matrix.stop)
+        size = struct.unpack_from(f'{self._order}i', data, length.start)[0]
+        at = self._after(length, matrix.content)
+        texts = self._element(data, at, matrix.stop)
+        at = self._after(texts, at)
+        if size < 1 or (texts.stop - texts.start) % size:
+            raise RecordingError(f'{key}: field names of {size} bytes: the file is broken')
+        names = [data[start:start + size].split(b'\0')[0].decode('ascii', 'replace')
+                 for start in range(texts.start, texts.stop, size)]
+        for number in range(count):
+            for name in names:
+                element = self._element(data, at, matrix.stop)
+                at = self._after(element, at)
+                if element.kind != _MATRIX:
+                    raise RecordingError(f'{key}/{name} is no array: the file is broken')
+                if element.stop > element.start:  # without: an empty field
+                    yield from self._parts(
+                        data, self._matrix(data, element),
+                        f'{key}/{name}' if count == 1 else f'{key}/{number}/{name}', depth + 1)
 
     def _unpacked(self, whole: _Buffer, element: _Element, size: int, limit: int) -> RawArray:
         """Read the array of a compressed variable of `size` bytes."""
@@ -153,6 +198,9 @@ class _Reader:
         flags, dims, name = places
         flag = struct.unpack_from(f'{self._order}I', data, flags.start)[0]
         kind = 0 if flag & _COMPLEX else flag & 0xFF
+        if kind == _OPAQUE:  # an object, as a table or a datetime: its name follows the flags
+            return _Matrix(data[dims.start:dims.stop].decode('ascii', 'replace'), kind, (1, 1),
+                           element.stop, element.stop)
         shape = np.frombuffer(data[dims.start:dims.stop], f'{self._order}i4')
         return _Matrix(data[name.start:name.stop].decode('ascii', 'replace'), kind,
                        tuple(shape.tolist()), at, element.stop)
@@ -206,6 +254,19 @@ class _Reader:
         if len(text) != prod(matrix.shape) or rows <= 1:
             return np.array([text])
         return np.array([text[row::rows] for row in range(rows)])
+
+
+def _or_refusal(key: str, parts: Callable[[], _Variables]) -> _Variables:
+    """Return the parts of a variable; of one that is broken, its key, which refuses to be read."""
+    try:
+        return iter(list(parts()))
+    except (RecordingError, struct.error, zlib.error) as error:
+        reason = RecordingError(f'{key}: {error}')
+
+    def refuse(limit: int) -> RawArray:
+        raise reason
+
+    return iter([(key, refuse)])
 
 
 def _inflate(whole: _Buffer, element: _Element, size: int) -> _Buffer:
