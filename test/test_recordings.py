@@ -624,6 +624,70 @@ def test_csv_without_header_and_with_a_text_column(tmp_path):
     np.testing.assert_array_equal(opened.read(), [[1, 2]])
 
 
+ROWS = [(f'{1e-3 * k:.8f}', f'{0.5 * k - 3.0:.2f}', f'{k % 7}.5') for k in range(40)]
+TABLES = {  # lines above the rows; separator, decimal point and coding; names, first unit
+    'preamble': ('Model,X1\nLabel,\nSample Interval,1e-3\n\nTIME,CH1,CH2\n', ',.', 'utf-8',
+                 ('CH1', 'CH2'), '', 1e3),
+    'preamble of as many fields': ('a,b,c\nd,e,f\nTime,CH1,CH2\n', ',.', 'utf-8',
+                                   ('CH1', 'CH2'), '', 1e3),
+    'units': ('Time,Channel A,Channel B\n(ms),(V),(mV)\n\n', ',.', 'utf-8',
+              ('Channel A', 'Channel B'), 'V', 1e6),
+    'units without brackets': ('x-axis,1,2\nsecond,Volt,Volt\n', ',.', 'utf-8',
+                               ('1', '2'), 'Volt', 1e3),
+    'units in the names': ('in s,C1 in V,C2 in V\n', ',.', 'utf-8', ('C1 in V', 'C2 in V'), 'V',
+                           1e3),
+    'decimal commas': ('Time;A;B\n(us);(g);(g)\n', ';,', 'utf-8', ('A', 'B'), 'g', 1e9),
+    'tabs': ('Rate\t1000\nTime [\u00b5s]\tA [m/s\u00b2]\tB\n', '\t,', 'latin-1',
+             ('A [m/s\u00b2]', 'B'), 'm/s\u00b2', 1e9),
+    'utf-16': ('Time [s]\tA [g]\tB\n', '\t.', 'utf-16', ('A [g]', 'B'), 'g', 1e3),
+    'quotes': ('"t","A","B"\n', ',.', 'utf-8', ('A', 'B'), '', 1e3)}
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_csv_of_instruments(tmp_path, name):
+    above, marks, coding, names, unit, rate = TABLES[name]
+    rows = ''.join(marks[0].join(row).replace('.', marks[1]) + '\n' for row in ROWS)
+    (tmp_path / 'scope.csv').write_bytes((above + rows).encode(coding))
+    opened = read(tmp_path / 'scope.csv')
+    assert opened.channel_names == names
+    assert opened.units[0] == unit
+    assert opened.sample_rate == pytest.approx(rate)
+    np.testing.assert_allclose(opened.read(), np.array(ROWS, float)[:, 1:].T)
+    assert len(opened.remarks) == ('preamble' in name or name == 'tabs')
+    opened = read(tmp_path / 'scope.csv', vibration_channels=names[1:], tach_channel=names[0])
+    np.testing.assert_allclose(opened.read_tach(), np.array(ROWS, float)[:, 1])
+
+
+def test_csv_with_a_preamble_beside_the_samples(tmp_path):
+    keys = [('Record Length', '40'), ('Sample Interval', '1e-3'), *[('', '')] * 38]
+    (tmp_path / 'scope.csv').write_text(''.join(
+        f'{",".join(key)},,{",".join(row)},\n' for key, row in zip(keys, ROWS)))
+    with pytest.raises(RecordingError, match=r'no time column .* say: Sample Interval,1e-3'):
+        read(tmp_path / 'scope.csv')
+    opened = read(tmp_path / 'scope.csv', time_column='3')
+    assert (opened.channels, opened.samples) == (2, 40)
+    assert opened.sample_rate == pytest.approx(1e3)
+
+
+def test_csv_whose_rows_are_numbered(tmp_path):
+    (tmp_path / 'scope.csv').write_text(
+        'X,CH1,Start,Increment,\nSequence,Volt,-6e-3,2e-6\n' + ''.join(
+            f'{k},{row[1]},,\n' for k, row in enumerate(ROWS)))
+    with pytest.raises(RecordingError, match=r'give the sample_rate; .*Increment.*,2e-6'):
+        read(tmp_path / 'scope.csv')
+    opened = read(tmp_path / 'scope.csv', vibration_channels='CH1', sample_rate=5e5)
+    assert (opened.channels, opened.samples, opened.units) == (1, 40, ('Volt',))
+
+
+@pytest.mark.parametrize('place', [0, 1, 2, 3, 20])
+def test_csv_with_a_bad_row_is_not_shortened(tmp_path, place):
+    rows = [','.join(row) for row in ROWS]
+    rows[place] = 'x,1.5,2.5'
+    (tmp_path / 'bad.csv').write_text('time,a,b\n' + '\n'.join(rows))
+    with pytest.raises(RecordingError, match=r"could not convert string 'x'|no time column"):
+        read(tmp_path / 'bad.csv').read()
+
+
 @pytest.mark.parametrize(('text', 'options', 'message'), [
     ('a,b\n1,2\n', {}, 'no time column among a, b'),
     ('time,a\n0,1\n0,2\n', {}, 'sort the rows by time'),
@@ -662,9 +726,12 @@ def test_npz_that_is_cut_off_says_so(recording, tmp_path):
         read(tmp_path / 'cut.npz')
 
 
-def test_a_table_of_a_million_columns_gets_a_short_line(tmp_path):
+def test_a_table_of_a_hundred_thousand_columns_gets_a_short_line(tmp_path):
     path = tmp_path / 'wide.csv'
     path.write_text('1,' * 1_000_000 + '1\n')
+    with pytest.raises(RecordingError, match='longer than'):
+        read(path, sample_rate=1.0)
+    path.write_text('1,' * 100_000 + '1\n')
     with pytest.raises(RecordingError, match='give 1 to 4096 channels'):
         read(path, sample_rate=1.0)
     with pytest.raises(RecordingError, match='no time column') as refused:

@@ -11,12 +11,10 @@
 """
 Recordings in `.csv` files: one row a sample, read in blocks.
 
-Fields are separated by comma, semicolon or tab; with semicolons a comma is a decimal point. A
-first row that is not numeric has the names of the columns, otherwise these are 0, 1, ...
+What a file holds is told by its structure (`csv_layout`): lines above the samples, names, units.
 """
 
 from collections.abc import Iterator
-import csv
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -25,10 +23,8 @@ from typing import TextIO
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.csv_layout import CsvLayout, layout_of, MAX_LINE
 from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
-
-_MAX_LINE = 1 << 20
-_TIME_NAMES = ('time', 't', 'time_s', 'time [s]', 'time (s)')
 
 
 @dataclass(frozen=True)
@@ -41,8 +37,7 @@ class CsvSource:
     """
 
     path: Path
-    delimiter: str
-    has_header: bool
+    layout: CsvLayout
     columns: tuple[int, ...]
     samples: int
     times: int | None = None
@@ -58,11 +53,11 @@ class CsvSource:
         """Iterate over `channel` x `sample` blocks."""
         wanted = self.columns if self.times is None else (*self.columns, self.times)
         start = 0
-        with recording_errors(self.path), _open(self.path) as file:
-            lines = _rows(file, self.delimiter, self.has_header)
+        with recording_errors(self.path), _open(self.path, self.layout) as file:
+            lines = _rows(file, self.layout)
             while start < self.samples:
                 count = min(samples_per_block, self.samples - start)
-                block = _parse(islice(lines, count), self.delimiter, wanted, start)
+                block = _parse(islice(lines, count), self.layout, wanted, start)
                 if not len(block):
                     raise RecordingError(f'ends at row {start} of {self.samples}: the file was '
                                          'cut while it was read; open it again')
@@ -72,6 +67,7 @@ class CsvSource:
                 start += len(block)
 
     def _check_times(self, times: FloatArray, start: int) -> None:
+        times = times * self.layout.time_unit
         places = (times - self.start_time) * self.sample_rate
         astray = np.flatnonzero(~(abs(places - start - np.arange(len(times))) < 0.5))
         if astray.size:
@@ -90,25 +86,20 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
     if there is neither, or a row is not numeric.
     """
     with recording_errors(path):
-        with _open(path) as file:
-            first = file.readline(_MAX_LINE).strip()
-        delimiter = next((mark for mark in ';\t,' if mark in first), ',')
-        names = [name.strip() for name in next(csv.reader([first], delimiter=delimiter), [])]
-        has_header = not all(_is_number(name, delimiter) for name in names)
-        if not has_header:
-            names = [str(column) for column in range(len(names))]
+        layout = layout_of(path)
+        names = list(layout.names)
         channel_map = channel_map.named(names)
-        time = channel_map.time or next((n for n in names if n.lower() in _TIME_NAMES), '')
-        wanted = {*channel_map.vibration} or {*names} - {time, ''}  # none: a delimiter too many
+        layout = layout.with_time(channel_map.time)
+        time = '' if layout.time is None else names[layout.time]
+        wanted = {*channel_map.vibration} or {names[k] for k in layout.used} - {time, ''}
         if channel_map.tach:
             wanted.add(channel_map.tach)
         columns = tuple(k for k, name in enumerate(names) if name in wanted)
         if not columns:
             raise RecordingError(f'no column of vibration among {", ".join(names)}: name it with '
                                  'vibration_channels')
-        times = names.index(time) if time else None
-        cut, samples, start_time, end_time = _extent(path, delimiter, has_header, len(names),
-                                                     times)
+        times = layout.time
+        cut, samples, start_time, end_time = _extent(path, layout)
         rate = sample_rate
         if times is not None and samples > 1:
             if not end_time > start_time:
@@ -123,72 +114,66 @@ def open_csv(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
         if rate is None:
             raise RecordingError(
                 f'no time column among {", ".join(names)}: give its name as time_column, '
-                'or give the sample_rate')
-        source = CsvSource(path, delimiter, has_header, columns, samples, times, start_time, rate)
-        return channel_map.select(Recording(
-            source, rate, start_time=start_time,
-            channel_names=tuple(names[column] for column in columns),
-            remarks=(f'the file ends in the middle of row {samples}: it was read up to there',)
+                f'or give the sample_rate{layout.hint}')
+        source = CsvSource(path, layout, columns, samples, times, start_time, rate)
+        remarks = (*layout.remarks, *([
+            f'the file ends in the middle of row {samples}: it was read up to there']
             if cut else ()))
+        return channel_map.select(Recording(
+            source, rate, start_time=start_time, remarks=remarks,
+            channel_names=tuple(names[column] for column in columns),
+            units=tuple(layout.units[column] for column in columns)))
 
 
-def _open(path: Path) -> TextIO:
-    return open(path, encoding='utf-8-sig', newline=None)
+def _open(path: Path, layout: CsvLayout) -> TextIO:
+    return open(path, encoding=layout.encoding, errors='replace', newline=None)
 
 
-def _rows(file: TextIO, delimiter: str, has_header: bool) -> Iterator[str]:
+def _rows(file: TextIO, layout: CsvLayout) -> Iterator[str]:
     """Iterate over the rows with data, with decimal points."""
-    if has_header:
-        file.readline(_MAX_LINE)
-    while line := file.readline(_MAX_LINE):
-        if not line.endswith('\n') and len(line) >= _MAX_LINE:
-            raise RecordingError(f'a line is longer than {_MAX_LINE} characters: give a table '
+    for _ in range(layout.skipped):
+        file.readline(MAX_LINE)
+    while line := file.readline(MAX_LINE):
+        if not line.endswith('\n') and len(line) >= MAX_LINE:
+            raise RecordingError(f'a line is longer than {MAX_LINE} characters: give a table '
                                  'with one sample per row')
         if not line.isspace():
-            yield line.replace(',', '.') if delimiter == ';' else line
+            yield layout.pointed(line)
 
 
-def _parse(lines: Iterator[str], delimiter: str, columns: tuple[int, ...],
+def _parse(lines: Iterator[str], layout: CsvLayout, columns: tuple[int, ...],
            start: int) -> FloatArray:
     """Return rows as `row` x `column`, without rows an empty array."""
     rows = list(lines)
     if not rows:
         return np.empty((0, len(columns)))
     try:
-        return np.loadtxt(rows, delimiter=delimiter, usecols=columns, ndmin=2, comments=None,
-                          dtype=np.float64)
+        return np.loadtxt(rows, delimiter=layout.delimiter, usecols=columns, ndmin=2,
+                          comments=None, dtype=np.float64, quotechar='"')
     except ValueError as error:
         reason = str(error).split(';')[0]
         raise RecordingError(f'rows {start} to {start + len(rows)}: {reason}; give numbers '
                              'only') from error
 
 
-def _extent(path: Path, delimiter: str, has_header: bool, fields: int,
-            times: int | None) -> tuple[bool, int, float, float]:
+def _extent(path: Path, layout: CsvLayout) -> tuple[bool, int, float, float]:
     """
     Return whether the last row is cut off, the number of whole rows, and the first and last time.
 
-    Rows have so many `fields`. The times are 0 without a time column.
+    The times are 0 without a time column.
     """
     count, first, last, before = 0, '', '', ''
-    with _open(path) as file:
-        for line in _rows(file, delimiter, has_header):
+    with _open(path, layout) as file:
+        for line in _rows(file, layout):
             before, last, first = last, line, first or line
             count += 1
-    cut = count > 1 and not last.endswith('\n') and last.count(delimiter) + 1 < fields
+    cut = count > 1 and not last.endswith('\n') and (
+        last.count(layout.delimiter) + 1 < layout.fields)
     if cut:
         last, count = before, count - 1
-    if times is None or not count:
+    if layout.time is None or not count:
         return cut, count, 0.0, 0.0
-    ends = _parse(iter([first, last]), delimiter, (times,), 0)
+    ends = layout.time_unit * _parse(iter([first, last]), layout, (layout.time,), 0)
     if not np.isfinite(ends).all():
         raise RecordingError(f'time runs from {ends[0, 0]} to {ends[1, 0]} s: must be finite')
     return cut, count, float(ends[0, 0]), float(ends[1, 0])
-
-
-def _is_number(text: str, delimiter: str) -> bool:
-    try:
-        float(text.replace(',', '.') if delimiter == ';' else text)
-    except ValueError:
-        return False
-    return True
