@@ -79,6 +79,9 @@ setup(
         'bags': ['rosbags>=0.10'],
         'fleet': ['distributed>=2023.5'],
         'mat73': ['h5py>=3.7'],
+        'mdf': ['asammdf>=7.3'],
+        'tdms': ['npTDMS>=1.4'],
+        'uff': ['pyuff>=2.1'],
         'docs': ['myst-parser>=2,<6', 'sphinx>=7.2,<10'],
         'test': [
             'catkin_pkg',

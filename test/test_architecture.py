@@ -38,7 +38,9 @@ CORE = {
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {
         'effects', 'errors', 'parameter_file', 'parameters', 'prediction', 'pulses'},
-    'recordings': SCIENCE | {'errors', 'h5py', 'parameters', 'pulses', 'rosbags', 'samples'},
+    'recordings': SCIENCE | {
+        'asammdf', 'errors', 'h5py', 'nptdms', 'parameters', 'pulses', 'pyuff', 'rosbags',
+        'samples'},
     'simulation': SCIENCE | {'errors'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',

@@ -30,8 +30,10 @@ from test_architecture import is_ros, MODULES, needs
 
 ROOT = Path(__file__).resolve().parents[1]
 NAME = 'sa_jitter_ros'
-PYPI_NAMES = {'yaml': 'PyYAML'}
-OPTIONAL = {'distributed': 'fleet', 'h5py': 'mat73', 'rosbags': 'bags'}  # package to extra
+PYPI_NAMES = {'nptdms': 'npTDMS', 'yaml': 'PyYAML'}
+OPTIONAL = {  # package to extra
+    'asammdf': 'mdf', 'distributed': 'fleet', 'h5py': 'mat73', 'nptdms': 'tdms', 'pyuff': 'uff',
+    'rosbags': 'bags'}
 # Keys of rosdep that are Debian packages of Ubuntu 24.04 or of ROS 2, no names of pip.
 ROSDEP_KEYS = {
     'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-dev',
@@ -120,7 +122,8 @@ def test_setup_requires_what_is_imported_from_pypi(setup, packages):
             for name in packages - set(OPTIONAL) if not is_ros(name)} == required
     for package, extra in OPTIONAL.items():
         assert package in packages
-        assert re.match(r'[\w-]+', setup['extras_require'][extra][0])[0] == package
+        assert re.match(r'[\w-]+', setup['extras_require'][extra][0])[0] == PYPI_NAMES.get(
+            package, package)
 
 
 def test_every_script_has_a_main(scripts):

@@ -42,7 +42,8 @@ def make_parser() -> Parser:
     parser = Parser(prog='average', description=__doc__,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='.npz, .mat, .wav, .csv or rosbag2, or a folder of them')
+                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2, or a '
+                        'folder of them')
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine; without: settings are chosen from '
                         'each recording')

@@ -44,8 +44,8 @@ def make_parser() -> Parser:
     parser = Parser(prog='check_keyphasor', description=__doc__,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recording', type=Path, metavar='RECORDING',
-                        help='.npz, .mat, .wav, .csv or rosbag2; a .npz or .mat with pulse times '
-                        'only is examined without vibration')
+                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2; a .npz '
+                        'or .mat with pulse times only is examined without vibration')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for keyphasor.json, machine.yaml and the figures')
     parser.add_argument('--teeth', type=int, nargs='+', default=(), metavar='N',

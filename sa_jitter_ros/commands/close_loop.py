@@ -37,7 +37,8 @@ def make_parser() -> Parser:
     parser = Parser(prog='close_loop', description=__doc__,
                     formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('recordings', type=Path, nargs='+', metavar='RECORDING',
-                        help='recordings of one machine: .npz, .mat, .wav, .csv or rosbag2; or '
+                        help='recordings of one machine: .npz, .mat, .wav, .csv, .tdms, .mf4, '
+                        '.uff or rosbag2; or '
                         'folders of recordings')
     parser.add_argument('--declared', '--params', type=Path, required=True, metavar='MODEL.yaml',
                         help='ROS parameter file of jitter_predictor, or of the whole machine')

@@ -294,7 +294,8 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = Parser(
         prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
-                        help='.npz, .mat, .wav, .csv or rosbag2; without: a simulated gearbox')
+                        help='.npz, .mat, .wav, .csv, .tdms, .mf4, .uff or rosbag2; without: '
+                        'a simulated gearbox')
     parser.add_argument('--keyphasor-rate', type=float, default=0.0, metavar='HZ',
                         help='round pulse times up to a clock of this rate, as if the keyphasor '
                         'had been sampled with it')

@@ -70,7 +70,8 @@ def recordings_of(options: argparse.Namespace) -> tuple[Found, ...]:
     found = find_recordings(options.recordings, leave_out=options.output)
     if not found:
         raise ParameterError(f'{", ".join(map(str, options.recordings))}: no recording in this '
-                             'folder: give one with .npz, .mat, .wav, .csv or rosbag2')
+                             'folder: give one with .npz, .mat, .wav, .csv, .tdms, .mf4, .uff or '
+                             'rosbag2')
     return found
 
 

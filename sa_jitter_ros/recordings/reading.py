@@ -22,11 +22,16 @@ from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.csv_format import open_csv
 from sa_jitter_ros.recordings.fields import given_fields, require_fields, SAMPLE_FIELDS
 from sa_jitter_ros.recordings.mat_format import open_mat
+from sa_jitter_ros.recordings.mdf_format import open_mdf
 from sa_jitter_ros.recordings.npz_format import open_npz
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
+from sa_jitter_ros.recordings.tdms_format import open_tdms
+from sa_jitter_ros.recordings.uff_format import open_uff
 from sa_jitter_ros.recordings.wav_format import open_wav
 
-SUFFIXES = ('.npz', '.mat', '.wav', '.csv', '.mcap', '.db3')
+_LISTS = {'.csv': open_csv, '.tdms': open_tdms, '.mf4': open_mdf, '.mdf': open_mdf,
+          '.uff': open_uff, '.unv': open_uff}  # what opens files that are lists of channels
+SUFFIXES = ('.npz', '.mat', '.wav', *_LISTS, '.mcap', '.db3')
 
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
@@ -38,7 +43,8 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
     Parameters
     ----------
     path
-        `.npz`, `.mat`, `.wav`, `.csv`, `.mcap` or `.db3` file, or a rosbag2 folder.
+        `.npz`, `.mat`, `.wav`, `.csv`, `.tdms`, `.mf4`, `.mdf`, `.uff`, `.unv`, `.mcap` or `.db3`
+        file, or a rosbag2 folder.
     acquisition
         Number of the acquisition, from 0, in a file with several (`Recording.acquisitions`).
     keyphasor
@@ -114,8 +120,8 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
             else:
                 rate = given.pop('sample_rate', None)
                 recording = replace(
-                    open_csv(path, channel_map=channel_map, sample_rate=rate)
-                    if suffix == '.csv' else open_bag(
+                    _LISTS[suffix](path, channel_map=channel_map, sample_rate=rate)
+                    if suffix in _LISTS else open_bag(
                         path, channel_map=channel_map, sample_rate=rate, keyphasor=keyphasor),
                     **given)
         if not 0 <= acquisition < recording.acquisitions:

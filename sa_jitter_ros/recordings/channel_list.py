@@ -1,0 +1,173 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Recordings in files that hold a list of channels, each with its own name, unit, rate and start.
+
+Formats of measuring systems are such lists (`tdms_format`, `mdf_format`, `uff_format`).
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.channel_map import ChannelMap, find_channel
+from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+
+_SAME_START = 0.01  # of a sample
+_ROUNDED = 1e-4  # relative, of a rate in a file
+_UNEVEN = 0.5  # of a sample, by which times may be off a constant rate
+_MOST_NAMED = 12  # channels in a message
+
+
+@dataclass(frozen=True)
+class Channel:
+    """
+    One channel of a file.
+
+    `names` are what it may be called, the shortest first; `rate` is in Hz, None where the file
+    does not say; `start` in s; `read` returns the samples from one index to another.
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    rate: float | None
+    start: float
+    samples: int
+    read: Callable[[int, int], FloatArray]
+
+
+@dataclass(frozen=True)
+class ChannelSource:
+    """The samples of channels that were sampled together."""
+
+    path: Path
+    parts: tuple[Channel, ...]
+
+    @property
+    def channels(self) -> int:
+        """Return the number of channels."""
+        return len(self.parts)
+
+    @property
+    def samples(self) -> int:
+        """Return the number of samples of each channel."""
+        return self.parts[0].samples
+
+    def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
+        """Iterate over `channel` x `sample` blocks."""
+        with recording_errors(self.path):
+            for start in range(0, self.samples, samples_per_block):
+                stop = min(start + samples_per_block, self.samples)
+                rows = [np.asarray(part.read(start, stop), np.float64) for part in self.parts]
+                if any(row.shape != (stop - start,) for row in rows):
+                    raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
+                                         'truncated or broken; copy it again')
+                yield np.stack(rows)
+
+
+def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: ChannelMap,
+                 sample_rate: float | None, left_out: Sequence[str] = ()) -> Recording:
+    """
+    Return the recording of some channels of a file, in the roles that the map gives them.
+
+    Without names of vibration it is all channels of one rate, start and length, those that hold
+    the most samples. The tach may have a rate of its own. `sample_rate` is used for channels
+    without one, and in place of one that is rounded. `left_out` says why
+    other channels of the file are none, one sentence each.
+
+    >>> acc, key = (Channel((name,), 'g', rate, 0.0, int(rate), lambda start, stop:
+    ...             np.zeros(stop - start)) for name, rate in (('acc', 100.0), ('key', 500.0)))
+    >>> recording_of(Path(), [acc, key], channel_map=ChannelMap(tach='key'), sample_rate=None)
+    Recording('.', 1 channel of 100 samples at 100 Hz (1 s), tach at 500 Hz, ratio 1)
+    """
+    channels = [channel for channel in channels if channel.samples]
+    names = _unique([channel.names for channel in channels])
+    if not channels:
+        raise RecordingError('; '.join(['no channel with samples at a constant rate',
+                                        *left_out[:_MOST_NAMED]]))
+    try:
+        tach = find_channel(names, channel_map.tach) if channel_map.tach else None
+        chosen = [find_channel(names, entry) for entry in channel_map.vibration]
+    except RecordingError as error:
+        raise RecordingError('; '.join([str(error), *left_out[:_MOST_NAMED]])) from None
+    remarks = list(left_out)
+    others = [k for k in range(len(channels)) if k != tach]
+    if not chosen and others:
+        together = Counter(_clock(channels[k]) for k in others)
+        most = max(together, key=lambda clock: together[clock] * clock[2])
+        chosen = [k for k in others if _clock(channels[k]) == most]
+        if len(together) > 1:
+            remarks.append(
+                'left out, because they were not sampled with '
+                f'{names[chosen[0]]}: ' + _listed([names[k] for k in others if k not in chosen]))
+    if not chosen:
+        raise RecordingError(f'the only channel, {channel_map.tach}, is the tach: name a channel '
+                             'of vibration')
+    if len({_clock(channels[k]) for k in chosen}) > 1:
+        raise RecordingError('channels of different rates, starts or lengths: ' + _listed([
+            f'{names[k]} {channels[k].samples} samples at {channels[k].rate or 0.0:g} Hz'
+            for k in chosen]) + '; choose those that were sampled together')
+    first = channels[chosen[0]]
+    rate = sample_rate or first.rate
+    if first.rate and rate and abs(rate / first.rate - 1.0) > _ROUNDED:
+        raise RecordingError(f'sample_rate {rate:.10g} Hz given, but the file says '
+                             f'{first.rate:.10g} Hz: leave it out')
+    if rate is None:
+        raise RecordingError(f'{names[chosen[0]]} has no sampling rate in the file: give '
+                             'sample_rate')
+    tach_source, tach_rate = None, None
+    if tach is not None:
+        stated = channels[tach].rate
+        tach_rate = rate if stated is None or stated == first.rate else stated
+        if abs(channels[tach].start - first.start) * tach_rate > _SAME_START:
+            raise RecordingError(
+                f'{names[tach]} begins at {channels[tach].start:.9g} s and {names[chosen[0]]} at '
+                f'{first.start:.9g} s: export channels that begin together')
+        tach_source = ChannelSource(path, (channels[tach],))
+    return Recording(
+        ChannelSource(path, tuple(channels[k] for k in chosen)), rate, start_time=first.start,
+        channel_names=tuple(names[k] for k in chosen),
+        units=tuple(channels[k].unit for k in chosen), tach=tach_source, tach_rate=tach_rate,
+        remarks=tuple(remarks), path=str(path))
+
+
+def constant_rate(times: FloatArray) -> tuple[float, float] | None:
+    """
+    Return rate (Hz) and start (s) of sample times, None if they are at no constant rate.
+
+    >>> constant_rate(np.array([1.0, 1.1, 1.2, 1.3]))
+    (10.0, 1.0)
+    >>> constant_rate(np.array([1.0, 1.1, 1.6, 1.7])) is None
+    True
+    """
+    if times.size < 2 or not np.isfinite(times).all() or not times[-1] > times[0]:
+        return None
+    rate = (times.size - 1) / float(times[-1] - times[0])
+    off = np.abs((times - times[0]) * rate - np.arange(times.size))
+    return (float(f'{rate:.12g}'), float(times[0])) if float(off.max()) < _UNEVEN else None
+
+
+def _clock(channel: Channel) -> tuple[float | None, float, int]:
+    return channel.rate, channel.start, channel.samples
+
+
+def _unique(names: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return for each channel the first of its names that no other one bears, else its number."""
+    counts = Counter(name for several in names for name in dict.fromkeys(several))
+    return [next((name for name in several if name and counts[name] == 1), str(number))
+            for number, several in enumerate(names)]
+
+
+def _listed(texts: Sequence[str]) -> str:
+    return ', '.join(texts[:_MOST_NAMED]) + (', ...' if len(texts) > _MOST_NAMED else '')

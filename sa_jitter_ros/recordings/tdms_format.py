@@ -1,0 +1,58 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Recordings in `.tdms` files of LabVIEW, read by npTDMS, which is an optional dependency.
+
+A channel is sampled at 1/`wf_increment` from `wf_start_offset` on, and bears its own name, or
+`group/name` where several groups have one of that name.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.errors import RecordingError
+from sa_jitter_ros.recordings.channel_list import Channel, recording_of
+from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+
+
+def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
+    """
+    Open a `.tdms` file; `sample_rate` is used for channels whose rate the file does not say.
+
+    Raises RecordingError if npTDMS is not installed or the file is broken.
+    """
+    with recording_errors(path):
+        try:
+            import nptdms
+        except ImportError:
+            raise RecordingError('a .tdms file is read with npTDMS, which is not installed: pip '
+                                 "install 'sa_jitter_ros[tdms]' or npTDMS") from None
+        with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
+            channels = [_channel(path, group.name, channel)
+                        for group in file.groups() for channel in group.channels()
+                        if channel.dtype is not None and channel.dtype.kind in 'fiub']
+        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate)
+
+
+def _channel(path: Path, group: str, channel: Any) -> Channel:
+    step = float(channel.properties.get('wf_increment', 0.0))
+
+    def read(start: int, stop: int) -> FloatArray:
+        import nptdms
+        with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
+            return np.asarray(file[group][channel.name][start:stop], np.float64)
+
+    return Channel((channel.name, f'{group}/{channel.name}'),
+                   str(channel.properties.get('unit_string', '')),
+                   1.0 / step if step > 0.0 else None,
+                   float(channel.properties.get('wf_start_offset', 0.0)), len(channel), read)
