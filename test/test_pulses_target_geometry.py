@@ -219,7 +219,10 @@ def test_the_vibration_tells_late_marks_from_a_ripple_of_the_speed(rng):
 
 @pytest.mark.parametrize(('options', 'words'), [
     ({'target_geometry': 'given'}, 'target_angles has 0 angles for a target of 4 marks'),
-    ({'target_geometry': 'given', 'target_angles': [0.0, 0.0, 0.0, 0.9]}, 'must be within 0.7854'),
+    ({'target_geometry': 'given', 'target_angles': [0.0, 0.8, -0.8, 0.0]},
+     'mark 2, -0.8 rad late, is not behind the mark before'),
+    ({'target_geometry': 'given', 'target_angles': [0.0, 0.0, np.nan, 0.0]},
+     'mark 2, nan rad late, is not behind'),
     ({'target_geometry': 'measure'}, "target_geometry 'measure'"),
     ({'target_geometry': 'given', 'target_angles': [0.0] * 4, 'missing_teeth': 1},
      'target_angles has 4 angles for a target of 3 marks')])

@@ -20,7 +20,7 @@ from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 
-_MOST_CYCLES, _AVERAGES = 100, 8
+_LEAST_CYCLES, _MOST_CYCLES, _AVERAGES = 5, 100, 8  # close_loop compares no fewer cycles
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
 _DEFAULT_ORDERS = (1.0, 2.0, 3.0)
 _SHAFT = 'shaft'
@@ -38,7 +38,9 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
     width = math.sqrt(12.0) * (std or check.fitted.scatter)
     rounded = check.from_waveform or tick > _ROUNDED * width
     rate = clock if rounded else 1.0 / width
-    cycles = int(np.clip(check.fitted.turns // _AVERAGES, 2, _MOST_CYCLES))
+    turns = check.fitted.turns
+    cycles = int(np.clip(turns // _AVERAGES, _LEAST_CYCLES if turns > _LEAST_CYCLES else 2,
+                         _MOST_CYCLES))
     common: dict[str, Any] = {
         'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0),
         f'{_SHAFT}.orders': [float(g) for g in found['orders'] or _DEFAULT_ORDERS],

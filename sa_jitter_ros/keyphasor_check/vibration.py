@@ -105,12 +105,15 @@ def path_delay(averages: Sequence[Average], ratio: float) -> tuple[Delay | None,
         return None, 'the speed hardly changes: record a run-up or several speeds'
     amplitudes = np.array([item.amplitudes for item in averages])
     noise = np.array([item.noise for item in averages])
-    with np.errstate(divide='ignore', invalid='ignore'):
-        clear = np.nanmin(np.abs(amplitudes) / noise, axis=0)
+    size = np.abs(amplitudes)
+    # An order that was refused in one of the averages has no amplitude there: it is not clear.
+    clear = np.nan_to_num(np.divide(
+        size, noise, out=np.where(size > 0.0, np.inf, 0.0), where=noise != 0.0),
+        posinf=np.inf).min(axis=0)
     found, errors, orders, turned = [], [], [], []
     centred = speeds - speeds.mean()
     for place, order in enumerate(averages[0].orders):
-        channel = int(np.argmax(np.nan_to_num(clear[:, place])))
+        channel = int(np.argmax(clear[:, place]))
         if not clear[channel, place] > _CLEAR:
             continue
         angle = np.unwrap(np.angle(amplitudes[:, channel, place])) / (

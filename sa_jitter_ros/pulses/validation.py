@@ -313,9 +313,11 @@ def _given_angles(mode: str, angles: Sequence[float], marks: int, teeth: int
     if len(angles) != marks:
         raise ParameterError(f'target_angles has {len(angles)} angles for a target of {marks} '
                              f'marks: give one for each, in rad')
-    most = math.pi / teeth
-    for angle in angles:
-        if not abs(angle) < most:
-            raise ParameterError(f'target_angles {angle} rad must be within {most:.4g} rad, half '
-                                 f'the angle between the {teeth} marks')
+    pitch = 2.0 * math.pi / teeth
+    for mark, angle in enumerate(angles):
+        step = pitch + angle - angles[mark - 1]
+        if not 0.0 < step < 2.0 * math.pi:  # also for NaN
+            raise ParameterError(f'target_angles: mark {mark}, {angle} rad late, is not behind '
+                                 f'the mark before, {angles[mark - 1]} rad late and '
+                                 f'{pitch:.4g} rad away: give the angles in order, in rad')
     return angles
