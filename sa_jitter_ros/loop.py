@@ -36,6 +36,7 @@ from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.unit_check import likely_mistake
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import channel_faults, is_lost, without_channels
+from sa_jitter_ros.recordings.recording import FloatArray
 from sa_jitter_ros.report.report import parameters_text, report, summary
 
 Source = str | os.PathLike[str] | Recording
@@ -212,7 +213,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
         observations: list[Observation] = []
         for name, recording in zip(names, opened):
             show(f'reading {name}')
-            for doubt in doubts(recording, recording.pulse_times, orders=model.orders,
+            for doubt in doubts(recording, _pulses(recording), orders=model.orders,
                                 ratio=model.ratio,
                                 pulses_per_revolution=model.pulses_per_revolution,
                                 pulses_per_trigger=model.pulses_per_trigger or None,
@@ -250,6 +251,14 @@ def _usable(recordings: Sequence[Recording], names: Sequence[str]
             faults.append(f'{name}: {recording.channel_names[channel]} {reason}'
                           + (' and is left out' if is_lost(reason) else ''))
     return [without_channels(recording, lost) for recording in recordings], faults
+
+
+def _pulses(recording: Recording) -> FloatArray | None:
+    """Return the pulse times of a recording, wherever they are; None where there are none."""
+    try:
+        return recording.keyphasor_pulses()
+    except SaJitterError:
+        return None
 
 
 def _mistake(recording: Recording) -> str:

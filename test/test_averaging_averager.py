@@ -223,6 +223,32 @@ def test_a_likely_mistake_is_named_beside_an_average():
         sa.average(VIBRATION, RATE, np.arange(0.0, 400.5, 0.5))
 
 
+@pytest.mark.parametrize(('factor', 'text'), [(0.5, 'half its rate: is it sampled at 5000'),
+                                              (2.0, 'twice its rate: is it sampled at 5000')])
+def test_another_sampling_rate_is_named(rng, factor, text):
+    time = np.arange(20_000) / 5e3
+    vibration = np.cos(2.0 * np.pi * 8.0 * 25.0 * time) + 0.1 * rng.normal(size=time.size)
+    with pytest.warns(sa.DataWarning) as caught:
+        sa.average(vibration, factor * 5e3, np.arange(1, 100) / 25.0)
+    assert sum(text in str(item.message) for item in caught) == 1
+
+
+@pytest.mark.parametrize('cycles', [None, 10])
+def test_orders_without_a_line_are_named_and_no_others(rng, cycles):
+    time = np.arange(40_000) / 5e3
+    angle = 2.0 * np.pi * (25.0 * time + 0.3 * time**2)  # in a run-up
+    pulses = np.interp(2.0 * np.pi * np.arange(1, 200), angle, time)
+    vibration = 0.1 * np.cos(23.0 * angle) + rng.normal(size=time.size)
+    for orders in ([23.0], [23.0, 24.0], [1.0, 23.0, 46.0]):
+        sa.average(vibration, 5e3, pulses, orders=orders, trigger_cycles=cycles)
+    sa.average(vibration, 5e3, pulses, trigger_cycles=cycles)
+    with pytest.warns(sa.DataWarning, match=r'none of the orders 24, 48 stands above its noise'):
+        sa.average(vibration, 5e3, pulses, orders=[24.0, 48.0], trigger_cycles=cycles)
+    sa.average(vibration, 5e3, pulses, orders=[24.0], trigger_cycles=3)  # these tell no noise
+    sa.average(0.0 * vibration, 5e3, pulses, orders=[24.0])
+
+
+@pytest.mark.filterwarnings('ignore:none of the orders 2, 20, 30')
 def test_orders_from_the_nyquist_frequency_on_are_named():
     with pytest.warns(sa.DataWarning, match='no amplitude of orders 20, 30: the shaft turns at 50 '
                       'Hz, and vibration sampled at 2000 Hz shows orders below 20 only'):

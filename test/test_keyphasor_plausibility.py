@@ -237,6 +237,26 @@ def test_loop_names_orders_that_are_not_there(recording):
         loop(recording, {**DECLARED, 'orders': [5, 11]})
 
 
+def test_loop_names_orders_that_are_not_there_without_pulse_times(recording):
+    pulses = recording.pulse_times
+    with pytest.warns(DataWarning, match='none of the orders 5, 11 stands above'):
+        loop(replace(recording, pulse_times=None, tach_rate=None, reference_pulse_times=pulses),
+             {**DECLARED, 'orders': [5, 11]})
+
+
+@pytest.mark.parametrize(('orders', 'text'), [
+    ([23, 46, 69], ''), ([24, 48, 72], 'no line beside 23, 46, 69, each at least 5 times'),
+    ([24], ''), ([24, 46], ''), ([23, 24], ''), ([26, 52, 78], 'none of'), ([21, 42, 63], 'beside 23')])
+def test_harmonics_beside_a_larger_family_are_named(rng, orders, text):
+    turns = np.cumsum(np.full(100_000, 20.0)) / 5e3
+    mesh = sum((1.0 + 0.1 * np.cos(2.0 * np.pi * turns) + 0.06 * np.cos(4.0 * np.pi * turns))
+               * np.cos(2.0 * np.pi * g * turns + g) for g in (23, 46, 69))
+    rig = Recording(ArraySource((mesh + 0.01 * rng.normal(size=turns.size))[None]), 5e3)
+    found = weak_orders(rig, np.arange(1, 399) / 20.0, orders, ratio=1.0,
+                        pulses_per_revolution=1, pulses_per_trigger=None, missing_teeth=0)
+    assert (text in found[0]) if text else found == ()
+
+
 @pytest.mark.parametrize(('marks', 'text'), [
     (1, ''), (2, 'pulses_per_revolution 1 instead of 2 all of them do'),
     (4, 'pulses_per_revolution 1 instead of 4 they are far larger')])

@@ -93,6 +93,7 @@ def test_arguments_of_a_wrong_type_are_named(function, arguments, text):
     assert text in str(caught.value)
 
 
+@pytest.mark.filterwarnings('ignore:none of the orders')
 def test_every_result_is_one_short_line_in_a_notebook():
     rate, orders = 5000.0, range(1, 41)
     vibration = np.random.default_rng(3).normal(0.0, 1.0, (3, 20_000))

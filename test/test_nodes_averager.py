@@ -387,6 +387,17 @@ def test_orders_and_shafts_beyond_nyquist(bench):
     assert 'shows orders below' in text
 
 
+def test_orders_that_hold_no_line_are_named_until_they_are_changed(bench):
+    b = bench(shaft__orders=[31.0, 37.0])
+    b.play(MACHINE, 4.0)
+    level, text, _ = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert text.startswith('lines of shaft: none of the orders 31, 37 stands above its noise')
+    assert b.set_parameter('shaft.orders', ORDERS)[0]
+    b.play(MACHINE, 4.0)
+    assert 'none of the orders' not in b.diagnostics()[1]
+
+
 # --- parameters ----------------------------------------------------------------------------------
 
 

@@ -26,12 +26,13 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
+from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
-from sa_jitter_ros.pulses.unit_check import likely_mistake
+from sa_jitter_ros.pulses.unit_check import likely_mistake, other_rate
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -272,11 +273,16 @@ def average(
             f'{pulses.size} pulses and vibration from {start:g} s to {end:g} s make '
             f'{counts["trigger_cycles"]} whole trigger cycles{wanted}: '
             + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
+    doubt = likely or other_rate(pulses, start, end, float(sample_rate))
     if discarded:
-        warnings.warn(f'{likely}; {discarded}' if likely else discarded, DataWarning, stacklevel=2)
+        warnings.warn(f'{doubt}; {discarded}' if doubt else discarded, DataWarning, stacklevel=2)
+    elif doubt:
+        warnings.warn(doubt, DataWarning, stacklevel=2)
     refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
     if refused:
         warnings.warn(refused, DataWarning, stacklevel=2)
+    if orders is not None and (none := without_lines(found)):
+        warnings.warn(none, DataWarning, stacklevel=2)
     return found
 
 

@@ -46,6 +46,9 @@ _CLEAR, _ABOVE = 4.0, 1.5
 _PLACES, _BY_CHANCE = 400, 0.05
 _OTHER_MARKS = (Fraction(1, 2), 2, Fraction(1, 3), 3, Fraction(1, 4), 4, Fraction(1, 8), 8)
 _LARGER, _FAR_LARGER = 0.7, 2.0
+# A family of harmonics beside the stated one: orders that may be those of a mesh, how near to a
+# multiple they are, and by how much the logarithm of each of their peaks is larger.
+_LEAST_MESH, _WHOLE, _BESIDE = 8, 1e-6, 1.6
 _MOST_VALIDATED = 100_000
 _UNUSED, _FEW = 0.25, 20  # of the time without a trigger cycle, and pulses in it
 _MOST_STRAYS = 0.05
@@ -141,7 +144,10 @@ def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
 def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float], *,
                 ratio: float, **target: Any) -> tuple[str, ...]:
     """
-    Return a sentence if no more orders stand above their noise than by chance, nothing else.
+    Return a sentence if the vibration shows other orders than these, nothing else.
+
+    So it does if no more of them stand above their noise than by chance, if they do with another
+    number of marks, or if they are the harmonics of a mesh beside those of a far larger one.
 
     An order stands where the spectrum over the angle has a peak; what leaks from its neighbours
     is none. So many peaks as there are anywhere in the spectrum are there by chance. `pulses`
@@ -193,6 +199,16 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
             return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} Hz '
                     f'and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead of '
                     f'{marks} {better} (check_keyphasor finds out)',)
+    base = round(min(orders))
+    if len(orders) < 2 or base < _LEAST_MESH or not all(
+            abs(order / base - round(order / base)) < _WHOLE for order in orders):
+        return ()
+    for miscounted in (base - 1, base + 1, base - 2, base + 2):
+        others = _sizes(*spectrum, places * (miscounted / base))
+        if np.all(others - sizes > _BESIDE):
+            larger_ones = ', '.join(f'{order * miscounted / base:g}' for order in orders[:6])
+            return (f'the orders {listed} hold no line beside {larger_ones}, each at least '
+                    f'{np.exp(_BESIDE):.0f} times as large: are those meant? Count the teeth',)
     return ()
 
 

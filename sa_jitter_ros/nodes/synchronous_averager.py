@@ -10,6 +10,7 @@
 
 """Node `synchronous_averager`: vibration and tach pulses in, synchronous averages out."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
@@ -21,6 +22,7 @@ from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, keyphasor_parameters, one_ratio, PARAMETERS, shaft_parameters, shaft_settings,
     streaming_averager)
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
+from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -34,6 +36,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 FloatArray = NDArray[np.float64]
 
+_LATEST = 6  # averages that tell whether orders hold lines
 MOST_SOURCES = 100  # names of keyphasors that are remembered
 
 
@@ -51,6 +54,7 @@ class SynchronousAverager(MonitoringNode):
             if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
                 raise one_ratio(values, name)
         self._shafts = {name: ShaftOutput(self, name) for name in names}
+        self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
         self._averager = streaming_averager(
             values, buffer_seconds=values['buffer_seconds'])
         self._check(values)
@@ -141,6 +145,10 @@ class SynchronousAverager(MonitoringNode):
             self._average_flow.came()
             self._shafts[name].publish(average)
             self.set_missing(f'orders of {name}', without_amplitude(average.refused))
+            if f'{name}.orders' in self.parameters.given:
+                self._latest[name].append(average)
+                self.set_missing(f'lines of {name}', without_lines(
+                    self._latest[name], fewest=_LATEST))
         speed = self._averager.take_speed() * revolutions
         if np.isfinite(speed):
             self._speed.publish(Float64(data=float(speed)))

@@ -22,6 +22,8 @@ _MUCH = 10.0  # pulses that span so many times the vibration are in another unit
 _FACTOR = 2.0  # by which spans may differ in the right unit
 # Spread of the logarithm of the spans: a tach is often shorter than the vibration, seldom longer.
 _SHORTER, _LONGER = 0.5, 0.1
+_FEW_REVOLUTIONS = 40  # pulses that tell a length
+_SAME_SPAN = 0.005  # relative, of lengths that are alike
 _EPOCH = 1e8  # s; later first pulses are counted since 1970
 
 
@@ -54,6 +56,28 @@ def likely_mistake(pulses: NDArray[Any], start: float, end: float, rate: float) 
     """
     found = find_mistakes(pulses, start, end, rate)
     return found[0].text if found else ''
+
+
+def other_rate(pulses: NDArray[Any], start: float, end: float, rate: float) -> str:
+    """
+    Return that the vibration may have half or twice the rate (Hz), '' if its length is another.
+
+    Its times would then be those of the pulses.
+
+    >>> other_rate(np.arange(0.0, 10.0, 0.05), 0.0, 20.0, 2.5e3)  # doctest: +ELLIPSIS
+    'the pulses span 9.95 s, the vibration spans 20 s, as with half its rate: ... 5000 Hz?'
+    """
+    times = pulses[np.isfinite(pulses)]
+    if times.size < _FEW_REVOLUTIONS:
+        return ''
+    span, duration = float(np.ptp(times)), end - start
+    room = 2.0 * float(np.median(np.diff(np.sort(times))))  # of the first and the last pulse
+    for factor, words in ((2.0, 'half'), (0.5, 'twice')):
+        beside = factor * (span + 0.5 * room) - duration
+        if abs(beside) < factor * (0.5 * room + _SAME_SPAN * span):
+            return (f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s, as with '
+                    f'{words} its rate: is it sampled at {factor * rate:.10g} Hz?')
+    return ''
 
 
 def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
