@@ -246,7 +246,8 @@ def test_loop_names_orders_that_are_not_there_without_pulse_times(recording):
 
 @pytest.mark.parametrize(('orders', 'text'), [
     ([23, 46, 69], ''), ([24, 48, 72], 'no line beside 23, 46, 69, each at least 5 times'),
-    ([24], ''), ([24, 46], ''), ([23, 24], ''), ([26, 52, 78], 'none of'), ([21, 42, 63], 'beside 23')])
+    ([24], ''), ([24, 46], ''), ([23, 24], ''), ([26, 52, 78], 'none of'),
+    ([21, 42, 63], 'beside 23')])
 def test_harmonics_beside_a_larger_family_are_named(rng, orders, text):
     turns = np.cumsum(np.full(100_000, 20.0)) / 5e3
     mesh = sum((1.0 + 0.1 * np.cos(2.0 * np.pi * turns) + 0.06 * np.cos(4.0 * np.pi * turns))

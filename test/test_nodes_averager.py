@@ -218,6 +218,22 @@ def test_imu_losses_repeats_and_restarts_are_detected(bench):
     assert_true(b.amplitudes(), machine, [1.0], rtol=1e-3)
 
 
+@pytest.mark.parametrize(('stamps', 'words'), [
+    (np.arange(600) / 150.0, 'its stamps come 150 times a second, sample_rate declares 400 Hz'),
+    (np.arange(800) // 20 / 20.0 + np.arange(800) % 20 * 1e-5, 'its stamps come in bursts, 4')])
+def test_imu_of_another_rate_than_declared_is_named(bench, stamps, words):
+    machine = Machine(speed=8.0, rate=400.0, components={1.0: (1.0, 0.4)}, channels=1)
+    b = bench(vibration_type='sensor_msgs/Imu', sample_rate=400.0, shaft__orders=[1.0])
+    b.send_pulses(machine.pulses(stamps[-1]))
+    for stamp in stamps:
+        b.send('vibration', imu(stamp, 0.0, 0.0, np.cos(2.0 * np.pi * 8.0 * stamp)))
+    b.settle()
+    level, text, _ = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert words in text
+    assert 'sample_rate declares 400 Hz' in text
+
+
 def test_pulse_arrays_carry_many_pulses(bench):
     b = bench(tach_type='std_msgs/msg/Float64MultiArray')
     b.play(MACHINE, 1.0)

@@ -151,9 +151,9 @@ def test_imu_axes_are_checked(axes):
         SampleDecoder(IMU, sample_rate=100.0, imu_axis=axes)
 
 
-def imu_blocks(stamps, rate=100.0, values=None):
-    """Return (index, time) of the blocks of Imu messages with these stamps (s)."""
-    decoder, found = SampleDecoder(IMU, sample_rate=rate), []
+def imu_blocks(stamps, rate=100.0, values=None, decoder=None):
+    """Return the indices of the blocks of Imu messages with these stamps (s)."""
+    decoder, found = decoder or SampleDecoder(IMU, sample_rate=rate), []
     for number, stamp in enumerate(stamps):
         message = Imu()
         nanoseconds = round(stamp * 1e9)
@@ -381,3 +381,21 @@ def test_pulse_errors_without_the_field_used_are_read():
     got = messages.decode_average('pulse_error', message)
     assert np.isnan(got.values[:, 3]).all()
     assert np.all(got.values[:, :3] == 1.0)
+
+
+@pytest.mark.parametrize(('stamps', 'doubt'), [
+    (np.arange(400) / 150.0, 'its stamps come 150 times a second, sample_rate declares 400 Hz: set'
+     ' sample_rate to 150'),
+    (np.arange(400) / 440.0, 'its stamps come 440 times a second, sample_rate declares 400 Hz'),
+    (np.arange(400) // 10 / 40.0 + np.arange(400) % 10 * 1e-5, 'its stamps come in bursts, 4'),
+    (np.arange(400) // 10 / 15.0 + np.arange(400) % 10 * 1e-5, 'its stamps come in bursts, 15'),
+    (np.arange(60) / 150.0, ''),
+    (np.arange(400) / 410.0, ''),
+    (np.delete(np.arange(400), np.arange(0, 400, 5)) / 400.0, ''),
+    (np.concatenate((np.arange(200) / 400.0, 30.0 + np.arange(100) / 400.0)), ''),
+    (np.concatenate((np.arange(100) / 150.0, np.arange(-400, -200) / 400.0)), '')])
+def test_imu_rate_that_is_not_the_declared_one_is_named(stamps, doubt):
+    decoder = SampleDecoder(IMU, sample_rate=400.0)
+    imu_blocks(100.0 + stamps, decoder=decoder)
+    assert decoder.doubt.startswith(doubt)
+    assert bool(decoder.doubt) == bool(doubt)

@@ -32,7 +32,7 @@ TACH_TYPE = Parameter(
 
 
 class SampleInput:
-    """Decodes the samples of one topic and warns while they come without a header."""
+    """Decodes the samples of one topic, and warns of those without header and of a wrong rate."""
 
     def __init__(self, node: MonitoringNode, values: Values) -> None:
         self._node = node
@@ -52,9 +52,10 @@ class SampleInput:
         return block
 
     def show_warning(self) -> None:
-        """Repeat the warning in the next diagnostics."""
+        """Say in the next diagnostics what is wrong with the samples."""
         if self._decoder.counted:
             self._node.show_warning(NO_HEADER)
+        self._node.set_missing('samples', self._decoder.doubt)
 
 
 class PulseOutput:

@@ -66,6 +66,7 @@ class AngleRuns:
     :param turn: the angle of a revolution, in the unit of the samples.
     :param moduli: the angles after which the samples may wrap, also by several of them at once.
     :param registers: ranges of counters that may overflow, one at a time.
+    :param below: shares of these ranges that may lie below 0.
     :param counts: the samples are whole counts.
 
     `glitches` counts samples that were bridged, `jumps` the runs that began because the angle
@@ -80,10 +81,11 @@ class AngleRuns:
     """
 
     def __init__(self, turn: float, *, moduli: tuple[float, ...] = (),
-                 registers: tuple[float, ...] = (), counts: bool = False) -> None:
+                 registers: tuple[float, ...] = (), below: tuple[float, ...] = (0.0,),
+                 counts: bool = False) -> None:
         self.glitches = self.jumps = self.gaps = 0
         self._turn, self._quantum = turn, 1.0 if counts else 0.0
-        self._moduli, self._registers = moduli, registers
+        self._moduli, self._registers, self._below = moduli, registers, below
         self._tick = 0.0  # the latest step of an angle that stands between its steps
         self._time, self._value = np.empty(0), np.empty(0)
         self._forget()
@@ -180,8 +182,8 @@ class AngleRuns:
                 best = np.where(np.abs(other - expected) < np.abs(best - expected), other, best)
         for modulus in self._registers:
             other = step - np.copysign(modulus, step - expected)
-            inside = (low >= 0.0) & (high <= modulus) | (low >= -modulus) & (high <= 0.0) | (
-                low >= -0.5 * modulus) & (high < 0.5 * modulus)
+            inside = np.any([(low >= -share * modulus) & (high <= (1.0 - share) * modulus)
+                             for share in self._below], axis=0)
             best = np.where(inside & (np.abs(other - expected) < np.abs(best - expected)),
                             other, best)
         return best

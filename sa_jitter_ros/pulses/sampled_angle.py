@@ -44,8 +44,7 @@ _REGISTERS = (2.0**8, 2.0**16, 2.0**32)  # ranges of counters
 _MOST_BEFORE = 1 << 14  # samples before the shaft turns
 _MOST_AT_ONCE = 50_000_000  # pulses
 _LEAST_MODULUS = 4.0  # counts; with fewer the direction cannot be told
-_USUALLY = 0.98  # of the counts are within the range of a counter
-_SAME_RANGE = 1.2  # of two ranges
+_USUALLY = 0.9  # of the counts are within the range of a counter
 _EXACT = 2.0**53  # the largest count that is exact
 
 
@@ -336,16 +335,25 @@ def counter_runs(counts: FloatArray, turn: float, modulus: float = 0.0) -> Angle
     It may overflow a register of 8, 16 or 32 bits, wrap at `modulus` or at a turn, or be reset at
     the end of the range in which `counts` return again and again.
     """
-    size = float(np.quantile(np.abs(counts), _USUALLY)) if counts.size else 0.0
+    if not counts.size:
+        return AngleRuns(turn, counts=True)
+    size = np.quantile(np.abs(counts), _USUALLY)
+    low, high = np.quantile(counts, (1.0 - _USUALLY, _USUALLY))
+    below = (0.0,) if low >= 0.0 else (1.0,) if high <= 0.0 else (0.0, 0.5, 1.0)
     registers = [each for each in (turn, *_REGISTERS) if each >= max(size, _LEAST_MODULUS)]
-    span = float(np.ptp(counts)) + 1.0 if counts.size else 0.0
-    falls = np.diff(counts)
-    falls = falls[np.abs(falls) > 0.5 * span]
-    if falls.size > 1 and abs(np.sum(np.sign(falls))) == falls.size and not any(
-            span <= each <= _SAME_RANGE * span for each in registers):
-        registers.append(span)
+    steps = np.diff(counts)
+    falls = np.flatnonzero(np.abs(steps) > 0.5 * (np.ptp(counts) + 1.0))
+    usual = 2.0 * float(np.median(np.abs(steps))) + 2.0 if steps.size else 0.0
+    if falls.size > 1:
+        fall = np.median(steps[falls])
+        falls = falls[np.abs(steps[falls] - fall) <= usual]
+        ends = np.concatenate((counts[falls], counts[falls + 1]))
+        span = float(np.ptp(ends)) + 1.0 if falls.size > 1 else 0.0
+        if span >= _LEAST_MODULUS and not any(
+                span <= each <= span + usual for each in registers):
+            registers.append(span)
     return AngleRuns(turn, moduli=(modulus,) if modulus else (), registers=tuple(registers),
-                     counts=True)
+                     below=below, counts=True)
 
 
 def counter_pulses(

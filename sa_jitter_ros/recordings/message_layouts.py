@@ -15,6 +15,7 @@ Only the fields of a message are used, so that messages of rclpy and of `rosbags
 the same rules. A message with another layout raises `MessageError`.
 """
 
+from collections import deque
 from collections.abc import Callable
 import math
 from typing import Any
@@ -42,6 +43,12 @@ _LOSS = 0.75
 _FOLLOW = 0.05
 # Sum of delays, in variances, that white jitter causes once in 1e8 stamps.
 _EVIDENCE = 13.0
+# Of `StampRate`: stamps that are compared, and the least number of them; the relative difference
+# of rates that loses no sample; a usual interval, in mean ones, that shows bursts.
+_COMPARED, _ENOUGH = 256, 64
+_SAME = 0.03
+_BURST = 0.5
+_PAUSES = 2
 
 
 def decode_array(message: Any, labels: tuple[str, ...], header_size: int | None
@@ -177,6 +184,47 @@ class StampCounter:
         return found
 
 
+class StampRate:
+    """
+    Compares the stamps of the latest samples with a declared `sample_rate` (Hz).
+
+    >>> stamps = StampRate(400.0)
+    >>> for number in range(100):
+    ...     stamps.add(number / 150.0)
+    >>> stamps.doubt()
+    'its stamps come 150 times a second, sample_rate declares 400 Hz: set sample_rate to 150'
+    """
+
+    def __init__(self, sample_rate: float) -> None:
+        self._rate = sample_rate
+        self._stamps: deque[float] = deque(maxlen=_COMPARED)
+
+    def add(self, time: float) -> None:
+        """Take the stamp (s) of the next sample."""
+        if self._stamps and time < self._stamps[-1] - max(TIME_TOLERANCE, 1.0 / self._rate):
+            self._stamps.clear()
+        self._stamps.append(time)
+
+    def doubt(self) -> str:
+        """Return what is wrong with the stamps, '' if nothing is, or if there are few of them."""
+        if len(self._stamps) < _ENOUGH or not self._stamps[-1] > self._stamps[0]:
+            return ''
+        intervals = np.diff(self._stamps)
+        usual = float(np.median(intervals))
+        # The mean without pauses; samples that are lost leave the usual interval as it is.
+        mean = float(np.mean(np.sort(intervals)[:-_PAUSES]))
+        if abs(usual * self._rate - 1.0) <= _SAME or (
+                abs(mean * self._rate - 1.0) <= _SAME and usual >= _BURST * mean):
+            return ''
+        declared = f'sample_rate declares {self._rate:.4g} Hz'
+        if usual < _BURST * mean:
+            return (f'its stamps come in bursts, {1.0 / np.mean(intervals):.4g} a second in the '
+                    f'mean, {declared}: stamp each sample with the time at which it was measured')
+        measured = f'{1.0 / mean:.4g}'
+        return (f'its stamps come {measured} times a second, {declared}: set sample_rate to '
+                f'{measured}')
+
+
 class SampleDecoder:
     """
     Decode `vibration` or `tach_waveform` messages of one type to `SampleBlock`.
@@ -199,6 +247,7 @@ class SampleDecoder:
         self._axes = tuple(imu_axis)
         self._next_index = 0
         self._stamps, self._imu_index = StampCounter(sample_rate), 0
+        self._stamp_rate = StampRate(sample_rate)
         self._imu_last: tuple[float, ...] = ()
         self.counted = False
 
@@ -206,6 +255,11 @@ class SampleDecoder:
     def restarts(self) -> int:
         """Return how often the stamps of Imu messages jumped back."""
         return self._stamps.restarts
+
+    @property
+    def doubt(self) -> str:
+        """Return why the stamps of Imu messages do not fit `sample_rate`, '' if they do."""
+        return self._stamp_rate.doubt()
 
     def decode(self, message: Any) -> SampleBlock:
         """Return the block of samples in a message."""
@@ -258,6 +312,7 @@ class SampleDecoder:
         values = tuple(float(getattr(vector, axis)) for axis in self._axes)
         if (time, *values) != self._imu_last:  # a repeated message keeps its index
             self._imu_index = self._stamps.index(time)
+            self._stamp_rate.add(time)
         self._imu_last = time, *values
         return SampleBlock(np.array(values)[:, None], time, rate, self._imu_index)
 
