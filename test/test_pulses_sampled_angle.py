@@ -324,6 +324,16 @@ def test_a_reversal_ends_a_run_of_a_counter_and_dither_does_not():
     assert pulses.size == 199
 
 
+def test_a_count_that_is_wrong_by_one_for_a_sample_moves_no_pulse():
+    counts = np.arange(4000) // 27 % 100
+    clean, _ = counter_pulses(counts, sample_rate=RATE, pulses_per_revolution=100)
+    counts[27 * 100 - 7] = 0  # reads 0, is 99
+    counts[27 * 101 + 7] = 0  # is 1
+    pulses, state = counter_pulses(counts, sample_rate=RATE, pulses_per_revolution=100)
+    np.testing.assert_array_equal(pulses, clean)
+    assert state.glitches == 2
+
+
 def test_a_revolution_counter_of_a_bearing_rig(shared_data):
     with np.load(shared_data / 'uia_bearing_rig_1.npz') as data:
         counts, rate = data['tach_count'], float(data['tach_rate'])

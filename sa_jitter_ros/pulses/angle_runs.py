@@ -34,6 +34,7 @@ _GAP = 6.0  # usual intervals of samples without a sample
 _SHARE = 0.9  # of the usual step, by which a step may differ from it
 _DEVIATIONS = 10.0  # median absolute deviations of the steps, likewise
 _QUANTA = 1.1  # steps of the resolution, likewise
+_SLOW = 0.5  # counts a sample; a slower counter stands between its counts
 _LEAST = 1e-3  # of a turn, likewise
 _OF_MODULUS = 1.0 / 12.0  # more is not told from a step in the other direction
 _TICK = 0.15  # of a turn, that a standing angle may move at once
@@ -194,13 +195,23 @@ class AngleRuns:
         steps.taken[1:] = self._near(steps.raw[1:], steps.expected[1:], value[:-1], value[1:])
         usual = np.abs(steps.taken - steps.expected) <= steps.limit
         usual[0] = True
+        lone = np.zeros(usual.size, bool)
+        if self._quantum:  # one sample beside a count that stands for long
+            lone[:-1] = (steps.taken[:-1] != 0.0) & (steps.taken[1:] == -steps.taken[:-1]) & (
+                np.abs(steps.expected[:-1]) < _SLOW)
+            lone[end - 1] = not ends and bool(steps.taken[end - 1])
+            usual &= ~lone
         done = self._decided
         for i in (np.flatnonzero(~usual[done:end]) + done).tolist():
             if i < done:
                 continue
             if not ends and i + _BLOCK >= end:
                 return int(i)
-            done = self._resolve(steps, i, end, ends=ends)
+            if lone[i]:
+                self._bridge(steps, i, i + 1)
+                steps.taken[i + 1], done = 0.0, i + 2
+            else:
+                done = self._resolve(steps, i, end, ends=ends)
         return end
 
     def _resolve(self, steps: '_Steps', i: int, end: int, *, ends: bool) -> int:
