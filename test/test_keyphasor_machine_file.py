@@ -10,14 +10,23 @@
 
 """What `check_keyphasor` writes, `average` and `close_loop` take."""
 
+from dataclasses import replace
 import json
 from types import SimpleNamespace
 import warnings
 
 import numpy as np
 import pytest
+from sa_jitter_ros.averaging.averager_parameters import streaming_averager
 from sa_jitter_ros.commands import average, check_keyphasor, close_loop
+from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.inference.observation import observe
+from sa_jitter_ros.keyphasor_check import check as keyphasor
+from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.vibration import path_delay
+from sa_jitter_ros.offline.average_recording import average_file, AverageJob
+from sa_jitter_ros.offline.settings import averager_values, MachineFile
+from sa_jitter_ros.recordings import ArraySource, read
 
 RATE = 5120.0
 
@@ -78,3 +87,50 @@ def test_an_order_that_one_average_refuses_gives_no_delay_and_no_warning():
             items = [item(20.0 + k, refused[k % 2]) for k in range(8)]
             assert path_delay(items, 1.0) == (
                 None, 'fewer than two orders stand clear of their noise at all speeds')
+
+
+# --- measured machines ---------------------------------------------------------------------------
+
+EDGES = [(f'engine_edges_{name}', {'pulse_times': f'edges_{k}'}) for name, k in (
+    ('4b11_running', 1), ('4b11_running', 2), ('civic_K20_cranking', 1),
+    ('civic_K20_cranking', 2), ('toyota_3_tooth_cam', 1), ('toyota_3_tooth_cam', 2))]
+RECORDINGS = [
+    *EDGES, ('crank_vr_60_2', {}), ('crank_vr_60_2', {'tach': 'tach_4'}), ('gear0_gearbox', {}),
+    *((f'motor_{name}', {}) for name in ('10V_100kHz', '30V_100kHz', 'runup_20V_40kHz')),
+    *((f'rotorbalancer_{name}', {'acquisition': k})
+      for name in ('weight', 'weight_5', 'without_weight') for k in (0, 6)),
+    *((f'turbine_201303{day}', {}) for day in (16, 26, 31)),
+    *((f'turbine_201304{day}', {}) for day in ('05', 15)), ('uia_bearing_rig_1', {}),
+    pytest.param('encoder_motor_slow', {}, marks=pytest.mark.xfail(
+        strict=False, reason='its intervals change faster than the validation accepts'))]
+
+
+def cut(recording, seconds):
+    """Return the first seconds of a recording."""
+    vibration = recording.read()[:, :int(seconds * recording.sample_rate)]
+    tach = recording.read_tach()
+    return replace(recording, vibration=ArraySource(vibration), tach=None if not tach.size else
+                   ArraySource(tach[None, :int(seconds * recording.tach_rate)]))
+
+
+@pytest.mark.filterwarnings('ignore::sa_jitter_ros.errors.DataWarning')
+@pytest.mark.parametrize(('name', 'fields'), RECORDINGS)
+def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, name, fields):
+    """Other warnings than those for users, as numpy gives them, are errors in all tests."""
+    path = shared_data / f'{name}.npz'
+    recording = read(path, pulses_suffice=True, **fields)
+    check = keyphasor.check_keyphasor(recording)
+    file = tmp_path / 'machine.yaml'
+    file.write_text(machine_file(check, path.name))
+    values = averager_values(MachineFile.read(file), recording)
+    if recording.samples == 1:
+        streaming_averager(values, buffer_seconds=1.0)
+        assert read_declaration(file).models
+        return
+    row = average_file(AverageJob(name, str(path), str(tmp_path / 'averages'),
+                                  MachineFile.read(file), options=fields, figures=False))
+    assert (row.error, row.averages > 0) == ('', True)
+    for model in read_declaration(file, sample_rate=recording.sample_rate).models.values():
+        if recording.samples * recording.channels > 200_000:  # the loop takes all of them, slowly
+            recording = cut(recording, 3.5 * model.trigger_cycles / model.trigger_speed)
+        assert observe(recording, model).acquisitions
