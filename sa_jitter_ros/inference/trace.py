@@ -48,7 +48,7 @@ from sa_jitter_ros.inference.gathering import (
     pulse_evidence)
 from sa_jitter_ros.inference.line_checks import check_channels, check_gain, check_lines
 from sa_jitter_ros.inference.limits import Limit, limits
-from sa_jitter_ros.inference.observation import Observation, together
+from sa_jitter_ros.inference.observation import CHANCE, Observation, together
 from sa_jitter_ros.inference.residual import ACCURACY, FALSE_ALARM, Residual, UNDEFINED
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.timing import read_timing, refitted, stretches, Timing
@@ -299,9 +299,11 @@ def require_acquisitions(observation: Observation) -> None:
     """Raise ModelError for fewer than 4 acquisitions."""
     count = len(observation.acquisitions)
     if count < _FEWEST:
-        raise ModelError(f'{count} acquisitions of {observation.model.trigger_cycles} trigger '
-                         f'cycles: fitting and scoring take at least {_FEWEST}; lower '
-                         'trigger_cycles or record longer')
+        cycles = observation.model.trigger_cycles
+        remedy = 'lower trigger_cycles or record longer' if cycles > CHANCE + 1 else (
+            'record longer')  # fewer cycles tell no coherence
+        raise ModelError(f'{count} acquisitions of {cycles} trigger cycles: fitting and scoring '
+                         f'take at least {_FEWEST}; {remedy}')
 
 
 def timing_of(bench: Bench) -> Timing | None:
