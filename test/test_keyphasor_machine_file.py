@@ -135,7 +135,8 @@ def test_machine_files_of_measured_recordings_are_taken(shared_data, tmp_path, n
     for model in read_declaration(file, sample_rate=recording.sample_rate).models.values():
         record_pulses(recording, model)
         if recording.samples * recording.channels > 60_000:  # of all the loop is slow
-            recording = cut(recording, 3.5 * model.trigger_cycles / model.trigger_speed)
+            recording = cut(recording, 3.5 * model.trigger_cycles * model.trigger_revolutions
+                            / model.trigger_speed)
             seen = recording.keyphasor_pulses(duration=recording.duration)
             model = replace(model, trigger_speed=(seen.size - 1) / np.ptp(seen)
                             / model.pulses_per_revolution)

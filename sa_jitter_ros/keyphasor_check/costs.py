@@ -133,12 +133,12 @@ def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]
     """
     Return the losses (order,) of trigger cycles of a revolution, and of those from mark to mark.
 
-    None where trigger cycles from mark to mark save too little to be proposed, or with few marks.
+    None where trigger cycles from mark to mark save too little over the quadratic angle law to be
+    proposed, or with few marks.
     """
     if fitted.pattern.present < _SEVERAL:
         return None
-    within = fitted.within_turns
-    turn = _of_errors(within[np.abs(within) < 0.5], ratio, orders)
+    turn, parabola = (_of_errors(error, ratio, orders) for error in fitted.within_turns)
     pitch = np.diff(fitted.true) / np.diff(fitted.numbers)
     change = np.diff(pitch) / pitch[1:]
     # Pulse errors change the speed to and fro, motion for longer.
@@ -146,7 +146,8 @@ def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]
     place = np.linspace(0.0, 1.0, 9)
     mark = _of_errors(0.5 / fitted.pattern.teeth * steady[:, None] * place * (1.0 - place), ratio,
                       orders)
-    return (turn, mark) if max(turn) > _DEAR and max(mark) < _SAVED * max(turn) else None
+    dear = max(parabola) > _DEAR and max(mark) < _SAVED * max(parabola)
+    return (turn, mark) if dear else None
 
 
 def _of_errors(error: FloatArray, ratio: float, orders: Sequence[float]) -> FloatArray:

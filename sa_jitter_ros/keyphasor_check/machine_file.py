@@ -20,7 +20,8 @@ from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 
-_LEAST_CYCLES, _MOST_CYCLES, _AVERAGES = 5, 100, 8  # close_loop compares no fewer cycles
+# close_loop compares no fewer cycles; cycles from mark to mark are more, and corrected together
+_LEAST_CYCLES, _MOST_CYCLES, _AVERAGES, _MOST_FROM_MARKS = 5, 100, 8, 400
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
 _DEFAULT_ORDERS = (1.0, 2.0, 3.0)
 _SHAFT = 'shaft'
@@ -46,7 +47,8 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
         f'{_SHAFT}.orders': [float(g) for g in found['orders'] or _DEFAULT_ORDERS],
         'pulses_per_revolution': count, 'trigger_cycles': cycles, 'keyphasor_rate': float(rate)}
     if by_marks(check.fitted, common[f'{_SHAFT}.ratio'], common[f'{_SHAFT}.orders']) is not None:
-        common |= {'pulses_per_trigger': 1, 'trigger_cycles': cycles * count}
+        turns = min(cycles, max(1, _MOST_FROM_MARKS // count))
+        common |= {'pulses_per_trigger': 1, 'trigger_cycles': turns * count}
     jitter: dict[str, Any] = {'jitter_distribution': 'uniform'}
     if not rounded and std:
         jitter = {'jitter_distribution': 'normal', 'jitter_std': float(std)}

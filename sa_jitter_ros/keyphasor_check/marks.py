@@ -64,21 +64,26 @@ class FittedPulses:
         return replace(self, pattern=pattern, true=self.measured)
 
     @property
-    def within_turns(self) -> FloatArray:
+    def within_turns(self) -> tuple[FloatArray, FloatArray]:
         """
-        Return by how much (n,) the angle of each pulse is ahead of an even turn, in revolutions.
+        Return by how much the angle of pulses is ahead of an even turn, in revolutions (m,).
 
-        Those of a revolution are compared with the line from its first mark to the next one's.
+        Those of a revolution are compared with the line from its first mark to the next one's. The
+        second result is what a parabola in each revolution leaves, as a speed that changes evenly.
         """
         turned, start = self.revolutions, np.arange(
             math.ceil(self.revolutions[0]), math.floor(self.revolutions[-1]) + 1.0)
         if start.size < 2:
-            return np.zeros(0)
+            return np.zeros(0), np.zeros(0)
         begun = np.interp(start, turned, self.true)
         inside = (turned >= start[0]) & (turned < start[-1])
         number = np.floor(turned[inside] - start[0]).astype(np.intp)
-        even = (self.true[inside] - begun[number]) / np.diff(begun)[number]
-        return np.asarray(turned[inside] % 1.0 - even)
+        place = (self.true[inside] - begun[number]) / np.diff(begun)[number]
+        ahead, bend = turned[inside] % 1.0 - place, place * (1.0 - place)
+        known = np.maximum(np.bincount(number, bend * bend), np.finfo(np.float64).tiny)
+        size = np.bincount(number, bend * ahead) / known
+        near = np.abs(ahead) < 0.5  # of a turn: not beside a standstill
+        return ahead[near], (ahead - size[number] * bend)[near]
 
     @property
     def revolutions(self) -> FloatArray:
