@@ -98,6 +98,19 @@ def test_edge_and_polarity_reach_the_core(bench, edge, polarity):
     np.testing.assert_allclose(pulses(b), expected, atol=6e-10)
 
 
+def test_spikes_are_counted_and_polarity_is_decided(bench):
+    b = bench(polarity='auto')
+    samples = -waveform(3.0)
+    clean = KeyphasorDetector(polarity='auto').update(samples, 0.0, RATE)
+    spoilt = samples.copy()
+    spoilt[[4000, 9000, 9001]] = 60.0, -500.0, 500.0
+    play(b, spoilt)
+    assert len(clean) == 64
+    np.testing.assert_allclose(pulses(b), clean, atol=2e-4)
+    values = b.diagnostics()[2]
+    assert (values['spikes'], values['polarity']) == ('3', 'negative')
+
+
 def test_given_threshold_needs_no_learning(bench):
     b = bench(automatic_threshold=False, threshold=1, hysteresis=0)
     play(b, waveform(0.3))
