@@ -369,7 +369,7 @@ def test_what_was_bridged_is_said():
         assert sa.pulses_from_angle(TIME, angle).size == 73
     with pytest.warns(DataWarning, match='no pulses: its 10000 samples go from 1 to 1 rad'):
         assert not sa.pulses_from_angle(TIME, np.ones(10_000)).size
-    with pytest.warns(DataWarning, match='no pulses: its 0 samples go; check'):
+    with pytest.warns(DataWarning, match='no pulses: its 0 samples hold no finite one; check'):
         assert not sa.pulses_from_angle([], []).size
 
 

@@ -455,12 +455,15 @@ def pulses_from_angle(
     state = crossings.state
     unit = 'counts' if whole else 'rad'
     if not pulses.size:
-        seen = f' from {finite.min():g} to {finite.max():g} {unit}' if finite.size else ''
-        warnings.warn(f'the angle has no pulses: its {values.size} samples go{seen}; check its '
+        seen = (f'go from {finite.min():g} to {finite.max():g} {unit}' if finite.size
+                else 'hold no finite one')
+        warnings.warn(f'the angle has no pulses: its {values.size} samples {seen}; check its '
                       'unit, the modulus, and that the shaft turns', DataWarning, stacklevel=2)
-    elif state.glitches or state.restarts:
-        warnings.warn(
-            f'{state.glitches} samples of the angle are where the shaft cannot be: bridged; '
-            f'{state.restarts} jumps of angle or time that are no wrap began a new run: check '
-            'sensor and modulus', DataWarning, stacklevel=2)
+        return pulses
+    found = [f'{state.glitches} samples of the angle are where the shaft cannot be, and were '
+             'bridged'] * bool(state.glitches)
+    found += [f'{state.restarts} jumps of angle or time that are no wrap began a new run'] * bool(
+        state.restarts)
+    if found:
+        warnings.warn(f'{"; ".join(found)}: check sensor and modulus', DataWarning, stacklevel=2)
     return pulses

@@ -74,7 +74,7 @@ def other_rate(pulses: NDArray[Any], start: float, end: float, rate: float) -> s
     room = 2.0 * float(np.median(np.diff(np.sort(times))))  # of the first and the last pulse
     for factor, words in ((2.0, 'half'), (0.5, 'twice')):
         beside = factor * (span + 0.5 * room) - duration
-        if abs(beside) < factor * (0.5 * room + _SAME_SPAN * span):
+        if abs(beside) < factor * (room + _SAME_SPAN * span):
             return (f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s, as with '
                     f'{words} its rate: is it sampled at {factor * rate:.10g} Hz?')
     return ''
