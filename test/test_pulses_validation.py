@@ -502,3 +502,21 @@ def test_a_speed_that_jumps_twice_is_found_again_as_fast():
     speeds = np.repeat([30.0, 12.0, 30.0], [40, 8, 40])
     _, runs, *_ = validate(5.0 + np.cumsum(1.0 / speeds))
     assert runs[-1].size > 32
+
+
+@pytest.mark.parametrize('speed', [4.0, 8.0, 25.0])
+@pytest.mark.parametrize('tau', [2.5, 5.0, 10.0])
+def test_a_fan_that_coasts_down_loses_no_pulse(speed, tau):
+    """By viscous friction to the end; by dry friction the pulses may stop with a stray less."""
+    time = np.arange(0.0, 3.0 * tau, 1e-4)
+    for dry in (False, True):
+        angle = (np.where(time < 2.0 * tau, speed * time * (1.0 - 0.25 * time / tau), speed * tau)
+                 if dry else speed * tau * -np.expm1(-time / tau))
+        count = int(0.999 * angle.max())
+        validator = PulseValidator()
+        validator.update(np.interp(np.arange(1.0, count + 1.0), angle, time))
+        validator.flush()
+        found = validator.finish()
+        assert found.accepted >= count - 2 * dry
+        assert found.early <= 2 * dry
+        assert found.late == found.missing_broken == 0

@@ -296,7 +296,8 @@ class IntervalJudge:
         if self._is_of_clock():
             return True
         rules = self._rules()
-        paths = [Path(0.0, self.confirmed, self._slot, 0, model.level, model.before)]
+        paths = [Path(0.0, self.confirmed, self._slot, 0, model.level, model.before,
+                      slowed=model.slowed)]
         for number, pulse in enumerate(queue[:_MOST_WAITING]):
             paths = rules.extend(paths, pulse)
             if (number or len(queue) == 1) and self._commit(paths, final):

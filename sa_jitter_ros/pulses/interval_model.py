@@ -158,6 +158,12 @@ class IntervalModel:
         return self._levels[-2]
 
     @property
+    def slowed(self) -> int:
+        """Return how many of the last intervals were each longer than the one before."""
+        longer = [after > before for before, after in pairwise(self._levels[-_REACH:])]
+        return next((k for k, item in enumerate(reversed(longer)) if not item), len(longer))
+
+    @property
     def expected(self) -> float:
         """Return the expected level of the next interval."""
         return _expected(_WEIGHTS[self._chosen], self._levels, len(self._levels))

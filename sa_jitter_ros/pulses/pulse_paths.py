@@ -46,6 +46,8 @@ _CHAIN_COST = 6.0  # of an acceptable chain, for each pulse
 STRAY_OF_ONE, STRAY_OF_MARKS = 8.0, 10.0
 _LADDER = (0.002, 0.01, 0.05, 0.15)  # scatter that a chain is tried with
 _REGULAR = 0.02
+_SLOWED = 4  # intervals that show that a shaft slows down
+_STOPS = 0.05  # of the speed, or of its square, that must be left
 _LEAST = 1e-6  # of the longest interval; shorter ones are no pulses of one shaft
 
 
@@ -57,6 +59,7 @@ class Path(NamedTuple):
     where the path began, `level` and `before` those of the last two intervals (None: not known).
     With `jumped` the speed is no longer that of earlier intervals. `deviations` are those of the
     intervals of true pulses, 0 for strays; `levels` likewise. `stray_at` (s) is the latest stray.
+    The last `slowed` intervals were each longer than the one before.
     """
 
     cost: float
@@ -70,6 +73,7 @@ class Path(NamedTuple):
     deviations: tuple[float, ...] = ()
     levels: tuple[float, ...] = ()
     stray_at: float = -math.inf
+    slowed: int = 0
 
     def stray(self, pulse: float, cost: float) -> 'Path':
         """Return the path that takes the next pulse (s) for a stray."""
@@ -146,7 +150,8 @@ class PathRules:
                 cost=path.cost + cost + unlike + self.each, last=pulse, slot=slot,
                 passed=path.passed + passed, level=level, before=path.level,
                 jumped=path.jumped or cost == JUMP, marks=(*path.marks, mark),
-                deviations=(*path.deviations, off), levels=(*path.levels, level)))
+                deviations=(*path.deviations, off), levels=(*path.levels, level),
+                slowed=path.slowed + 1 if path.level is not None and level > path.level else 0))
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
         return found
@@ -182,10 +187,27 @@ class PathRules:
             expected.append(self.expected)
         if path.before is not None:
             expected.append(2.0 * path.level - path.before)
+            if path.slowed >= _SLOWED and path.level > path.before:
+                expected += slowing(path.level, path.before)
         if mark > 1:
             half = 0.5 * (mark - 1)
             expected += [each + half * (each - path.level) for each in expected[1:]]
         return math.expm1(min((level - each for each in expected), key=abs))
+
+
+def slowing(level: float, before: float) -> list[float]:
+    """
+    Return the next level of a shaft that friction slows down: viscous, and dry.
+
+    The one takes as much speed in each interval, the other as much of its square. Neither is
+    expected where so little would be left that the shaft stops.
+
+    >>> [round(math.exp(item), 3) for item in slowing(math.log(1.25), 0.0)]
+    [1.667, 1.89]
+    """
+    ratio = math.exp(before - level)  # of the latest speed over the one before
+    return [level + math.log(ratio) - math.log(2.0 * ratio**power - 1.0) / power
+            for power in (1.0, 2.0) if 2.0 * ratio**power > 1.0 + _STOPS]
 
 
 def is_multiple(off: float) -> bool:
