@@ -14,10 +14,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from sa_jitter_ros.averaging.average import Average
+from sa_jitter_ros.parameters import listed
 
 _STANDS = 4.0  # standard deviations of the noise of an amplitude
 _FEWEST_CYCLES = 5  # that tell the noise of an average
-_MOST_NAMED = 6
 
 
 def without_lines(averages: Sequence[Average], *, fewest: int = 1) -> str:
@@ -59,9 +59,7 @@ def without_lines(averages: Sequence[Average], *, fewest: int = 1) -> str:
     if np.mean(clear.any(axis=(1, 2))) > 0.5 or np.any(
             known.any(axis=0) & (mean > _STANDS * scatter)):
         return ''
-    orders = averages[0].orders
-    listed = ', '.join(f'{order:g}' for order in orders[:_MOST_NAMED]) + (
-        ', ...' if orders.size > _MOST_NAMED else '')
     speed = float(np.mean([item.trigger_speed for item in averages]))
-    return (f'none of the orders {listed} stands above its noise at {speed:.4g} Hz: check orders, '
-            'ratio, pulses_per_revolution and sample_rate, or average more trigger cycles')
+    return (f'none of the orders {listed(averages[0].orders)} stands above its noise at '
+            f'{speed:.4g} Hz: check orders, ratio, pulses_per_revolution and sample_rate, or '
+            'average more trigger cycles')

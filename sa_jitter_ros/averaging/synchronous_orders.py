@@ -242,7 +242,7 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
                                          lengths.transpose(1, 0, 2), np.abs(amplitudes)):
         series, channels = series[:, told], int(told.sum())
         series = series - series.mean(axis=0)
-        shares = shares_of_tones(series, rates, rfft(series, 4 * count, axis=0)[1:-1])
+        shares = _shares(series, rates, rfft(series, 4 * count, axis=0)[1:-1])
         place = int(np.argmax(shares))
         power = shares[place] * np.sum(series**2)
         # of 2 and count - 3 degrees of freedom in each channel
@@ -252,7 +252,7 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
             near = rates[place] + np.linspace(-1.0, 1.0, 21) * rates[0]
             near = near[(near > 0.5 * rates[0]) & (near < 0.5 - 0.5 * rates[0])]
             waves = np.exp(-2j * pi * np.multiply.outer(near, np.arange(count)))
-            rate = near[int(np.argmax(shares_of_tones(series, near, waves @ series)))]
+            rate = near[int(np.argmax(_shares(series, near, waves @ series)))]
             if rate > 0.5 - rates[0]:  # the cycles do not tell it from half a turn
                 rate = 0.5
             largest = power
@@ -260,7 +260,7 @@ def orders_beside(problem: PulseErrorProblem, errors: FloatArray, cycle_length: 
     return found
 
 
-def shares_of_tones(series: FloatArray, rates: FloatArray, lines: ComplexArray) -> FloatArray:
+def _shares(series: FloatArray, rates: FloatArray, lines: ComplexArray) -> FloatArray:
     """
     Return the share (rate,) of `series` (cycle, channel) that tones have, all channels alike.
 

@@ -23,6 +23,7 @@ Rejected = Sequence[tuple[float, str]]
 
 _PLACES, _AROUND = 5, 6.0  # panels, and pulse intervals on either side of a place
 _MOST_SAMPLES = 20_000  # of a waveform in a panel
+_SAME = 1e-6  # of an interval, by which the times of one pulse may differ
 _DPI = 110
 _ACCEPTED, _BAD, _WAVE = 'tab:blue', 'tab:red', '0.6'
 _WORDS = {'doubles': 'double', 'early': 'stray', 'late': 'late', 'missing': 'missing',
@@ -49,15 +50,15 @@ def repairs_figure(name: str, recording: Recording, pulses: FloatArray, rejected
                     fontsize='medium')
     waves = _waveforms(recording, [(place - _AROUND * interval, place + _AROUND * interval)
                                    for place in places])
-    bad = {time for time, _ in rejected}
+    bad = np.array([time for time, _ in rejected])
     for panel, place, (times, wave) in zip(panels, places, waves):
         low, high = place - _AROUND * interval, place + _AROUND * interval
         if times.size:
             span = max(float(np.ptp(wave)), np.finfo(np.float64).tiny)
             panel.plot(times, (wave - wave.min()) / span, color=_WAVE, linewidth=0.8)
         inside = pulses[(pulses >= low) & (pulses <= high)]
-        good = np.array([time for time in inside.tolist() if time not in bad])
-        panel.vlines(good, 0.0, 1.0, color=_ACCEPTED, linewidth=1.2)
+        same = np.isclose(inside[:, None], bad, rtol=0.0, atol=_SAME * interval).any(axis=1)
+        panel.vlines(inside[~same], 0.0, 1.0, color=_ACCEPTED, linewidth=1.2)
         for time, why in rejected:
             if low <= time <= high:
                 panel.vlines(time, 0.0, 1.0, color=_BAD, linewidth=1.2,

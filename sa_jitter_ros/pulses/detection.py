@@ -17,6 +17,7 @@ time of the first sample past the threshold, as Camerini et al. 2019 (Fig. 2) mo
 keyphasor.
 """
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -41,7 +42,7 @@ Piece = tuple[float, int, FloatArray]  # origin of the times, index of the first
 # is the noise of a stopped machine.
 _STOPPED = 0.1
 # Earlier levels that are taken up again at once.
-_TRUSTED = 2
+_TRUSTED = 3
 # Part of a window that one event may take.
 _EVENT = 0.25
 # Part of a lobe that a signal must pass on either side of the resting level.
@@ -151,7 +152,8 @@ class KeyphasorDetector:
         self._levels: StateLevels | None = None
         self._confirmed = False
         self._pending: StateLevels | None = None
-        self._trusted: list[StateLevels] = []  # earlier ones that windows agreed on
+        # earlier ones that windows agreed on
+        self._trusted: deque[StateLevels] = deque(maxlen=_TRUSTED)
         self._bridge = np.nan  # the last sample that is no spike
         self._trigger = SchmittTrigger(interpolate=self._interpolate)
         self._trigger_origin = np.nan
@@ -257,7 +259,7 @@ class KeyphasorDetector:
                 self._levels = levels
             if not self._confirmed:
                 self._confirmed = True
-                self._trusted = [*self._trusted[-_TRUSTED:], levels]
+                self._trusted.append(levels)
         elif not self._confirmed or self._idle(window, known) or any(
                 _alike(levels, item) for item in (*self._trusted, self._pending) if item):
             self._levels, self._pending, self._confirmed = levels, None, False

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import MessageError, RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.libraries import missing_library
 from sa_jitter_ros.recordings.limits import check_bag
 from sa_jitter_ros.recordings.message_layouts import (
     decode_pulse_array, decode_pulse_reference, FLOAT32, FLOAT64, IMU, SampleDecoder,
@@ -189,9 +190,7 @@ def _reader(path: Path) -> Iterator[Any]:
     try:
         from rosbags.rosbag2 import Reader
     except ImportError as error:
-        raise RecordingError(
-            'bags are read with rosbags, which is not installed: pip install '
-            "'sa_jitter_ros[bags]' or rosbags") from error
+        raise missing_library('bags are', 'rosbags', 'bags') from error
     check_bag(path)
     with Reader(path) as reader:
         if reader.compression_mode == 'message':

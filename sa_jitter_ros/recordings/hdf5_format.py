@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.fields import MAX_FIELD_BYTES, RawArray, recording_from_fields
+from sa_jitter_ros.recordings.libraries import missing_library
 from sa_jitter_ros.recordings.limits import check_inflation, IN_MEMORY_BYTES
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -46,9 +47,8 @@ def open_hdf5(path: Path, *, acquisition: int, given: Mapping[str, Any],
     try:
         import h5py
     except ImportError:
-        raise RecordingError('MATLAB version 7.3 (HDF5) is read with h5py, which is not '
-                             "installed: pip install 'sa_jitter_ros[mat73]' or h5py, or save the "
-                             "file with '-v7'") from None
+        raise missing_library('MATLAB version 7.3 (HDF5) is', 'h5py', 'mat73',
+                              ", or save the file with '-v7'") from None
     with h5py.File(path, 'r') as file:
         variables = dict(islice(_datasets(file, file, '', ()), _MOST_KEYS))
         return recording_from_fields(

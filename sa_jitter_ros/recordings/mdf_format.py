@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.libraries import missing_library
 from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
 
 
@@ -36,8 +36,7 @@ def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
         try:
             import asammdf
         except ImportError:
-            raise RecordingError('a .mf4 file is read with asammdf, which is not installed: pip '
-                                 "install 'sa_jitter_ros[mdf]' or asammdf") from None
+            raise missing_library('a .mf4 file is', 'asammdf', 'mdf') from None
         left_out: list[str] = []
         with asammdf.MDF(path) as file:
             channels = list(_channels(path, file, left_out))

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_list import Channel, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.libraries import missing_library
 from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
 
 
@@ -35,8 +35,7 @@ def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None)
         try:
             import nptdms
         except ImportError:
-            raise RecordingError('a .tdms file is read with npTDMS, which is not installed: pip '
-                                 "install 'sa_jitter_ros[tdms]' or npTDMS") from None
+            raise missing_library('a .tdms file is', 'npTDMS', 'tdms') from None
         with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
             channels = [_channel(path, group.name, channel)
                         for group in file.groups() for channel in group.channels()

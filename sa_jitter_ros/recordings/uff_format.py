@@ -23,6 +23,7 @@ import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_list import Channel, constant_rate, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.libraries import missing_library
 from sa_jitter_ros.recordings.limits import MAX_VALUES
 from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
@@ -40,8 +41,7 @@ def open_uff(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
         try:
             import pyuff
         except ImportError:
-            raise RecordingError('a universal file is read with pyuff, which is not installed: '
-                                 "pip install 'sa_jitter_ros[uff]' or pyuff") from None
+            raise missing_library('a universal file is', 'pyuff', 'uff') from None
         if path.stat().st_size > 8 * MAX_VALUES:
             raise RecordingError(f'{path.stat().st_size} bytes: universal files of at most '
                                  f'{8 * MAX_VALUES} are read; export .tdms, .mat or .wav')
