@@ -99,7 +99,7 @@ def needs(path):
         top, _, rest = name.partition('.')
         if top == 'sa_jitter_ros':
             found.add(rest.partition('.')[0])
-        elif top not in sys.stdlib_module_names:
+        elif top not in sys.stdlib_module_names and top != 'typing_extensions':  # for mypy alone
             found.add(top)
     return found
 

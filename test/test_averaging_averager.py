@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
+from sa_jitter_ros.averaging.averager_parameters import PARAMETERS, shaft_parameters
 from sa_jitter_ros.pulses.resampling import gain, METHODS
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
@@ -350,6 +351,24 @@ def test_the_two_signatures_are_one():
     del stream['buffer_seconds'], whole['vibration'], whole['pulse_times']
     assert [(item.name, item.default, item.annotation) for item in stream.values()] == [
         (item.name, item.default, item.annotation) for item in whole.values()]
+
+
+def test_defaults_are_those_of_the_node():
+    signature = inspect.signature(sa.Averager)
+    shown = {item.name: item.default for item in signature.parameters.values()}
+    known = {item.name: item.default for item in (*PARAMETERS, *shaft_parameters(''))}
+    known = {name.lstrip('.'): default for name, default in known.items()}
+    differ = {name for name in shown.keys() & known.keys()
+              if shown[name] != known[name] and (shown[name] or known[name])}
+    assert shown.keys() - known.keys() == set()
+    assert differ == {'sample_rate', 'orders', 'trigger_cycles', 'buffer_seconds'}
+
+
+def test_an_unknown_keyword_is_named_with_the_one_it_looks_like():
+    with pytest.raises(TypeError, match=r"'trigger_cycle': did you mean trigger_cycles"):
+        sa.Averager(RATE, trigger_cycle=4)
+    with pytest.raises(TypeError, match="unknown keyword 'buffer_seconds'"):
+        sa.average(VIBRATION, RATE, PULSES, buffer_seconds=4.0)
 
 
 def test_detected_pulses_are_those_of_the_waveform():

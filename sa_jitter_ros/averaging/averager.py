@@ -16,9 +16,8 @@ names. Three defaults differ: `trigger_cycles` None averages all cycles, `keypha
 the sampling rate of the vibration, and `buffer_seconds` is unlimited.
 """
 
-from collections.abc import Sequence
-import math
-from typing import Literal
+from dataclasses import fields
+from typing import TYPE_CHECKING
 import warnings
 
 import numpy as np
@@ -26,6 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.envelope import EnvelopeSettings
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
+from sa_jitter_ros.averaging.options import (
+    AverageOptions, AveragerOptions, completed, with_keywords)
 from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -33,13 +34,12 @@ from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.unit_check import likely_mistake, other_rate
-from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 from sa_jitter_ros.samples import SampleBlock
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 FloatArray = NDArray[np.float64]
-Averaging = Literal['block', 'sliding', 'exponential']
-AngleLawName = Literal['linear', 'quadratic', 'spline']
-Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
 
 _PIECE = 1 << 18  # samples of a channel that are handed on at once, so that memory stays small
 _ALL_CYCLES = 1 << 60  # more trigger cycles than a stream has
@@ -82,24 +82,13 @@ class Averager:
     ((), 49)
     """
 
-    def __init__(
-        self, sample_rate: float, *, start_time: float = 0.0, ratio: float = 1.0,
-        pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
-        trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
-        correct_jitter: bool = False, keyphasor_rate: float | None = None,
-        maximum_discarded: float = 0.0, averaging: Averaging = 'block',
-        angle_law: AngleLawName = 'linear',
-        interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
-        missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
-        interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
-        time_tolerance: float = 0.01, path_delay: float = 0.0,
-        target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
-        bearing_orders: Sequence[float] = (), envelope_band: Sequence[float] = (),
-        buffer_seconds: float = math.inf,
-    ) -> None:
+    @with_keywords(AveragerOptions)
+    def __init__(self, sample_rate: float, **options: 'Unpack[AveragerOptions]') -> None:
+        values = completed(options, AveragerOptions)
         sample_rate = number('sample_rate', sample_rate)
-        start_time = number('start_time', start_time)
-        buffer_seconds = number('buffer_seconds', buffer_seconds)
+        start_time = number('start_time', values.pop('start_time'))
+        buffer_seconds = number('buffer_seconds', values.pop('buffer_seconds'))
+        endless = values['trigger_cycles'] is None
         if not (np.isfinite(sample_rate) and sample_rate > 0.0):
             raise ParameterError(f'sample_rate is {sample_rate} Hz: give a positive rate')
         if not np.isfinite(start_time):
@@ -107,29 +96,21 @@ class Averager:
                                  'sample on the clock of the pulses')
         if not buffer_seconds > 0.0:
             raise ParameterError(f'buffer_seconds is {buffer_seconds} s: give a positive time')
-        if trigger_cycles is None and averaging != 'block':
-            raise ParameterError(f'averaging is {averaging!r} without trigger_cycles: set the '
-                                 'number of trigger cycles in the window')
-        keyphasor = KeyphasorParameters(
-            pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
-            missing_teeth=missing_teeth, missing_pulses=missing_pulses,
-            maximum_missing=maximum_missing, interval_tolerance=interval_tolerance,
-            minimum_interval=minimum_interval, time_tolerance=time_tolerance,
-            path_delay=path_delay, target_geometry=target_geometry,
-            target_angles=tuple(target_angles))
-        settings = keyphasor.average(
-            ratio=ratio, orders=orders, averaging=averaging, angle_law=angle_law,
-            trigger_cycles=_ALL_CYCLES if trigger_cycles is None else trigger_cycles,
-            samples_per_revolution=samples_per_revolution, interpolation=interpolation,
-            correct_jitter=correct_jitter, keyphasor_rate=keyphasor_rate or 0.0,
-            maximum_discarded=maximum_discarded, envelope=EnvelopeSettings(
-                numbers('bearing_orders', bearing_orders),
-                numbers('envelope_band', envelope_band)))
+        if endless and values['averaging'] != 'block':
+            raise ParameterError(f'averaging is {values["averaging"]!r} without trigger_cycles: '
+                                 'set the number of trigger cycles in the window')
+        if endless:
+            values['trigger_cycles'] = _ALL_CYCLES
+        values['keyphasor_rate'] = values['keyphasor_rate'] or 0.0
+        keyphasor = KeyphasorParameters(**{
+            item.name: values.pop(item.name) for item in fields(KeyphasorParameters)})
+        envelope = EnvelopeSettings(numbers('bearing_orders', values.pop('bearing_orders')),
+                                    numbers('envelope_band', values.pop('envelope_band')))
         self._stream = StreamingAverager(
-            {_SHAFT: settings}, validator=keyphasor.validator(),
-            timeline=VibrationTimeline(
-                time_tolerance=time_tolerance, buffer_seconds=buffer_seconds),
-            keep_unfinished=trigger_cycles is None)
+            {_SHAFT: keyphasor.average(envelope=envelope, **values)},
+            validator=keyphasor.validator(), timeline=VibrationTimeline(
+                time_tolerance=keyphasor.time_tolerance, buffer_seconds=buffer_seconds),
+            keep_unfinished=endless)
         self._rate, self._start_time = sample_rate, start_time
         self._index = 0
         self._channels: int | None = None
@@ -201,20 +182,9 @@ class Averager:
         return tuple(average for _, average in found)
 
 
-def average(
-    vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike, *, start_time: float = 0.0,
-    ratio: float = 1.0, pulses_per_revolution: int = 1, pulses_per_trigger: int | None = None,
-    trigger_cycles: int | None = None, orders: Sequence[float] | None = None,
-    correct_jitter: bool = False, keyphasor_rate: float | None = None,
-    maximum_discarded: float = 0.0, averaging: Averaging = 'block',
-    angle_law: AngleLawName = 'linear',
-    interpolation: Interpolation = 'band_limited', samples_per_revolution: int = 0,
-    missing_teeth: int = 0, missing_pulses: MissingPulses = 'break', maximum_missing: int = 3,
-    interval_tolerance: float = 0.0, minimum_interval: float = 0.0,
-    time_tolerance: float = 0.01, path_delay: float = 0.0,
-    target_geometry: GeometryMode = 'none', target_angles: Sequence[float] = (),
-    bearing_orders: Sequence[float] = (), envelope_band: Sequence[float] = (),
-) -> tuple[Average, ...]:
+@with_keywords(AverageOptions)
+def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
+            **options: 'Unpack[AverageOptions]') -> tuple[Average, ...]:
     """
     Return the synchronous averages of a recording of vibration (channel, sample) or (sample,).
 
@@ -244,17 +214,8 @@ def average(
     >>> bool(np.ptp(result.correction.pulse_errors) < 1.05 / 1e3)  # a sample of the keyphasor
     True
     """
-    averager = Averager(
-        sample_rate, start_time=start_time, ratio=ratio,
-        pulses_per_revolution=pulses_per_revolution, pulses_per_trigger=pulses_per_trigger,
-        trigger_cycles=trigger_cycles, orders=orders, correct_jitter=correct_jitter,
-        keyphasor_rate=keyphasor_rate, maximum_discarded=maximum_discarded, averaging=averaging,
-        angle_law=angle_law, interpolation=interpolation,
-        samples_per_revolution=samples_per_revolution, missing_teeth=missing_teeth,
-        missing_pulses=missing_pulses, maximum_missing=maximum_missing,
-        interval_tolerance=interval_tolerance, minimum_interval=minimum_interval,
-        time_tolerance=time_tolerance, path_delay=path_delay, target_geometry=target_geometry,
-        target_angles=target_angles, bearing_orders=bearing_orders, envelope_band=envelope_band)
+    values = completed(options, AverageOptions)
+    averager = Averager(sample_rate, **options)
     samples, pulses = _array(vibration), np.asarray(pulse_times)
     if pulse_times is None:
         raise SignalError('pulse_times is None: give the pulse times in s; those of a recording '
@@ -264,14 +225,16 @@ def average(
                           'samples: give (channel, sample), transpose it')
     found = averager.update(samples, pulses) + averager.flush()
     discarded = _discarded(averager)
-    start, end = float(start_time), float(start_time + samples.shape[-1] / sample_rate)
+    start = float(values['start_time'])
+    end = start + float(samples.shape[-1] / sample_rate)
     likely = likely_mistake(pulses, start, end, float(sample_rate))
     if not found:
         counts = averager.counts
-        wanted = '' if trigger_cycles is None else f' of the {trigger_cycles} of an average'
+        wanted = values['trigger_cycles']
+        of_average = '' if wanted is None else f' of the {wanted} of an average'
         raise SignalError(
             f'{pulses.size} pulses and vibration from {start:g} s to {end:g} s make '
-            f'{counts["trigger_cycles"]} whole trigger cycles{wanted}: '
+            f'{counts["trigger_cycles"]} whole trigger cycles{of_average}: '
             + (likely or discarded or 'lower trigger_cycles, or give more pulses'))
     doubt = likely or other_rate(pulses, start, end, float(sample_rate))
     if discarded:
@@ -281,7 +244,7 @@ def average(
     refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
     if refused:
         warnings.warn(refused, DataWarning, stacklevel=2)
-    if orders is not None and (none := without_lines(found)):
+    if values['orders'] is not None and (none := without_lines(found)):
         warnings.warn(none, DataWarning, stacklevel=2)
     return found
 

@@ -1,0 +1,98 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Keywords of `average` and `Averager`: the parameters of the node under the same names.
+
+`AverageOptions` has their types, `KeyphasorParameters` and `AverageSettings` check them. Help and
+documentation show them with their defaults by `with_keywords`.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from difflib import get_close_matches
+from inspect import Parameter, signature
+import math
+from typing import Any, Literal, TypedDict, TypeVar
+
+from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
+from sa_jitter_ros.parameters import RATIO
+from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
+
+Averaging = Literal['block', 'sliding', 'exponential']
+AngleLawName = Literal['linear', 'quadratic', 'spline']
+Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
+FunctionT = TypeVar('FunctionT', bound=Callable[..., object])
+
+
+class AverageOptions(TypedDict, total=False):
+    """Keywords of `average`."""
+
+    start_time: float
+    ratio: float
+    pulses_per_revolution: int
+    pulses_per_trigger: int | None
+    trigger_cycles: int | None
+    orders: Sequence[float] | None
+    correct_jitter: bool
+    keyphasor_rate: float | None
+    maximum_discarded: float
+    averaging: Averaging
+    angle_law: AngleLawName
+    interpolation: Interpolation
+    samples_per_revolution: int
+    missing_teeth: int
+    missing_pulses: MissingPulses
+    maximum_missing: int
+    interval_tolerance: float
+    minimum_interval: float
+    time_tolerance: float
+    path_delay: float
+    target_geometry: GeometryMode
+    target_angles: Sequence[float]
+    bearing_orders: Sequence[float]
+    envelope_band: Sequence[float]
+
+
+class AveragerOptions(AverageOptions, total=False):
+    """Keywords of `Averager`."""
+
+    buffer_seconds: float
+
+
+_DEFAULTS: dict[str, Any] = {
+    item.name: item.default for item in (*fields(KeyphasorParameters), *fields(AverageSettings))
+} | {
+    'start_time': 0.0, 'ratio': RATIO.default, 'trigger_cycles': None, 'orders': None,
+    'keyphasor_rate': None, 'bearing_orders': (), 'envelope_band': (), 'buffer_seconds': math.inf}
+
+
+def with_keywords(options: type) -> Callable[[FunctionT], FunctionT]:
+    """Return a decorator that shows `options` with their defaults in a function's signature."""
+    def decorate(function: FunctionT) -> FunctionT:
+        plain = signature(function)
+        shown = [Parameter(name, Parameter.KEYWORD_ONLY, default=_DEFAULTS[name], annotation=kind)
+                 for name, kind in options.__annotations__.items()]
+        own = [item for item in plain.parameters.values() if item.kind != Parameter.VAR_KEYWORD]
+        function.__signature__ = plain.replace(  # type: ignore[attr-defined]
+            parameters=[*own, *shown])
+        return function
+    return decorate
+
+
+def completed(given: Mapping[str, object], options: type) -> dict[str, Any]:
+    """Return all `options` with the values that are given; raises TypeError for others."""
+    known = list(options.__annotations__)
+    for name in given:
+        if name not in known:
+            near = ' or '.join(get_close_matches(name, known, 2))
+            raise TypeError(f'unknown keyword {name!r}'
+                            + (f': did you mean {near}?' if near else ''))
+    return {name: given.get(name, _DEFAULTS[name]) for name in known}
