@@ -26,7 +26,8 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.inference.observation import observe
-from sa_jitter_ros.inference.trace import Trace, trace
+from sa_jitter_ros.inference.trace import trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh

@@ -82,7 +82,7 @@ def test_intervals_of_corrected_amplitudes_hold_in_every_setting(benchmark):
 
     Lines of another shaft that a few cycles do not tell make intervals too safe.
     """
-    campaign, trials = benchmark('interval_coverage'), 24
+    campaign, trials = benchmark('interval_coverage'), 16
     inside = np.zeros((2, 0))
     for number, setting in enumerate(campaign.SETTINGS):
         corrected, _, below = campaign.setting_distances(setting, trials, seed=5000 + number)

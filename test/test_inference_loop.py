@@ -412,9 +412,9 @@ def test_recording_that_hides_its_pulse_errors_says_what_it_cannot_exclude(share
     assert 0.0 < upper['missing_pulses'] < 0.2  # which the pulse times show
 
 
-@pytest.mark.parametrize('day', [20130331, 20130405])
-@pytest.mark.parametrize('orders', [(20.0, 40.0, 60.0), (40.0,), (20.0, 40.0)])
-@pytest.mark.parametrize('skew', [0.0, 1.4e-4])
+@pytest.mark.parametrize(('day', 'skew', 'orders'), [
+    (20130331, 0.0, (20.0, 40.0, 60.0)), (20130331, 1.4e-4, (40.0,)),
+    (20130405, 0.0, (20.0, 40.0)), (20130405, 1.4e-4, (20.0, 40.0, 60.0))])
 def test_turbine_whose_lines_come_and_go_has_no_limit_of_what_they_do_not_hold(
         shared_data, day, skew, orders):
     recording = read(shared_data / f'turbine_{day}.npz')

@@ -15,7 +15,7 @@ An effect is one frozen dataclass whose fields are its parameters. It overrides 
 `Influence` that it needs; the defaults of the other hooks have no influence.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 import math
 from typing import Any, ClassVar
@@ -286,3 +286,8 @@ def parameter_ranges(kind: type) -> Mapping[str, ParameterRange]:
 def parameter_defaults(kind: type) -> Mapping[str, Any]:
     """Return the defaults of an effect's parameters by name, in their order."""
     return {item.name: item.default for item in fields(kind) if 'range' in item.metadata}
+
+
+def effects_of(findings: Iterable[Finding]) -> list[Effect]:
+    """Return the effects that were found."""
+    return [finding.effect for finding in findings if finding.effect is not None]

@@ -34,7 +34,8 @@ from sa_jitter_ros.inference.online import good_lines, named, places, ReceivedAv
 from sa_jitter_ros.inference.record_pulses import RecordPulses
 from sa_jitter_ros.inference.scoring import Bench
 from sa_jitter_ros.inference.trace import (
-    require_acquisitions, timing_of, Trace, trace_bench)
+    require_acquisitions, timing_of, trace_bench)
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.prediction.amplitudes import line_variance
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel

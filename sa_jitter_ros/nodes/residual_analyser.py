@@ -31,7 +31,7 @@ from sa_jitter_ros.errors import MessageError, SaJitterError
 from sa_jitter_ros.inference.online import (
     Batch, compare, declared_by, Published, ReceivedAverage, require_comparable)
 from sa_jitter_ros.inference.online_trace import trace_averages
-from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.messages import (AverageMessage, decode_average, decode_prediction,
                                           encode_residual, ResidualMessage)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
-from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import (
     add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)

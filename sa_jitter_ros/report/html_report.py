@@ -17,7 +17,7 @@ import json
 from pathlib import PurePath
 from typing import Any
 
-from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import (
     measured_text, number_text, order_text, percent_text)
 from sa_jitter_ros.report.figures import illustrate, Illustration

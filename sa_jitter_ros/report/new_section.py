@@ -16,7 +16,7 @@ from typing import Any
 
 from sa_jitter_ros.effects.clock_skew import ClockSkew
 from sa_jitter_ros.effects.effect import Effect
-from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.prediction.model import DeclaredModel
 

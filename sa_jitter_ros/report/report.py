@@ -26,7 +26,7 @@ from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.residual import Residual
-from sa_jitter_ros.inference.trace import Trace
+from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.number_text import measured_text
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -1,0 +1,67 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Effects that may be there unseen, and are large enough to change an average."""
+
+from collections.abc import Callable, Mapping, Sequence
+import math
+
+import numpy as np
+from sa_jitter_ros.effects import Effect, EFFECTS
+from sa_jitter_ros.effects.effect import DirectEffect
+from sa_jitter_ros.effects.timing import Pattern
+from sa_jitter_ros.errors import ModelError
+from sa_jitter_ros.inference.candidates import Candidate
+from sa_jitter_ros.inference.limits import Limit
+from sa_jitter_ros.inference.observation import Observation
+from sa_jitter_ros.inference.timing import Timing
+from sa_jitter_ros.prediction.prediction import predict
+
+#: The largest change that an effect beside others makes.
+Change = Callable[[Sequence[Effect], Effect], float]
+_UNDECIDED = 1e-2  # change of an average by what may be there
+
+
+def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
+                      ) -> tuple[str, ...]:
+    """
+    Return the effects that, as large as their limits, would still change an average.
+
+    Random motions without a limit may be of any size.
+    """
+    found = []
+    for row in rows:
+        if row.effect is None:
+            kind = EFFECTS[row.name]
+            if row.lower is None and not issubclass(kind, DirectEffect) and not isinstance(
+                    kind.timing, Pattern):
+                found.append(row.name)
+            continue
+        try:
+            size = change(effects, row.effect)
+        except ModelError:  # so large that no average is left
+            size = math.inf
+        if size >= _UNDECIDED:
+            found.append(row.name)
+    return tuple(found)
+
+
+def published_change(observation: Observation, without: Sequence[Effect],
+                     with_them: Sequence[Effect]) -> float:
+    """Return the largest change by effects of what is published: mean and scatter of an order."""
+    before, after = (predict(observation.model, known) for known in (without, with_them))
+    return float(max(np.abs(getattr(after, name) - getattr(before, name)).max()
+                     for name in ('mean_attenuation', 'standard_deviation')))
+
+
+def probabilities(timing: Timing | None, candidates: Sequence[Candidate]) -> Mapping[str, float]:
+    """Return the probability of every effect that was tried."""
+    found = dict(timing.probabilities) if timing is not None else {}
+    return {item.name: item.finding.probability for item in candidates} | found
