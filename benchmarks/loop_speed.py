@@ -195,8 +195,9 @@ def main() -> int:
             ('prediction', partial(prediction, max(round(64 * scale), 2), rounds)),
             ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
             ('threads', partial(recovery_by_threads, max(round(100 * scale), 20), rounds)),
-            ('close_loop', lambda: [close_loop(min(rounds, _RUNS), max(scale, 0.3) * seconds, *other)
-                                    for seconds, *other in LOOPS])):
+            ('close_loop', lambda: [
+                close_loop(min(rounds, _RUNS), max(scale, 0.3) * seconds, *other)
+                for seconds, *other in LOOPS])):
         print(f'loop: {name}', file=sys.stderr, flush=True)
         found[name] = measure()
     found['load'] = f'{os.getloadavg()[0]:.1f}'

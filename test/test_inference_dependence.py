@@ -14,11 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.dependence import dependences, moving
 from sa_jitter_ros.inference.expectation import Memory
 from sa_jitter_ros.inference.fewer_cycles import fewer_cycles
 from sa_jitter_ros.inference.observation import observe
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import ModelError, RecordingError
+from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording

@@ -16,11 +16,11 @@ import math
 import numpy as np
 import pytest
 from sa_jitter_ros.effects import make_effect
+from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.expectation import expect, Lines, Memory
 from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.scoring import STEADY
-from sa_jitter_ros.inference.benches import make_bench
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.prediction.influence import Pulses
 from sa_jitter_ros.prediction.model import DeclaredModel

@@ -50,6 +50,10 @@ def test_ruff():
     check('ruff', 'check', '--output-format=concise', '--quiet', '.')
 
 
+def test_codespell():
+    check('codespell_lib', *SOURCES, 'README.md', 'CONTRIBUTING.md', 'CHANGELOG.rst', 'config')
+
+
 @pytest.mark.style
 def test_flake8():
     check('flake8', '.')

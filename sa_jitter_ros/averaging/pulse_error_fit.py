@@ -313,12 +313,8 @@ class PulseErrorProblem:
             last *= weight
             residual *= weight
             if self.with_ripple:  # eliminate the ripple from the equations of its cycle
-                middle = response.middle @ slope * weight
-                size = np.sqrt(_dot(middle, middle))
-                middle /= size[:, None, None]
-                parts = [_dot(middle, item) for item in (first, last, residual)]
-                first, last, residual = (item - middle * part[:, None, None] for item, part
-                                         in zip((first, last, residual), parts))
+                (first, last, residual), parts, size = _without(
+                    response.middle @ slope * weight, (first, last, residual))
             information = Tridiagonal(np.zeros(count + 1), _dot(first, last))
             information.diagonal[:-1] += _dot(first, first)
             information.diagonal[1:] += _dot(last, last)
@@ -502,6 +498,16 @@ def estimated_size(information: Tridiagonal, right: FloatArray, declared: float
                                + (right @ common) ** 2 / delay - np.log(delay))
     chance = np.exp(likelihood - likelihood.max()) * _CHANCES
     return float(np.exp(np.log(sizes) @ chance / chance.sum()))
+
+
+def _without(direction: FloatArray, items: Sequence[FloatArray]
+             ) -> tuple[list[FloatArray], list[FloatArray], FloatArray]:
+    """Return items of cycles without their parts along a direction, these, and its length."""
+    size = np.sqrt(_dot(direction, direction))
+    direction = direction / size[:, None, None]
+    parts = [_dot(direction, item) for item in items]
+    left = [item - direction * part[:, None, None] for item, part in zip(items, parts)]
+    return left, parts, size
 
 
 def _occam(information: Tridiagonal, std: float) -> float:

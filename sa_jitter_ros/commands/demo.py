@@ -289,8 +289,8 @@ def report(plan: Plan, watcher: Watcher, output: Path) -> None:
     print(f'written: {ARRAYS}, {TABLE} and figures in {output}')
 
 
-def main(args: Sequence[str] | None = None) -> int:
-    """Run the demo; return 0, or 2 after one line on unusable input or output."""
+def _parser() -> Parser:
+    """Return the parser of the options."""
     parser = Parser(
         prog='demo', description='Average a recording, or a simulated gearbox, over ROS topics.')
     parser.add_argument('recording', nargs='?', type=Path,
@@ -307,7 +307,12 @@ def main(args: Sequence[str] | None = None) -> int:
     parser.add_argument('--output', type=Path, default=Path('out'),
                         help='folder for arrays, table and figures (out)')
     add_recording_options(parser)
-    options = parser.parse_args(args)
+    return parser
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the demo; return 0, or 2 after one line on unusable input or output."""
+    options = _parser().parse_args(args)
     children: list[subprocess.Popen[bytes]] = []
     context = rclpy.Context()
     for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job ignores SIGINT

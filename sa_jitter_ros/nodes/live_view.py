@@ -26,8 +26,9 @@ from sa_jitter_ros.nodes.live_view_board import (
     ORDERS, orders_content, PulseErrors, pulses_content, spectrum_content, SPEEDS, table_content,
     Trend, waveform_content)
 from sa_jitter_ros.nodes.live_view_server import is_loopback, PageServer
-from sa_jitter_ros.nodes.messages import (decode_average, decode_prediction, decode_residual,
-                                          PREDICTION_FIELDS, RESIDUAL_FIELDS)
+from sa_jitter_ros.nodes.messages import (
+    AverageMessage, decode_average, decode_prediction, decode_residual, PREDICTION_FIELDS,
+    RESIDUAL_FIELDS)
 from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import Parameter, require_shaft_names, Values
 from std_msgs.msg import Float64, Float64MultiArray, String
@@ -47,6 +48,68 @@ PARAMETERS = (
     Parameter('channel_names', [], 'names of the vibration channels, for labels',
               element=str),
 )
+
+
+class ShaftView:
+    """Puts the results of one shaft on the board, with their histories."""
+
+    def __init__(self, shaft: str, board: Board) -> None:
+        self._shaft, self._board = shaft, board
+        self._errors, self._attenuations, self._indicators = PulseErrors(), Attenuations(), Trend()
+        self._amplitudes = {'raw': Trend(), 'corrected': Trend()}
+        self._maps = {'synchronous_average': OrderMap(), 'corrected_average': OrderMap()}
+
+    def _put(self, kind: str, content: Any, *, by_channel: bool = False) -> None:
+        self._board.put(f'{self._shaft}/{kind}', content, by_channel=by_channel)
+
+    def on_waveform(self, kind: str, message: Float64MultiArray) -> None:
+        """Show a waveform, and its spectrum if it is an average."""
+        average = decode_average(kind, message)
+        self._put(kind, partial(waveform_content, average))
+        if kind in self._maps:
+            self._put(f'{kind}_spectrum', partial(spectrum_content, average), by_channel=True)
+            content = self._maps[kind].add(average.header.end_time, average.values[:CHANNELS])
+            if content is not None:
+                self._put(f'{kind}_map', content, by_channel=True)
+
+    def on_indicators(self, message: Float64MultiArray) -> AverageMessage:
+        """Show condition indicators and their trend; return the message."""
+        average = decode_average('condition_indicator', message)
+        self._put('condition_indicator', partial(indicators_content, average))
+        values = average.values[:CHANNELS, :INDICATORS]
+        if average.names:
+            self._put('indicator_trend', self._indicators.add(
+                average.header.end_time, average.names[:INDICATORS], values,
+                values * math.nan), by_channel=True)
+        return average
+
+    def on_indicator_errors(self, message: Float64MultiArray) -> None:
+        """Show the standard errors of condition indicators."""
+        average = decode_average('condition_indicator_error', message)
+        self._put('condition_indicator_error', partial(indicators_content, average))
+        content = self._indicators.amend(
+            average.header.end_time, average.values[:CHANNELS, :INDICATORS])
+        if content is not None:
+            self._put('indicator_trend', content, by_channel=True)
+
+    def on_orders(self, message: Float64MultiArray) -> AverageMessage:
+        """Show order amplitudes and their trend; return the message."""
+        average = decode_average('order_amplitude', message)
+        shown = average.values[:CHANNELS, :ORDERS]
+        history = self._attenuations.add(shown[..., 0], shown[..., 5])
+        self._put('order_amplitude', partial(orders_content, average, history))
+        for kind, trend in self._amplitudes.items() if len(shown) else ():
+            self._put(f'{kind}_trend', trend.add(
+                average.header.end_time, tuple(f'{order:.6g}' for order in shown[0, :, 0]),
+                *amplitude_rows(shown, average.names, kind)), by_channel=True)
+        return average
+
+    def on_pulses(self, message: Float64MultiArray) -> AverageMessage:
+        """Show pulse errors; return the message."""
+        average = decode_average('pulse_error', message)
+        self._put('pulse_error', partial(
+            pulses_content, average, self._errors.add(average.values)))
+        return average
 
 
 class LiveView(MonitoringNode):
@@ -106,67 +169,27 @@ class LiveView(MonitoringNode):
 
     def _watch_shaft(self, shaft: str) -> None:
         """Subscribe to the results of one shaft."""
-        errors, attenuations, indicators = PulseErrors(), Attenuations(), Trend()
-        amplitudes = {'raw': Trend(), 'corrected': Trend()}
-        maps = {'synchronous_average': OrderMap(), 'corrected_average': OrderMap()}
-
-        def on_waveform(kind: str, message: Float64MultiArray) -> None:
-            average = decode_average(kind, message)
-            self._board.put(f'{shaft}/{kind}', partial(waveform_content, average))
-            if kind in maps:
-                self._board.put(f'{shaft}/{kind}_spectrum', partial(spectrum_content, average),
-                                by_channel=True)
-                content = maps[kind].add(average.header.end_time, average.values[:CHANNELS])
-                if content is not None:
-                    self._board.put(f'{shaft}/{kind}_map', content, by_channel=True)
-
-        def on_indicators(message: Float64MultiArray) -> None:
-            average = decode_average('condition_indicator', message)
-            self._flows.came(shaft, 'condition_indicator', average)
-            self._board.put(f'{shaft}/condition_indicator', partial(indicators_content, average))
-            values = average.values[:CHANNELS, :INDICATORS]
-            if average.names:
-                self._board.put(f'{shaft}/indicator_trend', indicators.add(
-                    average.header.end_time, average.names[:INDICATORS], values,
-                    values * math.nan), by_channel=True)
-
-        def on_indicator_errors(message: Float64MultiArray) -> None:
-            average = decode_average('condition_indicator_error', message)
-            self._board.put(f'{shaft}/condition_indicator_error',
-                            partial(indicators_content, average))
-            content = indicators.amend(
-                average.header.end_time, average.values[:CHANNELS, :INDICATORS])
-            if content is not None:
-                self._board.put(f'{shaft}/indicator_trend', content, by_channel=True)
+        view = ShaftView(shaft, self._board)
 
         def on_orders(message: Float64MultiArray) -> None:
-            average = decode_average('order_amplitude', message)
+            average = view.on_orders(message)
             self._averages += 1
             self._flows.came(shaft, 'order_amplitude', average)
             names, channels = self._labels['channel_names'], len(average.values)
             self.set_missing('names of the channels', (
                 f'channel_names has {len(names)} and {shaft} has {channels} channels: name each'
                 if names and len(names) != channels else ''))
-            shown = average.values[:CHANNELS, :ORDERS]
-            history = attenuations.add(shown[..., 0], shown[..., 5])
-            self._board.put(f'{shaft}/order_amplitude', partial(orders_content, average, history))
-            for kind, trend in amplitudes.items() if len(shown) else ():
-                self._board.put(f'{shaft}/{kind}_trend', trend.add(
-                    average.header.end_time, tuple(f'{order:.6g}' for order in shown[0, :, 0]),
-                    *amplitude_rows(shown, average.names, kind)), by_channel=True)
 
-        def on_pulses(message: Float64MultiArray) -> None:
-            average = decode_average('pulse_error', message)
-            self._flows.came(shaft, 'pulse_error', average)
-            self._board.put(f'{shaft}/pulse_error', partial(
-                pulses_content, average, errors.add(average.values)))
+        def on_flow(kind: str, show: Callable[[Any], AverageMessage], message: Any) -> None:
+            self._flows.came(shaft, kind, show(message))
 
         callbacks: dict[str, Callable[[Any], None]] = {
-            **{kind: partial(on_waveform, kind)
+            **{kind: partial(view.on_waveform, kind)
                for kind in ('synchronous_average', 'standard_error', 'corrected_average')},
-            'order_amplitude': on_orders, 'pulse_error': on_pulses,
-            'condition_indicator': on_indicators,
-            'condition_indicator_error': on_indicator_errors}
+            'order_amplitude': on_orders,
+            'pulse_error': partial(on_flow, 'pulse_error', view.on_pulses),
+            'condition_indicator': partial(on_flow, 'condition_indicator', view.on_indicators),
+            'condition_indicator_error': view.on_indicator_errors}
         for kind, callback in callbacks.items():
             self.create_input(Float64MultiArray, f'{shaft}/{kind}', callback, RESULT_QOS)
 

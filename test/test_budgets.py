@@ -1,0 +1,97 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""Budgets of pyproject.toml: lines of code of each folder, words of docs, size of functions."""
+
+import ast
+from collections import Counter
+from io import StringIO
+from pathlib import Path
+import sys
+import tokenize
+
+import pytest
+from radon.metrics import mi_visit
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+BUDGETS = tomllib.loads((ROOT / 'pyproject.toml').read_text())['tool']['sa_jitter_ros']['budgets']
+MODULES = sorted((ROOT / 'sa_jitter_ros').rglob('*.py'))
+FUNCTIONS = ast.FunctionDef | ast.AsyncFunctionDef
+NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
+           tokenize.ENDMARKER}
+
+
+def docstring_lines(node):
+    """Return the numbers of the lines of a docstring, none without one."""
+    first = node.body[0] if node.body else None
+    if isinstance(first, ast.Expr) and isinstance(getattr(first.value, 'value', None), str):
+        return set(range(first.lineno, first.end_lineno + 1))
+    return set()
+
+
+def code_lines(text):
+    """Return the number of lines without blanks, comments and docstrings."""
+    lines = set()
+    for token in tokenize.generate_tokens(StringIO(text).readline):
+        if token.type not in NO_CODE:
+            lines.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, (ast.Module, ast.ClassDef, *FUNCTIONS.__args__)):
+            lines -= docstring_lines(node)
+    return len(lines)
+
+
+def test_lines_of_code_are_counted_without_docstrings():
+    text = '"""A module."""\n\nx = (1,  # one\n     2)\n\n\ndef f():\n    """Do."""\n'
+    assert code_lines(text) == 3
+
+
+def test_every_folder_keeps_its_lines_of_code():
+    found = Counter()
+    for path in MODULES:
+        parts = path.relative_to(ROOT / 'sa_jitter_ros').parts
+        found[parts[0] if len(parts) > 1 else 'top'] += code_lines(path.read_text('utf-8'))
+    limits = BUDGETS['lines']
+    assert found.keys() == limits.keys()
+    assert {name: count for name, count in found.items() if count > limits[name]} == {}
+
+
+def test_the_documentation_keeps_its_words():
+    pages = [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))]
+    assert sum(len(page.read_text('utf-8').split()) for page in pages) <= BUDGETS['words']
+
+
+def test_tests_are_as_long_as_what_they_test():
+    lines = [sum(code_lines(path.read_text('utf-8')) for path in (ROOT / folder).rglob('*.py'))
+             for folder in ('test', 'sa_jitter_ros')]
+    assert lines[0] >= BUDGETS['tests_per_line'] * lines[1]
+
+
+@pytest.mark.parametrize('folder', ['sa_jitter_ros', 'test'])
+def test_no_function_is_long(folder):
+    long = {}
+    for path in sorted((ROOT / folder).rglob('*.py')):
+        for node in ast.walk(ast.parse(path.read_text('utf-8'))):
+            if isinstance(node, FUNCTIONS):
+                size = node.end_lineno + 1 - node.lineno - len(docstring_lines(node))
+                if size > BUDGETS['function']:
+                    long[f'{path.relative_to(ROOT)}: {node.name}'] = size
+    assert long == {}
+
+
+def test_every_module_can_be_maintained():
+    found = {path.name: mi_visit(path.read_text('utf-8'), multi=True) for path in MODULES}
+    assert {name: value for name, value in found.items()
+            if value < BUDGETS['maintainability_index']} == {}
