@@ -411,21 +411,66 @@ def parameters_of(name):
 
 
 def table_of_parameters():
-    """Return docs/parameters.md."""
+    """Return docs/parameters.md, where what several nodes have in common stands once."""
+    found = {name: parameter_rows(name) for name in NODES}
+    nodes_of = {}  # of each row
+    for name, rows in found.items():
+        for row in rows:
+            nodes_of.setdefault(row, []).append(name)
     lines = ['# Parameters', '',
-             'The parameters of each node, as `ros2 param describe` prints them. `<shaft>` stands '
-             'for each name in `shafts`. A float parameter accepts an integer.',
-             'A *fixed* parameter is read when the node starts. `python test/test_docs.py` writes '
-             'this page.']
-    for name in NODES:
-        lines += ['', f'## {name}', '| parameter | default | allowed | meaning |',
-                  '|---|---|---|---|']
-        for key, (descriptor, value) in parameters_of(name).items():
-            if key == 'recording':
-                value = ''
-            lines.append(f'| `{key}` | {shown(value)} | {allowed(descriptor)} | '
-                         f'{descriptor.description}{"; *fixed*" * descriptor.read_only} |')
-    return '\n'.join(lines) + '\n'
+             'Every parameter of every node, for whoever writes a machine file or starts a node. '
+             'The first table has those that are the same in several nodes.', '',
+             '`<shaft>` stands for each name in `shafts`. A float parameter accepts an integer. '
+             'A *fixed* parameter is read when the node starts. `ros2 param describe` prints the '
+             'same. `python test/test_docs.py` writes this page.',
+             '', '## Several nodes', *table('parameter', 'nodes', 'default', 'allowed', 'meaning')]
+    lines += [f'| {key} | {those(nodes)} | {" | ".join(rest)} |'
+              for (key, *rest), nodes in nodes_of.items()
+              if len(nodes) > 1 and 'effects.' not in key]
+    for name, rows in found.items():
+        own = [row for row in rows if nodes_of[row] == [name] and 'effects.' not in row[0]]
+        lines += ['', f'## {name}', *table('parameter', 'default', 'allowed', 'meaning')]
+        lines += [f'| {" | ".join(row)} |' for row in own]
+    return '\n'.join([*lines, *table_of_effects(found)]) + '\n'
+
+
+def table_of_effects(found):
+    """Return the lines about the effects, with their defaults in predictor and simulator."""
+    predictor, simulator = ({row[0]: row for row in found[name] if 'effects.' in row[0]}
+                            for name in ('jitter_predictor', 'machine_simulator'))
+    assert predictor.keys() == simulator.keys()
+    lines = ['', '## Effects',
+             '`effects.<name>.enabled` (`false`) adds an effect to the model of '
+             '`jitter_predictor`, or to the machine of `machine_simulator`. '
+             '[What each of them is](theory.md#effects).',
+             '', *table('parameter', 'predictor', 'simulator', 'allowed', 'meaning')]
+    for key, (_, default, limits, meaning) in predictor.items():
+        assert simulator[key][2:] == (limits, meaning)
+        if not key.endswith('.enabled`'):
+            lines.append(f'| {key} | {default} | {simulator[key][1]} | {limits} | {meaning} |')
+    return lines
+
+
+def parameter_rows(name):
+    """Return (name, default, allowed, meaning) of each parameter of a node, in Markdown."""
+    return [(f'`{key}`', '' if key == 'recording' else shown(value), allowed(descriptor),
+             descriptor.description.removesuffix(' [1]') + '; *fixed*' * descriptor.read_only)
+            for key, (descriptor, value) in parameters_of(name).items()]
+
+
+def table(*columns):
+    """Return the first two lines of a table."""
+    return f'| {" | ".join(columns)} |', f'|{"---|" * len(columns)}'
+
+
+def those(nodes):
+    """Return the names of some nodes."""
+    others = [name for name in NODES if name not in nodes]
+    if not others:
+        return 'all'
+    if len(others) < len(nodes):
+        return f'all but {", ".join(others)}'
+    return ', '.join(nodes)
 
 
 def shown(value):
@@ -442,10 +487,14 @@ def allowed(descriptor):
     parts = [descriptor.additional_constraints] if descriptor.additional_constraints else []
     for limits in (*descriptor.floating_point_range, *descriptor.integer_range):
         low, high = limits.from_value, limits.to_value
-        if abs(low) < 1e300 and low > -2**63:
-            parts.append(f'at least {low:g}')
-        if abs(high) < 1e300 and high < 2**63 - 1:
-            parts.append(f'at most {high:g}')
+        has_low = abs(low) < 1e300 and low > -2**63
+        has_high = abs(high) < 1e300 and high < 2**63 - 1
+        if has_low and has_high:
+            parts.append(f'{low:.8g} to {high:.8g}')
+        elif has_low:
+            parts.append(f'at least {low:.8g}')
+        elif has_high:
+            parts.append(f'at most {high:.8g}')
     return '; '.join(parts)
 
 
