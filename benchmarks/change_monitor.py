@@ -137,8 +137,8 @@ class Case:
 CASES = (
     Case('steady machine'),
     Case('load scatters by 2 %', 0.02),
-    Case('load scatters by 2 %, remembers 10 averages', 0.02, 10.0),
-    Case('load scatters by 2 %, remembers 50 averages', 0.02, 50.0),
+    Case('load scatters by 2 %, correlated over 10 averages', 0.02, 10.0),
+    Case('load scatters by 2 %, correlated over 50 averages', 0.02, 50.0),
     Case('keyphasor exchanged for one with twice the noise', later=2.0),
 )
 
@@ -278,7 +278,7 @@ def _of_days(values: FloatArray, learning: int, memory: FloatArray
 def six_weeks_table(count: int, seed: int) -> Iterator[str]:
     """Iterate over the lines of the table of a value a day."""
     baselines = (8, 10, 15, 20)
-    yield '| a day keeps of the one before | ' + ' | '.join(
+    yield '| correlation of successive days | ' + ' | '.join(
         f'baseline of {number}' for number in baselines) + ' |'
     yield '|---|' + '---|' * len(baselines)
     for kept in (0.0, 0.3, 0.6):
