@@ -293,7 +293,7 @@ def main() -> None:
     parser.add_argument('--data', type=Path, help='folder with gear0_gearbox.npz')
     parser.add_argument('--jobs', type=int, default=1, help='processes')
     parser.add_argument('--figures', type=Path, help='folder for the figures')
-    parser.add_argument('--page', type=Path, help='page whose tables are replaced')
+    parser.add_argument('--page', type=Path, help='page whose table of the fleet is replaced')
     options = parser.parse_args()
     tables, figures = {}, {}
     with tempfile.TemporaryDirectory() as folder:
@@ -309,7 +309,7 @@ def main() -> None:
         if options.figures:
             figure.savefig(options.figures / f'{name}.png', dpi=110)
     if options.page:
-        options.page.write_text(fill(options.page.read_text(), tables))
+        options.page.write_text(fill(options.page.read_text(), {'fleet': tables['fleet']}))
 
 
 if __name__ == '__main__':
