@@ -593,7 +593,8 @@ def test_link(document, target):
     assert not anchor or anchor in slugs(found)
 
 
-@pytest.mark.parametrize('document', DOCUMENTS, ids=lambda document: document.name)
+@pytest.mark.parametrize('document', [*DOCUMENTS, ROOT / 'CONTRIBUTING.md'],
+                         ids=lambda document: document.name)
 def test_files_and_tests_that_are_named_exist(document):
     tests = {path.name: path.read_text(encoding='utf-8') for path in (ROOT / 'test').glob('*.py')}
     text = re.sub(r'(?ms)^ *```.*?^ *```', '', document.read_text(encoding='utf-8'))
