@@ -200,8 +200,8 @@ def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
     """
     Tell whether jitter moves pulses over the ticks of a clock.
 
-    Each tick is then an independent error (Widrow and Kollar 2008), and the errors that the
-    `smooth`est motion on the grid tells (pulse,) are wrong: that motion is rougher than the
+    Each tick is then an independent error (Widrow and Kollar 2008), and `smooth` (pulse,), the
+    errors that the smoothest motion on the grid tells, are wrong: that motion is rougher than the
     recovered one, which the ticks do not allow. What repeats with the marks is left in both.
     """
     marks, _ = own_marks(observation.model)
