@@ -52,11 +52,10 @@ PARAMETERS = (
               unit='s', minimum=0.0),
     Parameter('path_delay', 0.0, 'delay of the pulses behind the vibration, of filters and '
               'converters; it is subtracted from their times', unit='s'),
-    Parameter('target_geometry', 'none', 'what is taken from the pulses because the marks of the '
-              'target are uneven: learn (measure how late each mark is), given (by '
-              'target_angles), none', choices=GEOMETRY_MODES),
-    Parameter('target_angles', [], 'how late each mark of the target is, but those of missing '
-              'teeth, which have none; with target_geometry given', unit='rad'),
+    Parameter('target_geometry', 'none', 'correction of uneven marks: learn (measure how late '
+              'each mark is), given (by target_angles), none', choices=GEOMETRY_MODES),
+    Parameter('target_angles', [], 'how late each mark of the target is, without those of '
+              'missing teeth; with target_geometry given', unit='rad'),
     TRIGGER_CYCLES,
     Parameter('maximum_discarded', 0.0, 'largest number of discarded trigger cycles between those '
               'of an average, as a share of trigger_cycles; 0: a discarded cycle ends the average',
@@ -88,9 +87,8 @@ def shaft_parameters(name: str) -> tuple[Parameter, ...]:
                   'the condition indicators', above=0.0),
         Parameter(f'{name}.sidebands', 1, 'pairs of sidebands that belong to each mesh order',
                   minimum=0, maximum=100),
-        Parameter(f'{name}.bearing_orders', [], 'orders at which the bearings of this shaft are '
-                  'struck if they are damaged (cage, balls, rings), for the squared envelope of '
-                  'the residual signal', above=0.0),
+        Parameter(f'{name}.bearing_orders', [], 'orders of the bearings of this shaft (cage, '
+                  'balls, rings), for the squared envelope of the residual signal', above=0.0),
         Parameter(f'{name}.envelope_band', [], 'lowest and highest frequency of the residual '
                   'signal whose envelope is taken; empty: all', unit='Hz', minimum=0.0),
     )

@@ -49,10 +49,10 @@ PARAMETERS = (
               maximum=10000000, read_only=True),
     Parameter('group_averages', 5, 'consecutive averages whose mean is tested', minimum=1,
               maximum=10000, read_only=True),
-    Parameter('allow_uncorrected', False, 'take raw amplitudes and indicators where an average '
-              'has no correction; then another keyphasor is a change, too'),
-    Parameter('speed_bin', 0.05, 'relative width of a bin of speed, in each of which the machine '
-              'has a baseline of its own', minimum=1e-4, maximum=1.0, read_only=True),
+    Parameter('allow_uncorrected', False, 'take raw values where an average has no correction; '
+              'then another keyphasor is a change, too'),
+    Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
+              minimum=1e-4, maximum=1.0, read_only=True),
 )
 
 

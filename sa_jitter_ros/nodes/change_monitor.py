@@ -32,8 +32,8 @@ from std_msgs.msg import Float64MultiArray, String
 PARAMETERS = (
     Parameter('shafts', ['shaft'], 'names of the shafts that are monitored', read_only=True),
     *TEST_PARAMETERS,
-    Parameter('severe_change', 0.25, 'relative change that is an error, if it is at least that '
-              'large by two standard errors; smaller ones are warnings', above=0.0,
+    Parameter('severe_change', 0.25, 'relative change that is an error, if it is larger by two '
+              'standard errors; smaller ones are warnings', above=0.0,
               maximum=1e6),
     Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: '
               'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: it is '

@@ -33,13 +33,13 @@ FloatArray = NDArray[np.float64]
 PARAMETERS = (
     Parameter('recording', '', 'file or rosbag2 folder to play', read_only=True),
     Parameter('loop', False, 'start again at the end; times and indices continue'),
-    Parameter('tach', 'auto', 'keyphasor to play: pulses, waveform, reference (pulses of the '
-              'reference keyphasor), both (pulses and waveform), none, or auto: the first of '
-              'pulses, waveform and reference in the file',
+    Parameter('tach', 'auto', 'keyphasor to play; reference: pulses of the reference keyphasor; '
+              'both: pulses and waveform; auto: the first of pulses, waveform and reference in '
+              'the file',
               choices=('auto', 'pulses', 'waveform', 'reference', 'both', 'none'),
               read_only=True),
-    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate, as if the '
-              'keyphasor had been sampled with it; 0: times as recorded', unit='Hz', minimum=0.0,
+    Parameter('keyphasor_rate', 0.0, 'round pulse times up to a clock of this rate; 0: times as '
+              'recorded', unit='Hz', minimum=0.0,
               read_only=True),
     Parameter('recorded_keyphasor', '', 'keyphasor to play, of a bag that contains several; '
               'empty: the first', read_only=True),
