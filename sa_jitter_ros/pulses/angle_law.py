@@ -15,7 +15,7 @@ An angle law takes the pulse times around a trigger cycle and returns the times 
 the cycle. The linear law (Camerini et al. 2019, Eq. 5) needs only the two pulses of the cycle, so
 that a cycle can be averaged as soon as it ends, and it attenuates least under pulse jitter. The
 quadratic law follows a constant acceleration (Potter 1990; Fyfe and Munck 1997), the spline a
-smooth speed (Villa 2008). Both transfer more of the pulse jitter to the angle.
+smooth speed (Villa 2011). Both transfer more of the pulse jitter to the angle.
 
 The `PulseWeights` of a law say how errors of the pulses act on the angle. With pulse errors eps_k
 (fundamental cycles) the angle in cycle ``k`` is wrong by
