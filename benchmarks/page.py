@@ -21,8 +21,8 @@ LONG = 240.0  # s that a node must have lived for a trend
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
-    lines = [header, ['---'] * len(header), *rows]
-    return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
+    head, *body = (f'| {" | ".join(line)} |' for line in (header, *rows))
+    return '\n'.join((head, '|' + '---|' * len(header), *body))
 
 
 def fill(page: str, contents: Mapping[str, str]) -> str:

@@ -38,7 +38,6 @@ PEERS = (('numpy', 'scipy', 'setuptools'), ('rota-order',), ('acoular',), ('--pr
 # What the wheels of ROS 2 leave for child processes, wrong for another environment's Python.
 WHEELS = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'
 OURS = 'sa_jitter_ros, resampling and mean'
-REFERENCE = 'quintic spline'
 
 
 def environment_without_ros() -> dict[str, str]:
@@ -95,7 +94,7 @@ def sections(found: Mapping[str, Any]) -> dict[str, str]:
     core, loop, graph = found['core'], found['loop'], found['graph']
     return {
         'machine': _machine(core, loop, graph), 'core': _comparisons(core['comparisons']),
-        'limits': _limits(core), 'growth': _growth(core), 'loop': _loop(loop),
+        'limits': _limits(core), 'loop': _loop(loop),
         'shares': table(('on line', 'CPU share of one core'),
                         [(name, f'{share:.0%}') for name, share in core['shares'].items()]),
         'threads': table(('threads of linear algebra', 'recovery of 100 trigger cycles x 8 '
@@ -115,52 +114,35 @@ def _machine(core: Mapping[str, Any], loop: Mapping[str, Any], graph: Mapping[st
     return table(('', ''), rows)
 
 
-def _comparisons(comparisons: Iterable[Mapping[str, Any]]) -> str:
-    texts = []
-    for comparison in comparisons:
-        rows, reference = comparison['rows'], comparison['rows'][REFERENCE]['best']
-        bands = ' / '.join(f'{band:.2f}' for band in comparison['bands'])
-        lines = []
-        for name, row in rows.items():
-            gain = ('-' if row['gains'] is None
-                    else ' / '.join(f'{value:.4f}' for value in row['gains']))
-            lines.append((
-                name + ('*' if row['note'] else ''), f'{row["best"]:.3f}', f'{row["median"]:.3f}',
-                f'{row["nanoseconds"]:.1f}', f'{reference / row["best"]:.3g}', gain))
-        text = (f'**{comparison["channels"]} channels, {comparison["seconds"]:g} s, ratio '
-                f'{comparison["ratio"]:g}**\n\n')
-        text += table(('method', 'CPU s, least', 'median', 'ns per sample and channel',
-                       f'speed, {REFERENCE} = 1', f'gain error in dB at f/fs = {bands}'), lines)
-        notes = [f'\\* {name}: {row["note"]}.' for name, row in rows.items() if row['note']]
-        notes += [f'{name} was skipped: {why}.' for name, why in comparison['skipped'].items()]
-        texts.append('\n\n'.join((text, *notes)))
-    return '\n\n'.join(texts)
+def _comparisons(comparisons: Sequence[Mapping[str, Any]]) -> str:
+    """Return the time of each method in every comparison, and its gains in the first one."""
+    first, lines = comparisons[0], []
+    for name, row in first['rows'].items():
+        gain = '-' if row['gains'] is None else ' / '.join(f'{item:.4f}' for item in row['gains'])
+        lines.append((name + '*' * bool(row['note']), *(
+            f'{item["rows"][name]["nanoseconds"]:.1f}' if name in item['rows'] else '-'
+            for item in comparisons), gain))
+    text = table(('method', *(f'{item["channels"]} channels, ratio {item["ratio"]:g}'
+                              for item in comparisons),
+                  f'gain error in dB at f/fs = {" / ".join(f"{f:.2f}" for f in first["bands"])}'),
+                 lines)
+    notes = [f'\\* {name}: {row["note"]}.' for name, row in first['rows'].items() if row['note']]
+    notes += [f'{name} was skipped: {why}.' for name, why in first['skipped'].items()]
+    return '\n\n'.join((text, *notes))
 
 
 def _limits(core: Mapping[str, Any]) -> str:
-    limits = core['limits']
-    rows = []
-    for comparison in core['comparisons']:
-        for name in (OURS, 'sa_jitter_ros, on line'):
-            value = comparison['rows'][name]['nanoseconds']
-            rows.append((f'{name}, {comparison["channels"]} channels, ratio '
-                         f'{comparison["ratio"]:g}', f'{value:.1f}',
-                         f'{value / limits["memory"]:.0f}', f'{value / limits["arithmetic"]:.0f}'))
+    limits, texts = core['limits'], []
+    for name in (OURS, 'sa_jitter_ros, on line'):
+        times = [item['rows'][name]['nanoseconds'] / limits['arithmetic']
+                 for item in core['comparisons']]
+        texts.append(f'*{name.partition(", ")[2]}* takes {min(times):.0f} to {max(times):.0f} '
+                     'times the latter')
     return (f'One core reads {limits["bandwidth"] / 1e9:.1f} GB/s from memory and does '
             f'{limits["multiply_adds"] / 1e9:.1f} 10^9 multiply-adds a second in a product of '
             f'matrices: {limits["memory"]:.2f} ns to read a sample of 8 bytes once, '
-            f'{limits["arithmetic"]:.2f} ns for the 16 multiply-adds of a resampled value.\n\n'
-            + table(('', 'ns per sample and channel', 'times memory limit',
-                     'times arithmetic limit'), rows))
-
-
-def _growth(core: Mapping[str, Any]) -> str:
-    rows = [(name, ' / '.join(values), ' / '.join(f'{value:.1f}' for value in values.values()))
-            for name, values in core['growth'].items()]
-    memory = core['memory']
-    rows.append(('memory in MB over record length in s', ' / '.join(memory),
-                 ' / '.join(f'{value:.2f}' for value in memory.values())))
-    return table(('what grows', 'values', 'ns per sample and channel, or MB'), rows)
+            f'{limits["arithmetic"]:.2f} ns for the 16 multiply-adds of a resampled value. '
+            f'{", ".join(texts)}.')
 
 
 def _loop(loop: Mapping[str, Any]) -> str:
@@ -182,11 +164,9 @@ def _closed(item: Mapping[str, Any]) -> tuple[str, str, str]:
 
 def _graph(runs: Iterable[Mapping[str, Any]]) -> str:
     return table(
-        ('channels', 'shared memory', 'MB/s', 'ms in a message', 'CPU share of one core',
-         'peak memory in MB', 'averages', 'latency from the last pulse in ms, median / 99 %',
-         'sustained'),
-        [(str(run['channels']), _memory(run), f'{run["megabytes_per_second"]:.3g}',
-          f'{run["block_milliseconds"]:.3g}', f'{run["cpu_share"]:.1%}',
+        ('channels', 'shared memory', 'CPU share of one core', 'peak memory in MB', 'averages',
+         'latency from the last pulse in ms, median / 99 %', 'sustained'),
+        [(str(run['channels']), _memory(run), f'{run["cpu_share"]:.1%}',
           f'{run["peak_megabytes"]:.0f}', f'{run["averages"]} of {run["expected"]}',
           f'{run["pulse_median"]:.0f} / {run["pulse_99"]:.0f}',
           'yes' if run['sustained'] else 'no') for run in runs])
@@ -210,14 +190,10 @@ def _saturation(runs: Iterable[Mapping[str, Any]]) -> str:
     failed = [run for run in runs if not run['sustained']]
     if not failed:
         return 'Nothing saturated at these numbers of channels.'
-    texts = []
-    for run in failed:
-        diagnostics = run['diagnostics']
-        counts = ', '.join(f'{key} {value}' for key, value in diagnostics['counts'].items())
-        texts.append(f'{run["channels"]} channels, {_memory(run)}: level '
-                     f'{diagnostics["level"]} (1 = WARN), {counts}')
-        texts += [f'    {message}' for message in diagnostics['messages']]
-    return '\n\n'.join(texts)
+    names = list(failed[0]['diagnostics']['counts'])
+    return table(('channels', 'shared memory', *(f'`{name}`' for name in names)), [
+        (str(run['channels']), _memory(run),
+         *(str(run['diagnostics']['counts'][name]) for name in names)) for run in failed])
 
 
 def draw(found: Mapping[str, Any], folder: Path) -> None:
