@@ -14,7 +14,7 @@ Standard errors of order amplitudes and phases, and upper limits of orders that 
 The scatter of the single trigger cycles shows them. Along the radius of the complex mean it is
 noise; across it noise and jitter. Neighbouring cycles have a pulse in common, so that jitter makes
 half of the variance of one cycle the covariance with the next, and the variance of the mean of N_t
-cycles is twice that of independent ones (Camerini et al. 2019, Eq. 32, leaves this out). From
+cycles is twice that of independent ones (the covariances of Camerini et al. 2019, Eq. 32). From
 `_MANY` cycles on the spectrum of the scatter near frequency zero shows what the mean has,
 whatever its correlation; fewer cycles determine the standard deviation of one independent error
 for each pulse, with all channels and orders together. A correction knows the pulse errors and the
