@@ -116,27 +116,23 @@ def _findings(
     return (
         Finding('Fig. 3a', 'the mean of g1: the relative error of Eq. 40 grows with D and keeps '
                 'very small',
-                f'largest relative error for D from 0.1 to 0.4: {100.0 * mean_error:.2f} %; '
-                f'Eq. 38 agrees with quadrature to '
+                f'up to D = 0.4 {100.0 * mean_error:.2f} %; Eq. 38 agrees with quadrature to '
                 f'{third["Eq. 38"]["largest_relative_error"]:.0e}',
                 agreement(mean_error < 0.01,
                           third['Eq. 38']['largest_relative_error'] < 1e-9)),
         Finding('Fig. 3b', 'accurate approximations of the covariances (Eqs. 41 to 45)',
-                f'largest relative errors for D from 0.1 to 0.4: {terms}',
+                f'relative errors up to D = 0.4: {terms}',
                 agreement(*(third[name]['largest_relative_error'] < 0.05 for name in _TERMS))),
         Finding('Fig. 3', 'g2 dominates the variance, g1 the mean',
                 f'D = 0.4: Var g1 = {exact[1, at]:.4f}, Var g2 = {exact[2, at]:.4f}, E g1 = '
                 f'{exact[0, at]:.4f}, E g2 = 0',
                 agreement(exact[2, at] > 5.0 * exact[1, at])),
         Finding('Fig. 8', 'approximate and simulated distributions agree well',
-                f'largest distance of the distribution functions over D: {max(twenty):.3f} for '
-                f'N_t = 20, {max(hundred):.3f} for N_t = 100; {effort.iterations} draws resolve '
-                f'{resolution:.4f} (KS, 1 %)',
+                f'KS distance up to {max(twenty):.3f} for N_t = 20, {max(hundred):.3f} for '
+                f'N_t = 100; {effort.iterations} draws resolve {resolution:.4f}',
                 agreement(max(distances) < 0.1, max(distances) < resolution),
-                'Close, but a KS test separates them. With exact moments '
-                f'{max(normal):.3f} remains: a normal vector lacks the curvature of the arc that '
-                'timing errors draw. The curved distribution of the package is within '
-                f'{max(curved):.4f}.'),
+                f'With exact moments {max(normal):.3f} remains: a normal X does not lie along an '
+                f'arc. The curved distribution of the package is within {max(curved):.4f}.'),
         Finding('Fig. 8', 'for high D the expected value is slightly underestimated',
                 'D = 0.4: E|X|^2 simulated minus approximate = '
                 + ' and '.join(f'{gap:.5f}' for gap in shortfall)
@@ -146,8 +142,7 @@ def _findings(
                 f'skewness of |X|^2: {min(skewness):.2f} to {max(skewness):.2f}, most for '
                 f'{most_skewed}',
                 agreement(max(np.abs(skewness)) < 0.1, max(np.abs(skewness)) < 0.5),
-                'Not zero: the radial part is a mean of few one-sided losses, and its skewness '
-                'falls with the root of N_t.'),
+                'Losses are one-sided; skewness falls with the root of N_t.'),
     )
 
 

@@ -168,41 +168,36 @@ def _findings(ratios: dict[str, Array], predicted: Array, numbers: dict[str, Any
 
     return (
         Finding('Fig. 16a,b', 'the average attenuation is predicted very well',
-                f'mean ratio of the near sensors {means}; KS of each near sensor and harmonic '
-                f'({near[0].sizes[0]} against {near[0].sizes[1]}): smallest p '
+                f'mean ratio of the near sensors {means}; KS ({near[0].sizes[0]} against '
+                f'{near[0].sizes[1]}): smallest p '
                 f'{min(item.p_value for item in near):.3f}',
                 agreement(gap < 0.005, one_distribution(near))),
-        Finding('Fig. 16a,b', 'more dispersion than predicted, from noise: least at the sensors '
-                'close to the mesh',
+        Finding('Fig. 16a,b', 'more dispersion than predicted, from noise, least close to the '
+                'mesh',
                 'standard deviation for orders 19 and 38: predicted ' + listed(stds) + '; '
                 + '; '.join(f'{sensor} {listed(values)}' for sensor, values in spread.items()),
                 agreement(*(spread['far 2'][h] > max(spread['near 1'][h], stds[h])
                             for h in range(len(HARMONICS))))),
         Finding('Fig. 16a,b', 'the dispersion of the second harmonic is nearer to the predicted '
                 'one, close to the mesh',
-                'standard deviation over the predicted one for orders 19 and 38: '
+                'over predicted, orders 19 and 38: '
                 + '; '.join(f'{sensor} {first:.2f} and {second:.2f}'
                             for sensor, (first, second) in zip(SENSORS, excess))
-                + f'; mean logarithm of first over second {nearer:.3f} +- {error_of_nearer:.3f}',
+                + f'; logarithm of first over second {nearer:.3f} +- {error_of_nearer:.3f}',
                 agreement(*(second < first for first, second in excess[:_NEAR]),
                           nearer > _ORDINARY * error_of_nearer),
-                f'So as far as {len(linear)} acquisitions tell it. The paper names the signal to '
-                'noise ratio of the second harmonic. Ours is lower than that of the first; but '
-                'the scatter from jitter grows with the square of the order, that from noise does '
-                'not.'),
+                f'Not significant with {len(linear)} acquisitions.'),
         Finding('Fig. 16c-f', 'the linear law attenuates less than the quadratic law and the '
-                'spline, at all sensors and both harmonics',
+                'spline',
                 'loss of orders 19 and 38 (near sensors): '
                 + '; '.join(f'{law} {listed(values)}' for law, values in losses.items())
-                + '; sign tests of linear against quadratic '
-                f'{chance(tests["quadratic"])}, against spline {chance(tests["spline"])}; '
-                'smallest advantage of the mean over all sensors and both harmonics '
-                f'{advantage["quadratic"]:.4f} and {advantage["spline"]:.4f}',
+                + '; sign tests '
+                f'{chance(tests["quadratic"])} and {chance(tests["spline"])}; smallest '
+                f'advantage {advantage["quadratic"]:.4f} and {advantage["spline"]:.4f}',
                 agreement(*(value < SIGNIFICANCE for value in tests.values()),
                           min(advantage.values()) > 0.0),
-                'A law passes on the mean square of the pulse errors times '
-                + ', '.join(f'{value:.3f} ({law})' for law, value in error.items())
-                + ': the small-jitter attenuation is proportional to it.'),
+                'As the mean square angle errors: '
+                + ', '.join(f'{value:.3f} ({law})' for law, value in error.items()) + '.'),
     )
 
 

@@ -192,35 +192,28 @@ def _findings(fleet: list[Flights], predicted: Array, noisy: list[Array],
     z = same[0].mean() / (same[0].std() / math.sqrt(same[0].size))
     others = _other_cases(fleet, noisy)
     return (
-        Finding('Table 5, Fig. 21', 'the distribution of the amplitude ratio of each helicopter '
-                'agrees with the prediction',
-                f'mean ratio of {pooled.size} acquisitions {pooled.mean():.4f} (predicted '
-                f'{plain.mean():.4f}); KS distance of each of {len(tests)} helicopters (about '
-                f'{tests[0].sizes[0]} against {tests[0].sizes[1]}) '
-                f'{min(item.distance for item in tests):.3f} to '
-                f'{max(item.distance for item in tests):.3f}, smallest p '
-                f'{min(item.p_value for item in tests):.2g}',
-                agreement(abs(gap) < _CLOSE, one_distribution(tests)),
-                'Not reproducible on the recordings of the paper, which are not public; simulated '
-                'flights instead.'),
+        Finding('Table 5, Fig. 21', 'the amplitude ratios of each helicopter are distributed as '
+                'predicted',
+                f'mean ratio {pooled.mean():.4f} (predicted {plain.mean():.4f}); KS of '
+                f'{len(tests)} helicopters (about {tests[0].sizes[0]} against '
+                f'{tests[0].sizes[1]}): smallest p {min(item.p_value for item in tests):.2g}',
+                agreement(abs(gap) < _CLOSE, one_distribution(tests))),
         Finding('Fig. 21', 'more dispersion than predicted, which the noise explains',
-                f'standard deviation: predicted {np.std(plain):.4f}; helicopters from the least '
-                f'to the most noise {spread[0]:.4f} to {spread[-1]:.4f}, predicted with the noise '
-                f'{scatter[0]:.4f} to {scatter[-1]:.4f}; KS of each helicopter against the '
-                f'prediction with its noise: smallest p '
+                f'standard deviation predicted {np.std(plain):.4f}; least to most noise '
+                f'{spread[0]:.4f} to {spread[-1]:.4f}, predicted with it {scatter[0]:.4f} to '
+                f'{scatter[-1]:.4f}; KS: smallest p '
                 f'{min(item.p_value for item in explained):.3f}',
                 agreement(spread[-1] > float(np.std(plain)), one_distribution(explained))),
         Finding('Section 5.2.2', 'the added pulse errors are properly described by the model',
-                'measured minus modelled ratio under the same pulse errors: mean and standard '
-                f'deviation {same[0].mean():.5f} and {same[0].std():.4f} with the least noise, '
-                f'{same[1].mean():.5f} and {same[1].std():.4f} with the most',
+                'measured minus modelled ratio under the same pulse errors: '
+                f'{same[0].mean():.5f} +- {same[0].std():.4f} with the least noise, '
+                f'{same[1].mean():.5f} +- {same[1].std():.4f} with the most',
                 agreement(abs(z) < _ORDINARY, float(same[0].std()) < 0.2 * spread[0]),
-                'What remains with the least noise is the change of speed within trigger '
-                'cycles, which the linear law does not follow.'),
+                'With the least noise, speed changes within trigger cycles remain.'),
         Finding('Section 5.2.2', 'consistent for other uncertainties and harmonics',
                 '; '.join(f'{name}: mean {mean:.4f} (predicted {expected:.4f})'
                           for name, (mean, expected, _) in others.items())
-                + '; KS of each helicopter: smallest p '
+                + '; KS: smallest p '
                 f'{min(item.p_value for *_, tests in others.values() for item in tests):.3f}',
                 agreement(one_distribution(
                     [item for *_, tests in others.values() for item in tests]))))

@@ -91,11 +91,10 @@ def _findings(
         Finding('Fig. 7', 'simulations and the exact model agree',
                 f'KS over {len(tests)} cases of {tests[0].sizes[0]} against {tests[0].sizes[1]}: '
                 f'smallest p {min(item.p_value for item in tests):.3f}; with the same pulse '
-                f'errors the amplitudes differ by at most {gap:.1e} beside a second harmonic of '
-                f'{AMPLITUDE_RATIO:g}',
+                f'errors amplitudes differ by at most {gap:.1e}',
                 agreement(one_distribution(tests), gap < 1e-3)),
         Finding('Fig. 7a', 'r = 2.286: the approximate model is not suitable',
-                f'KS distance of approximate and exact model for r_hf = 2, 3, 4: {listed(rough)}',
+                f'KS distance of the models for r_hf = 2, 3, 4: {listed(rough)}',
                 agreement(*(value > 0.1 for value in rough))),
         Finding('Fig. 7a', 'r = 2.286: mean as for a single harmonic, more dispersion, most for '
                 'the closest order',
@@ -107,11 +106,10 @@ def _findings(
         Finding('Fig. 7b', 'r = 1: the approximate model equals the exact one',
                 f'largest difference {smooth:.1e}', agreement(smooth < 1e-10)),
         Finding('Fig. 7b', 'r = 1: the average attenuation differs strongly, orders interact',
-                f'mean {listed(means(whole))}, so {listed(bias)} away from a single harmonic; '
-                f'exact moments with leakage predict |E X| = {listed(predicted)}',
+                f'mean {listed(means(whole))} (single {alone["mean"]:.4f}); leakage predicts '
+                f'{listed(predicted)}',
                 agreement(*(abs(value) > 0.05 for value in bias)),
-                'For integer r the leakage of every trigger cycle is in phase: a bias that no '
-                'number of revolutions removes.'),
+                'If r is an integer, [leakage](theory.md#leakage) is a bias.'),
     )
 
 

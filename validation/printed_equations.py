@@ -34,11 +34,9 @@ _WIDTH = 0.4  # of the pulse error where two models are compared
 
 @dataclass(frozen=True)
 class Erratum:
-    """An equation as printed and as it holds, and the largest error of either."""
+    """The largest errors of an equation, as it is printed and as it is right."""
 
     equation: str
-    printed: str
-    right: str
     printed_error: float
     right_error: float
 
@@ -54,8 +52,7 @@ def slope_of_the_linear_law() -> Erratum:
                       / (pulses[k + 1] - pulses[k]) + k - (k + u)).max()
                for k in range(pulses.size - 1)]
         errors.append(float(max(off)))
-    return Erratum('5', 'slope times t', 'slope times (t - T_p): as printed, the angle jumps at '
-                   'every pulse', *errors)
+    return Erratum('5', *errors)
 
 
 def sum_of_the_cycles() -> Erratum:
@@ -69,8 +66,7 @@ def sum_of_the_cycles() -> Erratum:
         for k, factor in enumerate((_CYCLES, 1.0)):
             errors[k] = max(errors[k], np.abs(cycles.mean(axis=0) - factor * response * tone
                                               ).max())
-    return Erratum('7', 'the sum of N terms', 'the sum over N, as in Eqs. 6 and 8',
-                   *errors.tolist())
+    return Erratum('7', *errors.tolist())
 
 
 def phase_of_a_cycle(length: float, order: float) -> Erratum:
@@ -82,8 +78,7 @@ def phase_of_a_cycle(length: float, order: float) -> Erratum:
         for number, factor in enumerate((1.0, order)):
             given = np.exp(2j * np.pi * (order * theta + phase + factor * k * length))
             errors[number] = max(errors[number], np.abs(cycle - given).max())
-    return Erratum('17', 'phase (k-1) Theta of cycle k', 'gamma* (k-1) Theta, as in Eqs. 18 to '
-                   '22; the same where Theta = 1', *errors.tolist())
+    return Erratum('17', *errors.tolist())
 
 
 def jittered_cycles(order: float, phase: float) -> tuple[ComplexArray, ComplexArray]:
@@ -114,10 +109,9 @@ def initial_phase() -> Erratum:
     phase = 0.2
     without, _ = jittered_cycles(4.0, 0.0)
     with_phase, _ = jittered_cycles(4.0, phase)
-    return Erratum('text below 22', 'factor exp(j eta_0) for an initial phase',
-                   'exp(j 2 pi eta_0): Eq. 17 counts eta_0 in cycles',
-                   *(float(np.abs(np.exp(1j * turn * phase) * without - with_phase).max())
-                     for turn in (1.0, 2.0 * np.pi)))
+    return Erratum('text below 22', *(
+        float(np.abs(np.exp(1j * turn * phase) * without - with_phase).max())
+        for turn in (1.0, 2.0 * np.pi)))
 
 
 def comb_error() -> float:
@@ -165,33 +159,27 @@ def run(effort: Effort, progress: Progress) -> Results:
         'equation_17_with_theta_1': parametrised.printed_error, 'equation_18': jittered,
         'equation_8': comb, 'equation_12': shifted, 'equation_38': stretched,
         'noise_times_root_of_n': {'value': noise, 'standard_error': standard_error}}
-    table = (('equation', 'as printed', 'right', 'largest error as printed', 'right'),
-             *((item.equation, item.printed, item.right, f'{item.printed_error:.2g}',
-                f'{item.right_error:.0e}') for item in errata))
     return Results(
         'Angle law, comb filter, jittered cycles: Eqs. 5 to 18', numbers,
         (Finding('Eq. 8', 'the average is a comb filter of unit gain at whole orders',
-                 f'averages of {_CYCLES} cycles of six tones, two of whole order, one in a notch: '
-                 f'largest difference {comb:.1e}', agreement(comb < 1e-6)),
+                 f'{_CYCLES} cycles of six tones: largest difference {comb:.1e}',
+                 agreement(comb < 1e-6)),
          Finding('Section 2.2', 'stationary noise is attenuated by 1/sqrt(N)',
-                 f'white noise after {_CYCLES} cycles, times sqrt(N): {noise:.4f} +- '
+                 f'after {_CYCLES} cycles, times sqrt(N): {noise:.4f} +- '
                  f'{standard_error:.4f}',
                  agreement(abs(noise - 1.0) < _ORDINARY * standard_error)),
          Finding('Eqs. 9-12', 'a random shift of each cycle is no model of order tracking',
-                 f'D = {_WIDTH}: gain of the shifts {shifted:.4f} (Eq. 12), of the linear law '
-                 f'{stretched:.4f} (Eq. 38)', agreement(stretched - shifted > 0.05),
-                 'The linear law spreads the error of a pulse over two cycles and takes it back '
-                 'to none.'),
+                 f'gain at D = {_WIDTH}: shifts {shifted:.4f} (Eq. 12), linear law '
+                 f'{stretched:.4f} (Eq. 38)', agreement(stretched - shifted > 0.05)),
          Finding('Eqs. 16, 18', 'jitter stretches a cycle and moves it',
-                 f'cycles read by the linear law between jittered pulses, r = 3: largest '
-                 f'difference from Eq. 18 {jittered:.0e}', agreement(jittered < _EXACT)),
+                 f'r = 3: largest difference from Eq. 18 {jittered:.0e}',
+                 agreement(jittered < _EXACT)),
          Finding('Eqs. 5, 7, 17', 'as printed', 'largest errors '
                  + ', '.join(f'{item.printed_error:.2g}' for item in errata[:3]) + '; corrected '
                  + ', '.join(f'{item.right_error:.0e}' for item in errata[:3]),
                  agreement(*(item.printed_error < _EXACT for item in errata[:3])),
-                 'Errata, in the table below and with all others in '
-                 '[theory.md](theory.md#errata-of-the-paper). No later equation has them: for '
-                 'Theta = 1, as from Eq. 26 on, Eq. 17 as printed is right, too '
+                 '[Errata](theory.md#errata-of-the-paper), which no later equation has: for '
+                 'Theta = 1, as from Eq. 26 on, Eq. 17 is right as printed '
                  f'({parametrised.printed_error:.0e}).')),
         {}, ('Largest errors are in trigger cycles (Eq. 5), or of a component of amplitude 1. '
-             'Eq. 17 with Theta = 0.5, gamma* = 10.',), (table,))
+             'Eq. 17 with Theta = 0.5, gamma* = 10.',))

@@ -78,36 +78,24 @@ def run(effort: Effort, progress: Progress) -> Results:
         progress(number / len(TABLE_3))
     numbers = {str(number): {'learnt': asdict(learnt), f'{WIDE}': asdict(wide)}
                for number, (learnt, wide) in found.items()}
-    table = (('simulation', 'N_t', 'r', 'D', 'width of the pulse error / interval',
-              'recordings with losses, default', 'cycles lost',
-              f'recordings with losses, `interval_tolerance` {WIDE}', 'cycles lost'),
-             *((str(number), str(cycles), f'{ratio:g}', f'{width:g}', f'{width / ratio:.3f}',
-                *(text for item in found[number] for text in (
-                    f'{item.with_losses} of {item.recordings}', f'{100.0 * item.share:.2f} %')))
-               for number, cycles, ratio, width in TABLE_3))
     return Results(
         'Pulse validation under jitter: Table 3 through `average`', numbers, (_finding(found),),
         {}, ('The other parts of this page average between the pulses as they are, without '
              'validation, as the paper does; `average`, the library and the nodes validate them '
-             'first.',), (table,))
+             'first.',))
 
 
 def _finding(found: dict[int, tuple[Losses, Losses]]) -> Finding:
     first, remedied = found[1]
     default, wide = (sum(item[k].lost for item in found.values()) for k in (0, 1))
     total = sum(item.recordings * item.cycles for item, _ in found.values())
-    width = TABLE_3[0][3] / TABLE_3[0][2]
     return Finding(
         'Table 3', 'all N_t trigger cycles of a recording are averaged',
-        f'`average` with default tolerances: {first.with_losses} of {first.recordings} recordings '
-        f'of simulation 1 lose cycles, {first.lost} of {first.recordings * first.cycles}; '
-        f'with `interval_tolerance` {WIDE}: {remedied.with_losses}, {remedied.lost} cycles. '
-        f'All simulations: {default} of {total} cycles, with {WIDE} {wide}',
+        f'{first.with_losses} of {first.recordings} recordings of simulation 1 lose cycles, '
+        f'{first.lost} of {first.recordings * first.cycles}; with `interval_tolerance` {WIDE} '
+        f'{remedied.with_losses}, {remedied.lost} cycles. All simulations: {default} of {total} '
+        f'cycles, with {WIDE} {wide}',
         agreement(default == 0, wide <= _FEW * total),
-        'The default tolerance is learnt from the first dozen intervals, each compared with the '
-        'one before it. With an error of this width these differ with a standard deviation of '
-        f'{width * math.sqrt(0.5):.2f} of an interval: those of some recordings look like pulses '
-        'that come at random, of others like stray, displaced or missing pulses. Where jitter is '
-        f'known to be a tenth of an interval or more, set `interval_tolerance` to {WIDE}: what is '
-        'still lost is mostly a first pulse, taken for a stray. A `DataWarning` and the counts of '
-        'the averager tell what is lost.')
+        'So large a jitter looks like stray or missing pulses. If it is known to be a tenth of an '
+        f'interval or more, set `interval_tolerance` to {WIDE}. Counts and a `DataWarning` say '
+        'what is lost.')

@@ -23,20 +23,23 @@ from validation.results import Effort, Results
 
 _INTRODUCTION = """# Validation against the paper
 
-V. Camerini, G. Coppotelli, S. Bendisch, D. Kiehn, "Impact of pulse time uncertainty on
-synchronous average: Statistical analysis and relevance to rotating machinery diagnosis" (2019):
-every numerical result of the paper, compared with that of this package. One command writes this
-page, its figures and `validation.json`, with every number in them:
+For whoever wants to know how far this package reproduces V. Camerini, G. Coppotelli, S. Bendisch,
+D. Kiehn, "Impact of pulse time uncertainty on synchronous average: Statistical analysis and
+relevance to rotating machinery diagnosis" (2019). One command compares every numerical result of
+the paper with ours, and writes this page, its figures and `validation.json`:
 
     {command}
 
-D is the width of the uniform pulse error in cycles of the analysed order, N_t the number of
-averaged trigger cycles, r the cycle length: fundamental cycles in a trigger cycle.
+`validation.json` holds the numbers of each case, and the settings that differ from the paper or
+that the paper does not give.
 
-The command decides the agreement: *yes* if all its conditions hold, *partly* if some do. Samples
-are compared by two-sample Kolmogorov-Smirnov tests with their own sizes, at 1 % for each family of
-comparisons (Bonferroni). Full simulation and model are also compared draw by draw under the same
-pulse errors, which is stricter than any test of distributions.
+D is the width of the uniform pulse error in cycles of the analysed order, N_t the number of
+trigger cycles in an average, r that of fundamental cycles in a trigger cycle. The exact model
+splits fundamental cycles that straddle a pulse, the approximate one (Eq. 26) does not. KS is a
+two-sample Kolmogorov-Smirnov test, at 1 % for each family of comparisons (Bonferroni). Of the
+kurtosis, *separation* is the difference of the means over the standard deviation, *detection* that
+at 5 % false alarms, *area* that under the ROC curve. The agreement is *yes* if all conditions of
+the command hold, *partly* if some do.
 
 """
 
@@ -54,6 +57,7 @@ def write(results: Mapping[str, Results], effort: Effort, command: str, folder: 
             figure.savefig(figures / f'validation-{stem}.png', metadata={'Software': None})
     document = {'command': command, 'effort': asdict(effort),
                 'groups': {group.title: group.numbers for group in groups},
+                'settings': {group.title: group.choices for group in groups if group.choices},
                 'findings': [asdict(finding) for group in groups for finding in group.findings]}
     (folder / 'validation.json').write_text(
         json.dumps(_as_json(document), indent=1, allow_nan=False) + '\n', encoding='utf-8')
@@ -66,37 +70,32 @@ def page(results: Mapping[str, Results], command: str) -> str:
     count = Counter(finding.agreement for group in groups for finding in group.findings)
     lines = [_INTRODUCTION.format(command=command)
              + f'Of {sum(count.values())} findings {count["yes"]} are reproduced, '
-             f'{count["partly"]} partly, {count["no"]} not.\n',
-             '\n## Tables and figures of the paper\n', _items(results)]
+             f'{count["partly"]} partly, {count["no"]} not.\n', _items()]
     for group in groups:
         lines.append(f'\n## {group.title}\n')
         lines.append(_table(
-            (('', 'what the paper finds', 'what we find', 'agreement', 'why'),
+            (('', 'the paper', 'here', 'agreement', 'why'),
              *((item.item, item.paper, item.ours, item.agreement, item.why)
                for item in group.findings))))
-        lines += [_table(rows) for rows in group.tables]
-        if group.choices:
-            lines.append('Settings that differ from the paper or are not in its text:\n')
-            lines += [f'* {choice}' for choice in group.choices]
-            lines.append('')
-        lines += [f'![{stem} of: {group.title}](figures/validation-{stem}.png)\n'
-                  for stem in group.figures]
+        lines += [f'![{stem}](figures/validation-{stem}.png)\n' for stem in group.figures]
     return '\n'.join(lines)
 
 
-def _items(results: Mapping[str, Results]) -> str:
-    """Return the table of what the paper shows, and in which part of the page it is."""
-    titles = {name: group.title for name, group in results.items()}
-    return _table((('', 'what it shows', 'part of this page', 'on what'),
-                   *((item.name, item.shows, titles.get(item.module, 'none'), item.basis)
-                     for item in ITEMS)))
+def _items() -> str:
+    """Return what stands for tables and figures of the paper that have no numbers, or no data."""
+    names: dict[str, list[str]] = {}
+    for item in ITEMS:
+        if item.instead:
+            names.setdefault(item.instead, []).append(item.name)
+    return _table((('of the paper', 'here'),
+                   *((', '.join(group), instead) for instead, group in names.items())))
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table whose first row is the header."""
     escaped = [[cell.replace('|', '\\|') for cell in row] for row in rows]
-    body = [escaped[0], ['---'] * len(escaped[0]), *escaped[1:]]
-    return '\n'.join('| ' + ' | '.join(row) + ' |' for row in body) + '\n'
+    head, *body = ('| ' + ' | '.join(row) + ' |' for row in escaped)
+    return '\n'.join((head, '|' + '---|' * len(escaped[0]), *body)) + '\n'
 
 
 def _as_json(value: Any) -> Any:

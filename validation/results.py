@@ -63,8 +63,8 @@ class Results:
     """
     A group of results.
 
-    `numbers` hold what JSON can; `figures` are by file stem; `choices` name values that the paper
-    does not give; `tables` are rows of text, the first one the header.
+    `numbers` hold what JSON can; `figures` are by file stem; `choices` name settings that differ
+    from the paper or that it does not give.
     """
 
     title: str
@@ -72,7 +72,6 @@ class Results:
     findings: tuple[Finding, ...]
     figures: Mapping[str, Figure]
     choices: tuple[str, ...] = ()
-    tables: tuple[tuple[tuple[str, ...], ...], ...] = ()
 
 
 @dataclass(frozen=True)
