@@ -35,7 +35,7 @@ from fault_residual import check_report, ResidualChecker
 from fault_source import FaultySource, KEYPHASOR, Scene
 from matplotlib.figure import Figure
 import numpy as np
-from page import fill, growth, LONG, MEMORY, table
+from page import fill, table
 
 ROOT = Path(__file__).resolve().parents[1]
 PULSES = ('accepted', 'doubles', 'early', 'out_of_order', 'non_finite', 'unlocked')
@@ -253,8 +253,13 @@ def run(seed: int, scenes: int, report: Callable[[str], None], *, jitter: float 
 
 def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
     """Return the contents of the campaign's sections."""
-    faults, checked = found['faults'], found['checked']
-    rows = [(kind, f'{count:,}', f'{checked[kind]:,}') for kind, count in faults.items()]
+    faults = found['faults']
+    places: dict[str, list[str]] = {}
+    for kind in faults:
+        place, _, what = kind.partition(': ')
+        places.setdefault(place, []).append(what)
+    rows = [(place, ', '.join(kinds), f'{sum(faults[f"{place}: {what}"] for what in kinds):,}')
+            for place, kinds in places.items()]
     averages, extra = found['averages'], found['recovery']
     corrected, verdicts = found['corrected'], found['verdicts']
     again = [scenes for scenes in extra if scenes]
@@ -271,11 +276,7 @@ def fault_sections(found: Mapping[str, Any]) -> dict[str, str]:
         f'({", ".join(f"{name} {count:,}" for name, count in verdicts.items())}). In '
         f'{len(extra) - len(again)} of {len(extra)} scenes all averages were back '
         f'within the faultless 1.4 s at its end{later}.')
-    memory = [(role, *growth(rss)) for role, rss in found['rss']
-              if rss and rss[-1][0] - rss[0][0] > LONG]
-    return {'campaign': summary,
-            'faults': table(('fault', 'injected', 'averages checked in scenes with it'), rows),
-            'memory': table(('node', *MEMORY), memory)}
+    return {'campaign': summary, 'faults': table(('where', 'faults', 'injected'), rows)}
 
 
 def draw_faults(found: Mapping[str, Any], folder: Path) -> None:

@@ -185,15 +185,8 @@ def section(found: Mapping[str, Any]) -> str:
         f'median, {np.percentile(latency, 99):.0f} ms at 99 %, {latency.max():.0f} ms at most. '
         f'The source was late by up to {1e3 * found["source_late"]:.0f} ms itself. Counted: '
         f'{counted}.')
-    every = spans(found)
-    every = every[:: max(len(every) // 10, 1)]
-    rows = [(f'{start / 60.0:.2f}', *(f'{value:.0f}' for value in values))
-            for start, *values in every]
-    memory = []
-    for name, rss in found['rss'].items():
-        memory.append((name, *growth(rss)))
-    return '\n\n'.join((text, table(('minute', 'latency in ms, median', '99 %', 'largest'), rows),
-                        table(('process', *MEMORY), memory)))
+    memory = [(name, *growth(rss)) for name, rss in found['rss'].items()]
+    return f'{text}\n\n{table(("process", *MEMORY), memory)}'
 
 
 def draw(found: Mapping[str, Any], file: Path) -> None:

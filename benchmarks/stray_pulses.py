@@ -94,16 +94,21 @@ def judged(seed: int, speed: str, wheel: str, fault: str) -> tuple[int, int, int
 def run(seeds: int) -> str:
     """Return the table: share of the cycles found, and of those found the wrong ones."""
     rows = []
-    for speed in SPEEDS:
-        for wheel in WHEELS:
-            row = [speed, wheel]
-            for fault in FAULTS:
-                turns, found, wrong = np.sum([
-                    judged(seed, speed, wheel, fault) for seed in range(seeds)], axis=0)
-                row.append(f'{found / turns:.0%}, {wrong} of {found:,}')
-            rows.append(row)
-            print(' | '.join(row), flush=True)
-    return table(('speed', 'marks', *FAULTS), rows)
+    for wheel in WHEELS:
+        counts = np.zeros((len(FAULTS), 3), np.int64)
+        for speed in SPEEDS:
+            here = np.array([np.sum([judged(seed, speed, wheel, fault) for seed in range(seeds)],
+                                    axis=0) for fault in FAULTS])
+            print(' | '.join((speed, wheel, *map(cell, here))), flush=True)
+            counts += here
+        rows.append((wheel, *map(cell, counts)))
+    return table(('marks', *FAULTS), rows)
+
+
+def cell(counts: NDArray[np.int64]) -> str:
+    """Return revolutions, trigger cycles and wrong ones as text."""
+    turns, found, wrong = counts
+    return f'{found / turns:.0%}, {wrong} of {found:,}'
 
 
 def main() -> None:
