@@ -11,12 +11,14 @@
 """Tests of files of measuring systems: .tdms, .mf4 and universal files."""
 
 import contextlib
+from pathlib import Path
 import sys
 
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings import read
+from sa_jitter_ros.recordings.channel_list import Channel, ChannelSource
 
 # pyuff leaves files that it writes, and all three libraries broken ones, to the collector.
 pytestmark = pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
@@ -176,3 +178,18 @@ def test_broken_files_get_one_line(tmp_path, signals, rng, name):
         with contextlib.suppress(RecordingError):
             assert read(path).read().size
     assert path.exists()
+
+
+def test_a_file_stays_open_through_a_pass():
+    opened = []
+
+    @contextlib.contextmanager
+    def open_file():
+        opened.append(True)
+        yield 3.0
+
+    source = ChannelSource(Path(), 2 * (Channel(
+        ('a',), '', 1.0, 0.0, 10, lambda file, start, stop: np.full(stop - start, file)),),
+        open_file)
+    assert [block.shape[1] for block in source.blocks(4)] == [4, 4, 2]
+    assert opened == [True]

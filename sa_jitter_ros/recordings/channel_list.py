@@ -16,13 +16,17 @@ Formats of measuring systems are such lists (`tdms_format`, `mdf_format`, `uff_f
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.channel_map import ChannelMap, find_channel
 from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+
+Opened = Callable[[], AbstractContextManager[Any]]
 
 _SAME_START = 0.01  # of a sample
 _ROUNDED = 1e-4  # relative, of a rate in a file
@@ -36,7 +40,8 @@ class Channel:
     One channel of a file.
 
     `names` are what it may be called, the shortest first; `rate` is in Hz, None where the file
-    does not say; `start` in s; `read` returns the samples from one index to another.
+    does not say; `start` in s; `read` returns the samples of the open
+    file from one index to another.
     """
 
     names: tuple[str, ...]
@@ -44,15 +49,16 @@ class Channel:
     rate: float | None
     start: float
     samples: int
-    read: Callable[[int, int], FloatArray]
+    read: Callable[[Any, int, int], FloatArray]
 
 
 @dataclass(frozen=True)
 class ChannelSource:
-    """The samples of channels that were sampled together."""
+    """The samples of channels that were sampled together; `opened` opens their file."""
 
     path: Path
     parts: tuple[Channel, ...]
+    opened: Opened
 
     @property
     def channels(self) -> int:
@@ -65,11 +71,12 @@ class ChannelSource:
         return self.parts[0].samples
 
     def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
-        """Iterate over `channel` x `sample` blocks."""
-        with recording_errors(self.path):
+        """Iterate over `channel` x `sample` blocks, with the file open all the time."""
+        with recording_errors(self.path), self.opened() as file:
             for start in range(0, self.samples, samples_per_block):
                 stop = min(start + samples_per_block, self.samples)
-                rows = [np.asarray(part.read(start, stop), np.float64) for part in self.parts]
+                rows = [np.asarray(part.read(file, start, stop), np.float64)
+                        for part in self.parts]
                 if any(row.shape != (stop - start,) for row in rows):
                     raise RecordingError(f'samples {start} to {stop} cannot be read: the file is '
                                          'truncated or broken; copy it again')
@@ -77,16 +84,17 @@ class ChannelSource:
 
 
 def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: ChannelMap,
-                 sample_rate: float | None, left_out: Sequence[str] = ()) -> Recording:
+                 sample_rate: float | None, left_out: Sequence[str] = (),
+                 opened: Opened = nullcontext) -> Recording:
     """
     Return the recording of some channels of a file, in the roles that the map gives them.
 
     Without names of vibration it is all channels of one rate, start and length, those that hold
     the most samples. The tach may have a rate of its own. `sample_rate` is used for channels
     without one, and in place of one that is rounded. `left_out` says why
-    other channels of the file are none, one sentence each.
+    other channels of the file are none, one sentence each; `opened` opens what they read from.
 
-    >>> acc, key = (Channel((name,), 'g', rate, 0.0, int(rate), lambda start, stop:
+    >>> acc, key = (Channel((name,), 'g', rate, 0.0, int(rate), lambda file, start, stop:
     ...             np.zeros(stop - start)) for name, rate in (('acc', 100.0), ('key', 500.0)))
     >>> recording_of(Path(), [acc, key], channel_map=ChannelMap(tach='key'), sample_rate=None)
     Recording('.', 1 channel of 100 samples at 100 Hz (1 s), tach at 500 Hz, ratio 1)
@@ -134,10 +142,10 @@ def recording_of(path: Path, channels: Sequence[Channel], *, channel_map: Channe
             raise RecordingError(
                 f'{names[tach]} begins at {channels[tach].start:.9g} s and {names[chosen[0]]} at '
                 f'{first.start:.9g} s: export channels that begin together')
-        tach_source = ChannelSource(path, (channels[tach],))
+        tach_source = ChannelSource(path, (channels[tach],), opened)
     return Recording(
-        ChannelSource(path, tuple(channels[k] for k in chosen)), rate, start_time=first.start,
-        channel_names=tuple(names[k] for k in chosen),
+        ChannelSource(path, tuple(channels[k] for k in chosen), opened), rate,
+        start_time=first.start, channel_names=tuple(names[k] for k in chosen),
         units=tuple(channels[k].unit for k in chosen), tach=tach_source, tach_rate=tach_rate,
         remarks=tuple(remarks), path=str(path))
 

@@ -16,6 +16,7 @@ The times of a group of channels must be at a constant rate. A channel bears its
 """
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,12 @@ def open_mdf(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) 
             raise missing_library('a .mf4 file is', 'asammdf', 'mdf') from None
         left_out: list[str] = []
         with asammdf.MDF(path) as file:
-            channels = list(_channels(path, file, left_out))
+            channels = list(_channels(file, left_out))
         return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
-                            left_out=left_out)
+                            left_out=left_out, opened=partial(asammdf.MDF, path))
 
 
-def _channels(path: Path, file: Any, left_out: list[str]) -> Iterator[Channel]:
+def _channels(file: Any, left_out: list[str]) -> Iterator[Channel]:
     """Iterate over the channels of numbers; `left_out` takes groups without a constant rate."""
     for number, group in enumerate(file.groups):
         count, master = group.channel_group.cycles_nr, file.masters_db.get(number)
@@ -60,7 +61,7 @@ def _channels(path: Path, file: Any, left_out: list[str]) -> Iterator[Channel]:
             continue
         for index, channel in signals:
             yield Channel((channel.name, f'{number}/{channel.name}'), channel.unit or '', *steady,
-                          count, _Reader(path, number, index))
+                          count, partial(_samples, number, index))
 
 
 def _is_number(file: Any, group: int, index: int) -> bool:
@@ -71,16 +72,7 @@ def _is_number(file: Any, group: int, index: int) -> bool:
     return bool(first.ndim == 1 and first.dtype.kind in 'fiub')
 
 
-class _Reader:
-    """Reads a channel of a file."""
-
-    def __init__(self, path: Path, group: int, index: int) -> None:
-        self._path, self._group, self._index = path, group, index
-
-    def __call__(self, start: int, stop: int) -> FloatArray:
-        """Return the samples from `start` to `stop`."""
-        import asammdf
-        with asammdf.MDF(self._path) as file:
-            return np.asarray(file.get(
-                group=self._group, index=self._index, record_offset=start,
-                record_count=stop - start).samples, np.float64)
+def _samples(group: int, index: int, file: Any, start: int, stop: int) -> FloatArray:
+    """Return the samples of a channel from `start` to `stop`."""
+    return np.asarray(file.get(group=group, index=index, record_offset=start,
+                               record_count=stop - start).samples, np.float64)

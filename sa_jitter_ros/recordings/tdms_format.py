@@ -15,14 +15,16 @@ A channel is sampled at 1/`wf_increment` from `wf_start_offset` on, and bears it
 `group/name` where several groups have one of that name.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from sa_jitter_ros.recordings.channel_list import Channel, recording_of
 from sa_jitter_ros.recordings.channel_map import ChannelMap
 from sa_jitter_ros.recordings.libraries import missing_library
-from sa_jitter_ros.recordings.recording import FloatArray, Recording, recording_errors
+from sa_jitter_ros.recordings.recording import Recording, recording_errors
 
 
 def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None) -> Recording:
@@ -33,25 +35,27 @@ def open_tdms(path: Path, *, channel_map: ChannelMap, sample_rate: float | None)
     """
     with recording_errors(path):
         try:
-            import nptdms
+            import nptdms  # noqa: F401 (which `_opened` needs)
         except ImportError:
             raise missing_library('a .tdms file is', 'npTDMS', 'tdms') from None
-        with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
-            channels = [_channel(path, group.name, channel)
+        with _opened(path) as file:
+            channels = [_channel(group.name, channel)
                         for group in file.groups() for channel in group.channels()
                         if channel.dtype is not None and channel.dtype.kind in 'fiub']
-        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate)
+        return recording_of(path, channels, channel_map=channel_map, sample_rate=sample_rate,
+                            opened=partial(_opened, path))
 
 
-def _channel(path: Path, group: str, channel: Any) -> Channel:
-    step = float(channel.properties.get('wf_increment', 0.0))
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import nptdms
+    with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
+        yield file
 
-    def read(start: int, stop: int) -> FloatArray:
-        import nptdms
-        with open(path, 'rb') as raw, nptdms.TdmsFile.open(raw) as file:
-            return np.asarray(file[group][channel.name][start:stop], np.float64)
 
-    return Channel((channel.name, f'{group}/{channel.name}'),
-                   str(channel.properties.get('unit_string', '')),
+def _channel(group: str, channel: Any) -> Channel:
+    step, name = float(channel.properties.get('wf_increment', 0.0)), channel.name
+    return Channel((name, f'{group}/{name}'), str(channel.properties.get('unit_string', '')),
                    1.0 / step if step > 0.0 else None,
-                   float(channel.properties.get('wf_start_offset', 0.0)), len(channel), read)
+                   float(channel.properties.get('wf_start_offset', 0.0)), len(channel),
+                   lambda file, start, stop: file[group][name][start:stop])

@@ -73,4 +73,4 @@ def _channels(file: Any, left_out: list[str]) -> Iterator[Channel]:
         unit = str(content.get('ordinate_axis_units_lab', '')).strip()
         yield Channel(('' if name.upper() == 'NONE' else name, place),
                       '' if unit.upper() == 'NONE' else unit, *steady, data.size,
-                      lambda start, stop, data=data: data[start:stop])  # type: ignore[misc]
+                      lambda file, start, stop, data=data: data[start:stop])  # type: ignore[misc]
