@@ -203,6 +203,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
     opened = [item if isinstance(item, Recording) else read(item)
               for item in recordings]
     opened, faults = _usable(opened, names)
+    opened = [_with_pulses(item) for item in opened]
     declaration = _declaration(declared, opened[0].sample_rate)
     models = declaration.models
     if len(models) > 1:
@@ -214,7 +215,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
         observations: list[Observation] = []
         for name, recording in zip(names, opened):
             show(f'reading {name}')
-            for doubt in doubts(recording, _pulses(recording), orders=model.orders,
+            for doubt in doubts(recording, _times(recording), orders=model.orders,
                                 ratio=model.ratio,
                                 pulses_per_revolution=model.pulses_per_revolution,
                                 pulses_per_trigger=model.pulses_per_trigger or None,
@@ -254,19 +255,29 @@ def _usable(recordings: Sequence[Recording], names: Sequence[str]
     return [without_channels(recording, lost) for recording in recordings], faults
 
 
-def _pulses(recording: Recording) -> FloatArray | None:
-    """Return the pulse times of a recording, wherever they are; None where there are none."""
+def _with_pulses(recording: Recording) -> Recording:
+    """
+    Return a recording with the pulses of its waveform among its fields, so found once.
+
+    They are placed as the keyphasor was sampled, whose jitter is part of the declared model.
+    """
+    if recording.pulse_times is not None or recording.tach is None:
+        return recording
     try:
-        return recording.keyphasor_pulses()
+        return replace(recording, pulse_times=recording.keyphasor_pulses(interpolate=False))
     except SaJitterError:
-        return None
+        return recording
+
+
+def _times(recording: Recording) -> FloatArray | None:
+    """Return the pulse times of a recording, those of its reference where it has no others."""
+    return recording.reference_pulse_times if recording.pulse_times is None else (
+        recording.pulse_times)
 
 
 def _mistake(recording: Recording) -> str:
     """Return what is probably wrong with the pulse times of a recording, '' for nothing."""
-    times = recording.pulse_times
-    if times is None:
-        times = recording.reference_pulse_times
+    times = _times(recording)
     start = recording.start_time
     return '' if times is None else likely_mistake(
         times, start, start + recording.duration, recording.sample_rate)
