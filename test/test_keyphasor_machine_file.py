@@ -76,6 +76,15 @@ def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(tmp_path,
     assert 'averages of 1 recording' in text
 
 
+def test_a_file_without_orders_names_none_and_is_taken(tmp_path, capsys):
+    """It says what to add; averager and predictor take orders of their own meanwhile."""
+    write_rig(tmp_path / 'rig.npz', turns=48, orders=())
+    run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
+    text = (tmp_path / 'out/machine.yaml').read_text()
+    assert '# No order is known: add those of interest, as in shaft.orders: [1.0, 2.0], to' in text
+    assert text.count('shaft.orders') == 1
+
+
 def test_an_order_that_one_average_refuses_gives_no_delay_and_no_warning():
     def item(speed, refused):
         return SimpleNamespace(

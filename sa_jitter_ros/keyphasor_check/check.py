@@ -25,7 +25,7 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
-from sa_jitter_ros.keyphasor_check.costs import costs
+from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     ENCODERS, find_lines, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
@@ -156,9 +156,11 @@ class _Check:
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
             'path_delay': self._delay(averages.get(False, ()), ratio)}
-        warnings = (*self._warnings, *costs(findings, fitted, times, self._orders))
+        concerned = self._orders or NO_ORDERS
+        from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
+        warnings = (*self._warnings, *costs(findings, fitted, times, concerned, from_marks))
         return KeyphasorCheck(findings, warnings, fitted, per_revolution, self._rate,
-                              self._from_waveform)
+                              self._from_waveform, from_marks is not None)
 
     # --- what is there ---
 

@@ -26,6 +26,7 @@ from sa_jitter_ros.keyphasor_check.teeth import number_pulses
 from sa_jitter_ros.keyphasor_check.wheel import patterns
 
 FloatArray = NDArray[np.float64]
+Losses = tuple[FloatArray, FloatArray]
 
 #: Orders of which costs are given where none was found.
 NO_ORDERS = (1.0, 10.0, 100.0)
@@ -44,18 +45,18 @@ _CLEAR_PATTERN, _CERTAIN_PATTERN = 10.0, 40.0
 
 
 def costs(findings: Mapping[str, Finding], fitted: FittedPulses, times: FloatArray,
-          orders: Sequence[float]) -> list[Warn]:
+          orders: Sequence[float], from_marks: Losses | None) -> list[Warn]:
     """
     Return the warnings that findings call for, with the loss in percent at each order.
 
-    `fitted` are the pulses `times` (n,) in s on their target.
+    `fitted` are the pulses `times` (n,) in s on their target; `from_marks` is what `by_marks`
+    returns.
     """
-    orders = tuple(orders) or NO_ORDERS
     found = _of_pulses(fitted, orders)
     ratio = float(findings['ratio'].value or 1.0)
     found += _of_marks(fitted, ratio, orders)
     found += _of_jitter(findings, fitted, ratio, orders)
-    found += _of_speed(fitted, ratio, orders)
+    found += _of_speed(fitted, ratio, orders, from_marks)
     return found + _of_changes(times)
 
 
@@ -128,8 +129,7 @@ def _of_jitter(findings: Mapping[str, Finding], fitted: FittedPulses, ratio: flo
     return found
 
 
-def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]
-             ) -> tuple[FloatArray, FloatArray] | None:
+def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> Losses | None:
     """
     Return the losses (order,) of trigger cycles of a revolution, and of those from mark to mark.
 
@@ -156,11 +156,11 @@ def _of_errors(error: FloatArray, ratio: float, orders: Sequence[float]) -> Floa
                      if error.size else 0.0 for g in orders])
 
 
-def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> list[Warn]:
+def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float],
+              from_marks: Losses | None) -> list[Warn]:
     """Return what a speed costs that changes within a revolution, with the linear angle law."""
-    losses = by_marks(fitted, ratio, orders)
-    if losses is not None:
-        turn, mark = losses
+    if from_marks is not None:
+        turn, mark = from_marks
         return [Warn(
             'unsteady_speed', 'the speed changes within a revolution: set pulses_per_trigger to '
             '1, so that trigger cycles go from mark to mark; no order here then loses more than '

@@ -15,7 +15,6 @@ import math
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.keyphasor_check.costs import by_marks
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.parameter_file import section_text
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
@@ -23,7 +22,6 @@ from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 # close_loop compares no fewer cycles; cycles from mark to mark are more, and corrected together
 _LEAST_CYCLES, _MOST_CYCLES, _AVERAGES, _MOST_FROM_MARKS = 5, 100, 8, 400
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
-_DEFAULT_ORDERS = (1.0, 2.0, 3.0)
 _SHAFT = 'shaft'
 _DISCARDED = 0.5  # of the trigger cycles of an average
 _COARSE, _TICKS, _WIDEST = 0.02, 2.5, 0.45  # of an interval
@@ -44,9 +42,9 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
                          _MOST_CYCLES))
     common: dict[str, Any] = {
         'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0),
-        f'{_SHAFT}.orders': [float(g) for g in found['orders'] or _DEFAULT_ORDERS],
+        **({f'{_SHAFT}.orders': found['orders']} if found['orders'] else {}),
         'pulses_per_revolution': count, 'trigger_cycles': cycles, 'keyphasor_rate': float(rate)}
-    if by_marks(check.fitted, common[f'{_SHAFT}.ratio'], common[f'{_SHAFT}.orders']) is not None:
+    if check.by_marks:
         turns = min(cycles, max(1, _MOST_FROM_MARKS // count))
         common |= {'pulses_per_trigger': 1, 'trigger_cycles': turns * count}
     jitter: dict[str, Any] = {'jitter_distribution': 'uniform'}
@@ -65,8 +63,7 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
             _WIDEST, _TICKS * tick / pitch)
     target = TargetGeometry(np.array(check.findings['marks'].value),
                             np.array(check.findings['marks'].standard_error or 0.0))
-    turn = np.abs(target.angles).max() * common[f'{_SHAFT}.ratio'] * max(
-        common[f'{_SHAFT}.orders'])
+    turn = np.abs(target.angles).max() * common[f'{_SHAFT}.ratio'] * max(found['orders'] or [1.0])
     if target.standard_errors.all() and target.significant and turn > _SHOWS:
         nodes['synchronous_averager'] |= {
             'target_geometry': 'given', 'target_angles': target.angles.tolist()}
@@ -88,6 +85,9 @@ def machine_file(check: KeyphasorCheck, name: str) -> str:
             others = ', '.join(f'{value:.6g} ({probability:.0%})'
                                for value, probability in item.alternatives)
             lines.append(f'# {key} may also be {others}: {item.decided_by}')
+    if not check.findings['orders'].value:
+        lines.append('# No order is known: add those of interest, as in shaft.orders: [1.0, 2.0], '
+                     'to synchronous_averager and jitter_predictor.')
     lines += ['', '/**:', '  ros__parameters:', f'    hardware_id: {json.dumps(name)}']
     return '\n'.join(lines) + '\n\n' + '\n'.join(
         section_text(node, parameters) for node, parameters in machine_parameters(check).items())

@@ -51,7 +51,8 @@ class KeyphasorCheck:
 
     `fitted` are the pulses on their target, `lines` those of the vibration in orders of the tach
     shaft (None without vibration), `sample_rate` (Hz) that of the vibration without mistakes of
-    units. `from_waveform`: the pulses are those of a sampled waveform.
+    units. `from_waveform`: the pulses are those of a sampled waveform. `by_marks`: trigger cycles
+    from mark to mark are proposed.
     """
 
     findings: Mapping[str, Finding]
@@ -60,6 +61,7 @@ class KeyphasorCheck:
     lines: Lines | None
     sample_rate: float
     from_waveform: bool = False
+    by_marks: bool = False
 
     @property
     def report(self) -> dict[str, Any]:
