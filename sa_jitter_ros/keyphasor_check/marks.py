@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.keyphasor_check.teeth import joined, NumberedPulses
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, pattern_of
+from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 from scipy.ndimage import median_filter, uniform_filter1d
 
 FloatArray = NDArray[np.float64]
@@ -170,14 +171,12 @@ def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
         on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
         pulses = pulses.only(on_mark) if not on_mark.all() else pulses
         if pattern.teeth > 1:
-            pulses = replace(pulses, pitch=_pitch(pulses, pattern.teeth))
-            pattern = _measured(pulses, pattern)
+            pulses, pattern = _measured(pulses, pattern)
             pulses = _chosen_again(pulses, pattern)
         kept = ~_outliers(pulses, pattern.late()[pattern.tooth(pulses.numbers)], tick)
         pulses = pulses.only(kept) if not kept.all() else pulses
     if pattern.teeth > 1:
-        pulses = replace(pulses, pitch=_pitch(pulses, pattern.teeth))
-        pattern = _measured(pulses, pattern)
+        pulses, pattern = _measured(pulses, pattern)
     return pattern, pulses
 
 
@@ -214,54 +213,22 @@ def _counted_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     return replace(pulses, numbers=numbers).only(kept)
 
 
-def _pitch(pulses: NumberedPulses, teeth: int) -> FloatArray:
-    """Return the time from tooth to tooth (n,) in s, over whole revolutions around each pulse."""
-    first, last = int(pulses.numbers[0]), int(pulses.numbers[-1])
-    turns = 2 * teeth * -(-_AROUND // (2 * teeth))
-    turns = turns if last - first >= turns else teeth
-    if last - first < turns:
-        return pulses.pitch
-    low = np.clip(pulses.numbers - turns // 2, first, last - turns)
-    times = (np.interp(at, pulses.numbers, pulses.times) for at in (low, low + turns))
-    before, after = times
-    return np.asarray(np.maximum((after - before) / turns, 1e-300))
+def _measured(pulses: NumberedPulses, pattern: Pattern) -> tuple[NumberedPulses, Pattern]:
+    """Return the pattern with the marks where the pulses show them, and the pitch there."""
+    teeth = np.flatnonzero(~pattern.missing)
+    found = measured_geometry(pulses.times, pulses.numbers - pattern.origin, teeth, pattern.teeth)
+    if found is None:
+        return pulses, pattern
+    scale = pattern.teeth / (2.0 * math.pi)
+    pattern = replace(pattern, marks=found.angles * scale, errors=found.standard_errors * scale)
+    pitch = np.maximum(np.gradient(_smooth(pulses, pattern)), 1e-300)
+    return replace(pulses, pitch=pitch[pulses.numbers - pulses.numbers[0]]), pattern
 
 
-def _measured(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
-    """Return the pattern with the marks where the pulses show them."""
-    teeth = pattern.teeth
-    tooth = pattern.tooth(pulses.numbers)
-    true = pulses.times - pattern.late()[tooth] * pulses.pitch
-    grid = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
-    if grid.size < 4 * teeth:
-        return pattern
-    smooth = _smooth(pulses, pattern, grid)
-    place = pulses.numbers - grid[0]
-    left = (true - smooth[place]) / pulses.pitch
-    inside = (place >= 2 * teeth) & (place < grid.size - 2 * teeth)
-    if np.count_nonzero(inside) < 2 * teeth:
-        inside[:] = True
-    late, errors = pattern.late(), np.full(teeth, np.nan)
-    for each in np.flatnonzero(~pattern.missing):
-        own = left[inside & (tooth == each)]
-        if own.size < 2:
-            continue
-        middle = np.median(own)
-        spread = 1.4826 * np.median(np.abs(own - middle))
-        near = own[np.abs(own - middle) <= max(4.0 * spread, 1e-12)]
-        late[each] += near.mean()
-        errors[each] = near.std() / np.sqrt(max(near.size - 1, 1))
-    there = ~pattern.missing
-    return replace(pattern, marks=late[there] - late[there].mean(), errors=errors[there])
-
-
-def _smooth(pulses: NumberedPulses, pattern: Pattern, grid: IntArray) -> FloatArray:
-    """Return when even teeth of the numbers in `grid` (m,) would have passed, in s."""
+def _smooth(pulses: NumberedPulses, pattern: Pattern) -> FloatArray:
+    """Return when the teeth from the first to the last number (m,) would pass if even, in s."""
     true = pulses.times - pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
-    straight = np.linspace(true[0], true[-1], grid.size)
-    full = np.interp(grid, pulses.numbers, true) - straight
-    once = _over_revolution(full, pattern.teeth)
-    return np.asarray(2.0 * once - _over_revolution(once, pattern.teeth) + straight)
+    return motion_of(true, pulses.numbers - pulses.numbers[0], pattern.teeth)
 
 
 def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
@@ -270,7 +237,7 @@ def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     late = pattern.late()[pattern.tooth(grid)]
     marks = np.flatnonzero(~pattern.missing[pattern.tooth(grid)])
     pitch = np.interp(grid, pulses.numbers, pulses.pitch)
-    expected = np.maximum.accumulate((_smooth(pulses, pattern, grid) + late * pitch)[marks])
+    expected = np.maximum.accumulate((_smooth(pulses, pattern) + late * pitch)[marks])
     every = np.sort(np.append(pulses.times, pulses.strays))
     after = np.clip(np.searchsorted(expected, every), 1, marks.size - 1)
     near = after - (every - expected[after - 1] < expected[after] - every)
@@ -293,15 +260,6 @@ def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     kept |= extra
     return NumberedPulses(every[kept], numbers[kept], np.zeros(int(kept.sum())),
                           np.interp(numbers[kept], grid, pitch), every[~kept], pulses.breaks)
-
-
-def _over_revolution(values: FloatArray, teeth: int) -> FloatArray:
-    """Return the mean over a revolution on either side, to which no pattern contributes."""
-    room = min(2 * teeth, values.size - 1)
-    padded = np.pad(values, room, mode='reflect', reflect_type='odd')  # the speed goes on
-    once = uniform_filter1d(padded, teeth, mode='nearest')
-    twice = uniform_filter1d(once, teeth, mode='nearest', origin=-1 if teeth % 2 == 0 else 0)
-    return np.asarray(twice[room:room + values.size])
 
 
 def _outliers(pulses: NumberedPulses, late: FloatArray, tick: float) -> NDArray[np.bool_]:

@@ -103,15 +103,10 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
     tooth = numbers % count
     index = np.searchsorted(teeth, tooth)
     place = numbers - numbers[0]
-    grid = np.arange(place[-1] + 1)
-    straight = np.linspace(times[0], times[-1], grid.size)
     late = np.zeros(teeth.size)  # in teeth
-    pitch: FloatArray = np.full(grid.size, (times[-1] - times[0]) / place[-1])
+    pitch: FloatArray = np.full(place[-1] + 1, (times[-1] - times[0]) / place[-1])
     for _ in range(_ROUNDS):
-        true = times - late[index] * pitch[place]
-        full = np.interp(grid, place, true) - straight
-        once = _over_revolution(full, count)
-        smooth = 2.0 * once - _over_revolution(once, count) + straight
+        smooth = motion_of(times - late[index] * pitch[place], place, count)
         pitch = np.maximum(np.gradient(smooth), 1e-300)
         table = np.full((int(turns[-1]) + 1, teeth.size), np.nan)
         table[turns, index] = (times - smooth[place]) / pitch[place]
@@ -124,6 +119,20 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
         late -= late.mean()
     scale = 2.0 * np.pi / count
     return TargetGeometry(late * scale, _standard_errors(table) * scale, float(seen.mean()))
+
+
+def motion_of(times: FloatArray, place: IntArray, count: int) -> FloatArray:
+    """
+    Return when teeth 0, 1, ... (m,) of an even target would pass, in s.
+
+    It follows from the `times` (n,) in s at which the teeth `place` (n,), of which 0 is the first,
+    passed. Means over revolutions of `count` teeth, and of what they miss of a bent motion, see no
+    pattern of the target.
+    """
+    grid = np.arange(place[-1] + 1)
+    straight = np.linspace(times[0], times[-1], grid.size)
+    once = _over_revolution(np.interp(grid, place, times) - straight, count)
+    return np.asarray(2.0 * once - _over_revolution(once, count) + straight)
 
 
 def combined(before: TargetGeometry, latest: TargetGeometry, most: float) -> TargetGeometry:
