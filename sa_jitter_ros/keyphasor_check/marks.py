@@ -23,20 +23,17 @@ from numpy.typing import NDArray
 from sa_jitter_ros.keyphasor_check.teeth import joined, NumberedPulses
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, pattern_of
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
-from scipy.ndimage import median_filter, uniform_filter1d
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-_ROUNDS = 3
+_ROUNDS = 2
 _OUTLIER = 8.0  # robust standard deviations
 _LEAST = 0.02  # teeth that a stray stands beside its tooth at least
 _MOST_AT_ONCE = 200
 _NEIGHBOURS = 7  # with the pulse itself
 _FEWEST_TURNS = 24
-_AROUND = 8  # teeth over which the speed is taken at least
 _LEAST_SCATTER = 1e-9  # s
-_SHIFTS = (0, -1, 1, -2, 2)
 _NEAR = 0.25  # teeth from its mark: a pulse may be that of the mark
 
 
@@ -165,8 +162,6 @@ def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> Fitt
 def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
             ) -> tuple[Pattern, NumberedPulses]:
     """Return the pattern with its marks measured, and the pulses on it."""
-    if pattern.teeth > 1:
-        pulses = _counted_again(pulses, pattern)
     for _ in range(_ROUNDS):
         on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
         pulses = pulses.only(on_mark) if not on_mark.all() else pulses
@@ -193,24 +188,6 @@ def _away(places: FloatArray, pattern: Pattern, late: FloatArray, numbers: IntAr
     tooth = pattern.tooth(numbers)
     return np.asarray(np.where(pattern.missing[tooth], 0.5,
                                np.minimum(np.abs(places - late[tooth]), 0.5)))
-
-
-def _counted_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
-    """Return the pulses with numbers that are right where strays shifted the count by a tooth."""
-    late, window = pattern.late(), 2 * max(pattern.present, _AROUND) + 1
-    costs = []
-    for shift in _SHIFTS:
-        cost = _away(pulses.places, pattern, late, pulses.numbers + shift)
-        costs.append(uniform_filter1d(cost, window, mode='nearest'))
-    best = np.array(_SHIFTS)[np.argmin(np.array(costs), axis=0)]
-    clear = 2.0 * np.min(costs, axis=0) < costs[0]
-    numbers = pulses.numbers + np.where(clear, best, 0)
-    # A whole revolution too many or too few shows in the time only.
-    usual = median_filter(pulses.pitch, window, mode='nearest')[1:]
-    turns = np.rint((np.diff(pulses.times) / usual - np.diff(numbers)) / pattern.teeth)
-    numbers[1:] += np.cumsum(turns).astype(np.int64) * pattern.teeth
-    kept = np.append(True, numbers[1:] > np.maximum.accumulate(numbers)[:-1])
-    return replace(pulses, numbers=numbers).only(kept)
 
 
 def _measured(pulses: NumberedPulses, pattern: Pattern) -> tuple[NumberedPulses, Pattern]:

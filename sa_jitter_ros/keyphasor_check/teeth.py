@@ -33,7 +33,7 @@ BoolArray = NDArray[np.bool_]
 FEWEST = 6
 # Pulses around one from which its place follows: few follow a changing speed, many see through
 # strays.
-_WINDOWS = (41, 21, 11, 7, 5)
+_WINDOWS = (41, 11, 5)
 _BESIDE = 0.1  # of the window: ranks beside the median
 _BETTER = 0.7  # times as bad a fit makes up for fewer pulses
 # A longer silence than so many teeth is a standstill: teeth are counted anew behind it.
