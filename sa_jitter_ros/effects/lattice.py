@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.pulses.clock_grid import find_grid
 from scipy import special
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
@@ -28,8 +29,8 @@ ROOM = 0.02
 #: What the slope of errors over those of the smoothest motion on a grid may be off by.
 SLOPE_OFF = 0.25
 _STEPS = 3000
-# Ticks that an interval holds at least: with fewer, pulses are no time measurement.
-_COARSEST = 4.0
+# Least difference of intervals: in parts of the largest, and s; ticks by which equal ones differ.
+_LEAST_GAP, _LEAST_TICK, _SAME = 1e-3, 1e-12, 0.05
 
 
 @dataclass(frozen=True)
@@ -60,41 +61,15 @@ def find_clock(times: Array) -> Clock:
     """
     Find the clock whose ticks are all pulse `times` (n,) in s.
 
-    On a grid all differences of intervals are whole ticks, so their smallest one is one tick. A
-    machine whose intervals never repeat to within the rounding of its clock shows no grid.
+    A machine whose intervals never repeat to within the rounding of its clock shows no grid.
     """
-    none = Clock(0.0, 0.0)
     intervals = np.sort(np.diff(times))
-    intervals = intervals[intervals < 1.5 * np.median(intervals)]
-    resolution = rounding(times)
-    gaps = np.diff(intervals)
-    steps = gaps[gaps > max(resolution, 1e-3 * float(np.max(gaps, initial=0.0)), 1e-12)]
-    if steps.size == 0:
-        return none
-    tick = float(np.min(steps))
-    if tick > intervals[0] / _COARSEST:
-        return none
-    if np.count_nonzero(gaps <= 0.05 * tick) < 0.5 * gaps.size:
-        return none
-    elapsed = times - times[0]
-    count = 1
-    while count < times.size:  # lengthen the base over which the ticks are counted
-        count = min(2 * count, times.size - 1)
-        ticks = np.rint(elapsed[:count + 1] / tick)
-        if np.max(np.abs(elapsed[:count + 1] / tick - ticks)) > 0.35 or ticks[-1] < 1.0:
-            return none
-        tick = float(elapsed[:count + 1] @ ticks / (ticks @ ticks))
-        if count == times.size - 1:
-            break
-    ticks = np.rint(elapsed / tick)
-    centred = ticks - ticks.mean()
-    tick = float(elapsed @ centred / (centred @ centred))
-    scatter = float(np.std(elapsed - tick * ticks))
-    if scatter > ROOM * tick or np.gcd.reduce(ticks.astype(np.int64)) > 1:
-        return none
-    # Rounding is no chance: it need not average out over the pulses.
-    error = np.hypot(scatter / np.sqrt(centred @ centred), resolution / ticks[-1]) / tick**2
-    return Clock(1.0 / tick, float(error))
+    gaps = np.diff(intervals[intervals < 1.5 * np.median(intervals)])
+    grid = find_grid(times, rounding(times), max(
+        _LEAST_GAP * float(np.max(gaps, initial=0.0)), _LEAST_TICK))
+    if grid is None or np.count_nonzero(gaps <= _SAME * grid.tick) < 0.5 * gaps.size:
+        return NO_CLOCK
+    return Clock(1.0 / grid.tick, grid.standard_error / grid.tick**2)
 
 
 def rounding(times: Array) -> float:

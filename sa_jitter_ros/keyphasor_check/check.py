@@ -338,7 +338,7 @@ class _Check:
             stated = recording.tach_rate
             return Finding(stated, None, 'Hz', (), 'stated by the recording' if stated else
                            'no grid in the pulse times: they are not rounded to a clock')
-        if is_decimal(clock):
+        if is_decimal(clock.rate):
             return Finding(clock.rate, clock.standard_error, 'Hz', (), 'all pulse times are '
                            'multiples of its period, which may be their last written decimal')
         return Finding(clock.rate, clock.standard_error, 'Hz', (),

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.effects.library import predict
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.clock import is_decimal
@@ -107,7 +106,7 @@ def _of_jitter(findings: Mapping[str, Finding], fitted: FittedPulses, ratio: flo
     common: dict[str, Any] = {'trigger_speed': speed, 'trigger_cycles': _CYCLES, 'ratio': ratio,
                               'orders': list(orders)}
     found = []
-    if clock.value and not is_decimal(Clock(clock.value, 0.0)):
+    if clock.value and not is_decimal(clock.value):
         loss = _loss(keyphasor_rate=clock.value, **common)
         if max(loss) > _VISIBLE and 'multiples' in clock.decided_by:
             found.append(Warn(
