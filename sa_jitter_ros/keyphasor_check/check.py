@@ -28,7 +28,7 @@ from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
-    ENCODERS, find_lines, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
+    find_lines, is_usual, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
     usual_marks)
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses
 from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
@@ -36,13 +36,13 @@ from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedP
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, patterns
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
-from sa_jitter_ros.pulses.unit_check import find_mistakes
+from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_factor
 from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
 
 FloatArray = NDArray[np.float64]
 
-_MOST_MARKS = 72
+_MOST_MARKS, _MOST_ENCODER = 72, 4096  # of any number, and of usual ones
 _SYMMETRY = 1.5  # log probability that a pattern repeats in a revolution
 _DECLARED = math.log(300.0)  # what the statement of a recording says for a number of marks
 _LISTED = 0.01  # probability of an alternative that is listed
@@ -52,11 +52,9 @@ _MOST_SAMPLES = 12_000_000
 # Lines at whole orders of the tach shaft, beside those there by chance, with which it is the shaft
 # of interest; and the probability that another one is, all the same.
 _FEWEST_OWN, _ANOTHER = 3, 0.25
-_SPAN_SHORT, _SPAN_LONG = 0.8, 1.05
 _APART = 4.0  # standard errors
 _KILO = (500.0, 2000.0)  # times as long: a rate in kHz instead of Hz
 _FEWEST_SAMPLES = 16
-_SAME_SPAN = 0.1  # by which spans of twice, or half, the length may differ
 # Share of strays and lost pulses, and mean distance of the others from their marks (teeth): pulses
 # at random have 0.58 to 0.8 and 0.07 to 0.13; a quarter lost and as many strays 0.6 and 0.056.
 _AT_RANDOM, _OFF_PLACE = 0.4, 0.065
@@ -212,18 +210,12 @@ class _Check:
             self._recording = replace(recording, tach_rate=1e3 * recording.tach_rate)
 
     def _span(self, times: FloatArray) -> None:
-        duration, span = self._recording.samples / self._rate, float(np.ptp(times))
-        usual = float(np.median(np.diff(times)))
-        known = {item.code for item in self._warnings}
-        if 'span' in known or 'no_overlap' in known or span < 4.0 * usual:
-            return
-        if not _SPAN_SHORT * duration < span + 2.0 * usual < _SPAN_LONG * duration + 4.0 * usual:
-            self._warnings.append(Warn(
-                'span', f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s: '
-                'check that both were started and stopped together, and their sampling rates'))
-            for factor in (0.5, 2.0):
-                if abs(duration / (factor * span) - 1.0) < _SAME_SPAN:
-                    self._other_rate = factor * self._rate
+        end = self._start + self._recording.samples / self._rate
+        text = other_span(times, self._start, end)
+        if text and not {'span', 'no_overlap'} & {item.code for item in self._warnings}:
+            self._warnings.append(Warn('span', text))
+            factor = rate_factor(times, self._start, end)
+            self._other_rate = factor * self._rate if factor != 1.0 else 0.0
 
     def _samples(self) -> FloatArray | None:
         """Return the good channels of the vibration (channel, sample); None without any."""
@@ -282,8 +274,9 @@ class _Check:
         """Return the probability of each number of marks, and what the vibration says for it."""
         declared = self._recording.pulses_per_revolution
         span = int(numbered.numbers[-1] - numbered.numbers[0])
-        counts = sorted({*range(1, _MOST_MARKS + 1), *ENCODERS, *(item.teeth for item in found),
-                         declared})
+        counts = sorted({declared, *(item.teeth for item in found),
+                         *filter(is_usual, range(1, _MOST_ENCODER + 1)),
+                         *range(1, _MOST_MARKS + 1)})
         counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
         vibration = marks_evidence(lines, counts)
         log = {}

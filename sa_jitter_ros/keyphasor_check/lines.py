@@ -49,13 +49,8 @@ _SYMMETRY = 1.5
 _FEWEST_ON_RATIO = 3
 _PRIOR = 3.0  # log probability that the shaft of interest carries the tach
 _LARGEST_RATIO, _SMALLEST_RATIO = 30.0, 0.05
-#: Marks of usual targets with the probability of each.
-_USUAL_MARKS = {1: 0.45, 2: 0.1, 3: 0.03, 4: 0.06, 5: 0.02, 6: 0.05, 8: 0.05, 10: 0.02, 12: 0.03,
-                16: 0.02, 20: 0.01, 24: 0.02, 30: 0.01, 36: 0.02, 60: 0.03}
-#: Marks of usual encoders.
-ENCODERS = (100, 128, 180, 200, 250, 256, 300, 360, 400, 500, 512, 600, 720, 900, 1000, 1024, 1200,
-            1250, 1500, 1800, 2000, 2048, 2500, 3600, 4096)
-_OTHER_MARKS = 0.002
+# Marks of usual targets and encoders divide one of these; what the others are less probable by.
+_DIVIDED, _UNUSUAL = (18_000, 4096, 10_000), 2.5
 # Marks that may be uneven, by at least so many revolutions; revolutions and orders whose lines are
 # compared, and by how much sharper one of two is.
 _SEVERAL_MARKS, _EVEN, _MOST_TURNS, _MOST_ORDERS, _SHARPER = 4, 1e-4, 200, 200, 1.001
@@ -166,9 +161,14 @@ def marks_evidence(lines: Lines | None, counts: Sequence[int]) -> dict[int, floa
             for count, value in log.items()}
 
 
+def is_usual(count: int) -> bool:
+    """Return whether targets or encoders with so many marks are usual."""
+    return any(each % count == 0 for each in _DIVIDED)
+
+
 def usual_marks(count: int) -> float:
-    """Return the logarithm of the probability that a target has so many marks."""
-    return math.log(_USUAL_MARKS.get(count, _OTHER_MARKS))
+    """Return the logarithm of the probability, but for a constant, of so many marks."""
+    return -math.log(count) - (0.0 if is_usual(count) else _UNUSUAL)
 
 
 def _families(lines: Lines) -> list[list[int]]:

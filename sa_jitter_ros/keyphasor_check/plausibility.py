@@ -22,7 +22,7 @@ from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import angle_spectrum
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
-from sa_jitter_ros.pulses.unit_check import likely_mistake
+from sa_jitter_ros.pulses.unit_check import likely_mistake, other_span
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
@@ -32,7 +32,6 @@ FloatArray = NDArray[np.float64]
 _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000
-_SHORT = 0.8  # of the longer of pulses and vibration
 _FEWEST_REVOLUTIONS = 12
 _LONGEST_GAP = 10.0  # trigger cycles without a pulse
 # Bins of a peak on either side, and of what is beside it; the peak over the median of the
@@ -80,13 +79,7 @@ def doubts(recording: Recording, pulses: FloatArray | None, *, orders: Sequence[
     mistake = likely_mistake(pulses, start, end, recording.sample_rate)
     if mistake:
         return (mistake,)
-    found = []
-    covered = min(end, float(pulses[-1])) - max(start, float(pulses[0]))
-    usual = float(np.median(np.diff(pulses)))
-    if covered + 2.0 * usual < _SHORT * max(recording.duration, float(np.ptp(pulses))):
-        found.append(f'the pulses span {np.ptp(pulses):.6g} s, the vibration spans '
-                     f'{recording.duration:.6g} s: check that both were recorded together, and '
-                     'their sampling rates')
+    found = [*filter(None, [other_span(pulses, start, end)])]
     target = {'pulses_per_revolution': pulses_per_revolution, 'missing_teeth': missing_teeth,
               'pulses_per_trigger': pulses_per_trigger}
     unfit = _unfit(pulses, target)

@@ -24,6 +24,7 @@ _FACTOR = 2.0  # by which spans may differ in the right unit
 _SHORTER, _LONGER = 0.5, 0.1
 _FEW_REVOLUTIONS = 40  # pulses that tell a length
 _SAME_SPAN = 0.005  # relative, of lengths that are alike
+_TOGETHER = 0.8  # of the longer one, that pulses and vibration have in common
 _EPOCH = 1e8  # s; later first pulses are counted since 1970
 
 
@@ -67,17 +68,42 @@ def other_rate(pulses: NDArray[Any], start: float, end: float, rate: float) -> s
     >>> other_rate(np.arange(0.0, 10.0, 0.05), 0.0, 20.0, 2.5e3)  # doctest: +ELLIPSIS
     'the pulses span 9.95 s, the vibration spans 20 s, as with half its rate: ... 5000 Hz?'
     """
+    factor = rate_factor(pulses, start, end)
+    if factor == 1.0:
+        return ''
+    return (f'{_spans(pulses, end - start)}, as with {"half" if factor > 1.0 else "twice"} its '
+            f'rate: is it sampled at {factor * rate:.10g} Hz?')
+
+
+def rate_factor(pulses: NDArray[Any], start: float, end: float) -> float:
+    """Return 2.0 or 0.5 where the vibration is as long as the pulses with that much more rate."""
     times = pulses[np.isfinite(pulses)]
     if times.size < _FEW_REVOLUTIONS:
-        return ''
-    span, duration = float(np.ptp(times)), end - start
+        return 1.0
+    span = float(np.ptp(times))
     room = 2.0 * float(np.median(np.diff(np.sort(times))))  # of the first and the last pulse
-    for factor, words in ((2.0, 'half'), (0.5, 'twice')):
-        beside = factor * (span + 0.5 * room) - duration
-        if abs(beside) < factor * (room + _SAME_SPAN * span):
-            return (f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s, as with '
-                    f'{words} its rate: is it sampled at {factor * rate:.10g} Hz?')
-    return ''
+    return next((factor for factor in (2.0, 0.5) if abs(
+        factor * (span + 0.5 * room) - (end - start)) < factor * (room + _SAME_SPAN * span)), 1.0)
+
+
+def other_span(pulses: NDArray[Any], start: float, end: float) -> str:
+    """
+    Return that pulses (n,) and vibration have most of the time not in common, '' if they have.
+
+    >>> other_span(np.arange(0.0, 5.0, 0.04), 0.0, 8.0)  # doctest: +ELLIPSIS
+    'the pulses span 4.96 s, the vibration spans 8 s: check that both were recorded together, ...'
+    """
+    covered = min(end, float(pulses[-1])) - max(start, float(pulses[0]))
+    room = 2.0 * float(np.median(np.diff(pulses)))
+    if covered + room >= _TOGETHER * max(end - start, float(np.ptp(pulses))):
+        return ''
+    return (f'{_spans(pulses, end - start)}: check that both were recorded together, and their '
+            'sampling rates')
+
+
+def _spans(pulses: NDArray[Any], duration: float) -> str:
+    times = pulses[np.isfinite(pulses)]
+    return f'the pulses span {np.ptp(times):.6g} s, the vibration spans {duration:.6g} s'
 
 
 def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
@@ -99,7 +125,7 @@ def find_mistakes(pulses: NDArray[Any], start: float, end: float, rate: float
         return (Mistake('backwards', f'{backwards} of {times.size} pulse times are earlier than '
                         'the one before: give them in order of time, numpy.sort(pulse_times)'),)
     duration, span = end - start, float(np.ptp(times))
-    spans = f'the pulses span {span:.6g} s, the vibration spans {duration:.6g} s'
+    spans = _spans(times, duration)
     if span > _MUCH * duration:
         return _other_unit(spans, span / duration, rate)
     if span * _MUCH**2 < duration:
