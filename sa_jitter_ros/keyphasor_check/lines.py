@@ -32,9 +32,12 @@ FloatArray = NDArray[np.float64]
 
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000
-_FEWEST_TEETH = 24
+_FEWEST_TURNS = 12
 _FEWEST_REVOLUTIONS = 10  # of a shaft whose own revolution shows as a line
-_PROMINENT = 7.0  # times the median of the spectrum around; noise reaches 4
+# Times the median of the spectrum around: a line; and one that noise makes in 5e-5 of places.
+_PROMINENT, _CLEAR = 7.0, 4.0
+# Bins on either side that a line has, and to which it leaks, and by how much it is larger there.
+_LOBE, _SKIRT, _ABOVE = 3, 7, 1.5
 _NEIGHBOURHOOD = 100
 _MOST_LINES = 60
 _STRONGEST = 3e-3  # of the strongest line; below it are side lobes and distortion
@@ -70,30 +73,46 @@ class Lines:
     levels: FloatArray
     step: float
 
+    def logarithms(self, places: FloatArray) -> FloatArray:
+        """Return the logarithms of the sizes of lines at places (n,), 0 where there is none."""
+        near = np.abs(self.places - places[:, None]) < 0.5 * _LOBE * self.step
+        return np.asarray(np.log(np.max(np.where(near, self.sizes, 1.0), axis=1, initial=1.0)))
+
     def scaled(self, factor: float) -> 'Lines':
         """Return the lines with places in cycles of something `factor` teeth long."""
         return Lines(self.places * factor, self.sizes, self.levels, self.step * factor)
 
 
 def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray,
-               teeth: FloatArray) -> Lines | None:
+               turned: FloatArray, *, weak: bool = False) -> Lines | None:
     """
-    Return the lines in `samples` (sample, channel) over the angle.
+    Return the lines in `samples` (sample, channel) over the angle, also `weak` ones if asked.
 
-    The shaft has turned `teeth` (n,) at `times` (n,) in s; the first sample was at `start`. None
-    where too few teeth passed during the samples.
+    The shaft has `turned` (n,) at `times` (n,) in s; the first sample was at `start`. What leaks
+    from a line is none. None where the shaft hardly turns during the samples.
     """
-    angular = angle_spectrum(samples, start, rate, times, teeth, fewest=_FEWEST_TEETH)
-    if angular is None:
+    end = start + (len(samples) - 1) / rate
+    inside = (times >= start) & (times <= end)
+    times, turned = times[inside], turned[inside]
+    most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
+    count = int(np.searchsorted(times, times[0] + most / rate)) if times.size else 0
+    times, turned = times[:count], turned[:count]
+    if times.size < 3 or turned[-1] - turned[0] < _FEWEST_TURNS:
         return None
-    spectrum, base, step = angular
-    share = spectrum / np.maximum(base, np.finfo(float).tiny)
-    size, level = share.max(axis=1), (spectrum / np.max(spectrum, axis=0)).max(axis=1)
-    peak = np.zeros(size.size, np.bool_)
-    peak[3:-1] = (size[3:-1] >= size[2:-2]) & (size[3:-1] > size[4:])
-    peak &= (size > _PROMINENT) & (level > _STRONGEST)
-    found = np.flatnonzero(peak)
-    found = np.sort(found[np.argsort(-size[found])][:_MOST_LINES])
+    step = 1.0 / float(turned[-1] - turned[0])
+    spectrum = _spectrum(samples, (times - start) * rate, turned)
+    tiny = np.finfo(np.float64).tiny
+    share = spectrum / np.maximum(_background(spectrum), tiny)
+    size = share.max(axis=1)
+    level = (spectrum / np.maximum(spectrum.max(axis=0), tiny)).max(axis=1)
+    peak = (size > (_CLEAR if weak else _PROMINENT)) & (level > (0.0 if weak else _STRONGEST))
+    found = np.flatnonzero(peak[_SKIRT:1 - _SKIRT]) + _SKIRT
+    around = share[found[:, None] + np.arange(-_SKIRT + 1, _SKIRT)]  # line, bin, channel
+    beside = np.delete(around, slice(_SKIRT - _LOBE, _SKIRT + _LOBE - 1), axis=1).max(axis=1)
+    top = around[:, _SKIRT - 2:_SKIRT + 1].argmax(axis=1) == 1
+    found = found[np.any(top & (share[found] > np.maximum(_ABOVE * beside, _CLEAR)), axis=1)]
+    if not weak:
+        found = np.sort(found[np.argsort(-size[found])][:_MOST_LINES])
     channel = np.argmax(share[found], axis=1)
     left, middle, right = (np.log(np.maximum(spectrum[found + k, channel], 1e-300))
                            for k in (-1, 0, 1))
@@ -102,31 +121,15 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
     return Lines((found + np.clip(offset, -0.5, 0.5)) * step, size[found], level[found], step)
 
 
-def angle_spectrum(samples: FloatArray, start: float, rate: float, times: FloatArray,
-                   turned: FloatArray, *, fewest: float
-                   ) -> tuple[FloatArray, FloatArray, float] | None:
-    """
-    Return the amplitude spectrum (bin, channel) over the angle, its background, and its bin.
-
-    `samples` and the angles `turned` (n,) at `times` (n,) in s are those of `find_lines`. None
-    where the shaft turns by less than `fewest` during the samples.
-    """
-    end = start + (len(samples) - 1) / rate
-    inside = (times >= start) & (times <= end)
-    times, turned = times[inside], turned[inside]
-    most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
-    count = int(np.searchsorted(times, times[0] + most / rate)) if times.size else 0
-    times, turned = times[:count], turned[:count]
-    if times.size < 3 or turned[-1] - turned[0] < fewest:
-        return None
-    points = next_fast_len(int((times[-1] - times[0]) * rate), real=True)
+def _spectrum(samples: FloatArray, places: FloatArray, turned: FloatArray) -> FloatArray:
+    """Return the amplitude spectrum (bin, channel) over the angle, `turned` at `places` (n,)."""
+    points = next_fast_len(int(places[-1] - places[0]), real=True)
     angle = turned[0] + (turned[-1] - turned[0]) * np.arange(points) / points
-    position = (np.interp(angle, turned, times) - start) * rate
+    position = np.interp(angle, turned, places)
     over_angle = interpolate(samples, np.clip(position, 0.0, len(samples) - 1.0))
     over_angle -= over_angle.mean(axis=0)
     window = np.hanning(points + 1)[:-1, None]
-    spectrum = np.abs(rfft(over_angle * window, axis=0))[:int(0.42 * points)]
-    return spectrum, _background(spectrum), 1.0 / float(turned[-1] - turned[0])
+    return np.asarray(np.abs(rfft(over_angle * window, axis=0))[:int(0.42 * points)])
 
 
 def _background(spectrum: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
-from sa_jitter_ros.keyphasor_check.lines import angle_spectrum
+from sa_jitter_ros.keyphasor_check.lines import find_lines
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.unit_check import likely_mistake, other_span
@@ -32,12 +32,7 @@ FloatArray = NDArray[np.float64]
 _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000
-_FEWEST_REVOLUTIONS = 12
 _LONGEST_GAP = 10.0  # trigger cycles without a pulse
-# Bins of a peak on either side, and of what is beside it; the peak over the median of the
-# spectrum around, which noise alone exceeds in 5e-5 of orders, and over what is beside it.
-_PEAK, _SKIRT = 1, (3, 7)
-_CLEAR, _ABOVE = 4.0, 1.5
 # Places at which a spectrum is looked at for peaks there by chance; probability that so many stand
 # by chance, above which nothing is said for the orders; other numbers of marks, in parts of the
 # stated one, and by how much the logarithms of the peaks are larger with them on average; by how
@@ -162,16 +157,16 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     count = round(min(_FIRST_SECONDS * recording.sample_rate, recording.samples,
                       _MOST_VALUES / recording.channels))
     samples = next(recording.blocks(max(count, 1)))
-    spectrum = angle_spectrum(
+    lines = find_lines(
         np.nan_to_num(samples.T, posinf=0.0, neginf=0.0), recording.start_time,
-        recording.sample_rate, times, triggers.count[chosen] * share, fewest=_FEWEST_REVOLUTIONS)
-    if spectrum is None:
+        recording.sample_rate, times, triggers.count[chosen] * share, weak=True)
+    if lines is None:
         return ()
     places = ratio * np.asarray(orders)
-    sizes = _sizes(*spectrum, places)
+    sizes = lines.logarithms(places)
     stand = sizes > 0.0
     least, most = 0.8 * float(places.min()), 1.2 * float(places.max())
-    chance = float(np.mean(_sizes(*spectrum, np.linspace(least, most, _PLACES)) > 0.0))
+    chance = float(np.mean(lines.logarithms(np.linspace(least, most, _PLACES)) > 0.0))
     count, listed = int(np.count_nonzero(stand)), ', '.join(f'{order:g}' for order in orders[:6])
     speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.maximum(
         np.diff(triggers.count[chosen]), 1)))
@@ -186,7 +181,7 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
         fitting = round(other * marks)
         if fitting != other * marks:
             continue
-        others = _sizes(*spectrum, places / float(other))
+        others = lines.logarithms(places / float(other))
         if others.min() > 0.0 and others.sum() > sizes.sum() + larger * sizes.size:
             better = 'all of them do' if count < stand.size else 'they are far larger'
             return (f'{count} of the orders {listed} stand above their noise at {speed:.4g} Hz '
@@ -197,31 +192,12 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
             abs(order / base - round(order / base)) < _WHOLE for order in orders):
         return ()
     for miscounted in (base - 1, base + 1, base - 2, base + 2):
-        others = _sizes(*spectrum, places * (miscounted / base))
+        others = lines.logarithms(places * (miscounted / base))
         if np.all(others - sizes > _BESIDE):
             larger_ones = ', '.join(f'{order * miscounted / base:g}' for order in orders[:6])
             return (f'the orders {listed} hold no line beside {larger_ones}, each at least '
                     f'{np.exp(_BESIDE):.0f} times as large: are those meant? Count the teeth',)
     return ()
-
-
-def _sizes(spectrum: FloatArray, base: FloatArray, step: float, places: FloatArray
-           ) -> FloatArray:
-    """
-    Return logarithms of the peaks of a spectrum (bin, channel) at places (n,), 0 for none.
-
-    They are relative to the spectrum around, its `base`; a bin is `step`.
-    """
-    found = np.zeros(places.size)
-    for number, at in enumerate(np.rint(places / step).astype(int).tolist()):
-        if not _SKIRT[1] < at < len(spectrum) - _SKIRT[1]:
-            continue
-        peak = spectrum[at - _PEAK:at + _PEAK + 1].max(axis=0)
-        beside = np.concatenate([spectrum[at + sign * np.arange(*_SKIRT)] for sign in (-1, 1)])
-        above = np.maximum(base[at], np.finfo(float).tiny)
-        stands = (peak > _CLEAR * above) & (peak > _ABOVE * beside.max(axis=0))
-        found[number] = np.log(np.where(stands, peak / above, 1.0)).max()
-    return found
 
 
 def _other_jitter(pulses: FloatArray, declared: float) -> list[str]:
