@@ -38,6 +38,8 @@ _UNSTEADY = 0.005  # loss
 # to mark are proposed, and the part of it that they may leave.
 _SEVERAL, _DEAR, _SAVED = 4, 0.01, 0.3
 _MEMORY = 0.2
+# Angle ahead of that of a steady speed, in parts of the change of the speed, within a cycle.
+_BEND = 0.5 * np.linspace(0.0, 1.0, 17) * np.linspace(1.0, 0.0, 17)
 _HALF = 40  # pulses in which a pattern can be seen
 _MOST_PULSES = 5000
 _CLEAR_PATTERN, _CERTAIN_PATTERN = 10.0, 40.0
@@ -87,7 +89,7 @@ def _of_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> li
     if pattern.teeth < 2 or not np.nanmax(clear, initial=0.0) > _CLEAR_MARK:
         return []
     late = pattern.marks / pattern.teeth  # revolutions
-    loss = [1.0 - abs(np.mean(np.exp(2j * math.pi * g * ratio * late))) for g in orders]
+    loss = _of_errors(late, ratio, orders).tolist()
     if max(loss) < _INVISIBLE:
         return []
     worst = int(np.argmax(np.abs(pattern.marks)))
@@ -138,15 +140,16 @@ def by_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> Los
     if fitted.pattern.present < _SEVERAL:
         return None
     turn, parabola = (_of_errors(error, ratio, orders) for error in fitted.within_turns)
-    pitch = np.diff(fitted.true) / np.diff(fitted.numbers)
-    change = np.diff(pitch) / pitch[1:]
-    # Pulse errors change the speed to and fro, motion for longer.
-    steady = 0.5 * (change[1:] + change[:-1])
-    place = np.linspace(0.0, 1.0, 9)
-    mark = _of_errors(0.5 / fitted.pattern.teeth * steady[:, None] * place * (1.0 - place), ratio,
-                      orders)
+    steady = _steady_change(np.diff(fitted.true) / np.diff(fitted.numbers))
+    mark = _of_errors(np.multiply.outer(steady / fitted.pattern.teeth, _BEND), ratio, orders)
     dear = max(parabola) > _DEAR and max(mark) < _SAVED * max(parabola)
     return (turn, mark) if dear else None
+
+
+def _steady_change(values: FloatArray) -> FloatArray:
+    """Return relative changes of speeds or periods; pulse errors make others, to and fro."""
+    change = np.diff(values) / values[1:]
+    return np.asarray(0.5 * (change[1:] + change[:-1]))
 
 
 def _of_errors(error: FloatArray, ratio: float, orders: Sequence[float]) -> FloatArray:
@@ -168,11 +171,8 @@ def _of_speed(fitted: FittedPulses, ratio: float, orders: Sequence[float],
     speed = fitted.speed[::max(1, fitted.pattern.present)]
     if speed.size < 4:
         return []
-    change = np.diff(speed) / speed[1:]
-    # Pulse errors change the speed of revolutions to and fro, motion for longer.
-    steady = 0.5 * (change[1:] + change[:-1])
-    place = np.linspace(0.0, 1.0, 33)
-    loss = _of_errors(0.5 * steady[:, None] * place * (1.0 - place), ratio, orders)
+    steady = _steady_change(speed)
+    loss = _of_errors(np.multiply.outer(steady, _BEND), ratio, orders)
     if max(loss) < _UNSTEADY:
         return []
     return [Warn(

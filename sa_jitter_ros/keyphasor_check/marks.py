@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.keyphasor_check.teeth import joined, NumberedPulses
+from sa_jitter_ros.keyphasor_check.teeth import joined, nearest, NumberedPulses
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, pattern_of
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
@@ -177,17 +177,11 @@ def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
 
 def _aligned(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     """Return pulses behind a standstill with numbers that fit the pattern in front of it."""
-    late = pattern.late()
-    costs = [np.mean(_away(pulses.places, pattern, late, pulses.numbers + shift))
-             for shift in range(pattern.teeth)]
+    late = np.where(pattern.missing, np.inf, pattern.late())
+    away = [np.abs(pulses.places - late[pattern.tooth(pulses.numbers + shift)])
+            for shift in range(pattern.teeth)]
+    costs = np.minimum(away, 0.5).mean(axis=1)
     return replace(pulses, numbers=pulses.numbers + int(np.argmin(costs)))
-
-
-def _away(places: FloatArray, pattern: Pattern, late: FloatArray, numbers: IntArray) -> FloatArray:
-    """Return how far (n,), in teeth, pulses are from the marks of these numbers, at most 0.5."""
-    tooth = pattern.tooth(numbers)
-    return np.asarray(np.where(pattern.missing[tooth], 0.5,
-                               np.minimum(np.abs(places - late[tooth]), 0.5)))
 
 
 def _measured(pulses: NumberedPulses, pattern: Pattern) -> tuple[NumberedPulses, Pattern]:
@@ -219,9 +213,7 @@ def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     after = np.clip(np.searchsorted(expected, every), 1, marks.size - 1)
     near = after - (every - expected[after - 1] < expected[after] - every)
     away = np.abs(every - expected[near]) / pitch[marks[near]]
-    order = np.lexsort((away, near))
-    kept = np.zeros(every.size, np.bool_)
-    kept[order[np.append(True, np.diff(near[order]) != 0)]] = True
+    kept = nearest(near, away)
     # Where the speed is not known well, as at the ends and beside gaps, pulses keep their number.
     fixed = np.isin(every, pulses.times) & (
         (away > _NEAR) | (near < pattern.teeth) | (near >= marks.size - pattern.teeth))

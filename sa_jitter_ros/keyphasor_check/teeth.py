@@ -159,7 +159,7 @@ def _numbered(times: FloatArray, window: int, scale: float) -> NumberedPulses:
     strays = np.empty(0)
     for step in range(_PASSES):
         numbers, places, breaks = _places(times, pitch, silent, window)
-        kept = _nearest(numbers, places)
+        kept = nearest(numbers, np.abs(places))
         far = np.abs(places) > _FAR
         if np.mean(far) < 0.5:
             kept &= ~far
@@ -233,9 +233,9 @@ def _smooth(values: NDArray[Any], window: int) -> NDArray[Any]:
     return np.asarray(np.convolve(values, weight)[half:half + values.size])
 
 
-def _nearest(numbers: IntArray, places: FloatArray) -> BoolArray:
-    """Return which pulses stand nearest to their tooth among those of the same number."""
-    order = np.lexsort((np.abs(places), numbers))
+def nearest(numbers: IntArray, away: FloatArray) -> BoolArray:
+    """Return which pulses (n,), so far `away`, are nearest among those of the same number."""
+    order = np.lexsort((away, numbers))
     first = np.append(True, np.diff(numbers[order]) != 0)
     kept = np.zeros(numbers.size, np.bool_)
     kept[order[first]] = True

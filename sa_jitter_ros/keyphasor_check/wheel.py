@@ -24,6 +24,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.keyphasor_check.teeth import NumberedPulses
+from sa_jitter_ros.pulses.target import index_of
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -39,7 +40,6 @@ _LOST = 0.4  # at most so many of the present teeth have no pulse
 _MOSTLY = 0.67  # at most so many teeth are missing
 # Likelihoods hold for independent errors; those of pulses and speeds are not.
 _TEMPER = 0.3
-_OUTLIER = 4.0
 _CLEAR, _MOST_PATTERNS = 3.0, 4
 
 
@@ -113,7 +113,7 @@ def _once(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
 
 
 def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Pattern:
-    """Return the pattern of a target of so many teeth."""
+    """Return the pattern of a target of so many teeth, the errors of its marks not known yet."""
     part = _longest(pulses)
     numbers, places = pulses.numbers[part], pulses.places[part]
     classes = numbers % teeth
@@ -121,19 +121,12 @@ def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Pat
     seen = np.bincount(classes, minlength=teeth)
     missing = _missing(seen, span)
     origin = _index(missing)
-    late, errors = np.zeros(teeth), np.full(teeth, np.nan)
-    for tooth in np.flatnonzero(~missing):
-        own = places[classes == tooth]
-        middle = float(np.median(own))
-        spread = 1.4826 * float(np.median(np.abs(own - middle)))
-        near = own[np.abs(own - middle) <= max(_OUTLIER * spread, 1e-12)]
-        late[tooth] = near.mean()
-        errors[tooth] = near.std() / np.sqrt(max(near.size - 1, 1))
-    late, errors = np.roll(late, -origin), np.roll(errors, -origin)
     missing = np.roll(missing, -origin)
+    late = np.array([np.median(places[classes == (tooth + origin) % teeth])
+                     for tooth in np.flatnonzero(~missing)])
     # Where teeth are missing, those that are there need not have the mean place 0.
-    shift = late[~missing].mean() if not missing.all() else 0.0
-    return Pattern(teeth, missing, late[~missing] - shift, errors[~missing], origin, evidence)
+    return Pattern(teeth, missing, late - late.mean(), np.full(late.size, np.nan), origin,
+                   evidence)
 
 
 def _longest(pulses: NumberedPulses) -> slice:
@@ -144,13 +137,11 @@ def _longest(pulses: NumberedPulses) -> slice:
 
 
 def _index(missing: BoolArray) -> int:
-    """Return the first tooth behind the widest gap, as `pulses.target.ToothedWheel` has it."""
+    """Return the first tooth behind the widest gap."""
     there = np.flatnonzero(~missing)
     if there.size in (0, missing.size):
         return 0
-    steps = np.diff(np.append(there, there[0] + missing.size))
-    best = max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
-    return int(there[best])
+    return int(there[index_of(np.diff(np.append(there, there[0] + missing.size)))])
 
 
 def _missing(seen: IntArray, span: IntArray) -> BoolArray:

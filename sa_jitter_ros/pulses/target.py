@@ -95,6 +95,15 @@ class Lock:
                        believed=np.roll(self.believed, -self.slot))
 
 
+def index_of(steps: IntArray) -> int:
+    """
+    Return which tooth is the index of a wheel with these `steps` (m,) from tooth to tooth.
+
+    It is the one behind the widest gap; of several, the one behind the widest teeth before it.
+    """
+    return max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
+
+
 class Target(Protocol):
     """What the pulse validator needs to know of a target."""
 
@@ -207,7 +216,7 @@ class ToothedWheel:
         for guess in guesses:
             steps = np.maximum(np.rint(intervals / guess), 1.0).astype(np.int64)
             if steps.sum() == self._teeth:
-                index = max(range(steps.size), key=lambda k: tuple(np.roll(steps, -k)[::-1]))
+                index = index_of(steps)
                 steps = np.roll(steps, -index)
                 tolerance = self._tolerances(steps)
                 error = np.abs(np.roll(intervals / guess, -index) / steps - 1.0)
