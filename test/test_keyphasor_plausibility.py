@@ -78,6 +78,16 @@ def test_what_does_not_fit_is_said_once(recording, change, declared, text):
     assert len(found) == 1
 
 
+@pytest.mark.parametrize(('factor', 'found'), [(2.0, 0), (0.5, 0), (6.0, 1), (0.1, 1)])
+def test_a_declared_jitter_of_another_size_is_named(recording, factor, found):
+    assert len(of(recording, jitter_std=factor / CLOCK / np.sqrt(12.0))) == found
+
+
+def test_a_standstill_is_no_other_target(recording):
+    times = recording.pulse_times
+    assert of(replace(recording, pulse_times=times[(times < 3.0) | (times > 7.0)])) == ()
+
+
 @pytest.fixture
 def gearbox(rng):
     """Return a function for a machine with a shaft at 2.5 times the speed, and 8 marks."""

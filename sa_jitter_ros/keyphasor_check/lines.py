@@ -78,6 +78,11 @@ class Lines:
         near = np.abs(self.places - places[:, None]) < 0.5 * _LOBE * self.step
         return np.asarray(np.log(np.max(np.where(near, self.sizes, 1.0), axis=1, initial=1.0)))
 
+    def share(self, least: float, most: float) -> float:
+        """Return the share of places from `least` to `most` where `logarithms` has a line."""
+        count = np.count_nonzero((self.places > least) & (self.places < most))
+        return min(1.0, _LOBE * self.step * count / (most - least))
+
     def scaled(self, factor: float) -> 'Lines':
         """Return the lines with places in cycles of something `factor` teeth long."""
         return Lines(self.places * factor, self.sizes, self.levels, self.step * factor)

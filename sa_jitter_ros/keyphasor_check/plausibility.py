@@ -33,18 +33,17 @@ _FIRST_SECONDS = 20.0
 _MOST_VALUES = 4_000_000
 _MOST_PULSES = 4000
 _LONGEST_GAP = 10.0  # trigger cycles without a pulse
-# Places at which a spectrum is looked at for peaks there by chance; probability that so many stand
-# by chance, above which nothing is said for the orders; other numbers of marks, in parts of the
-# stated one, and by how much the logarithms of the peaks are larger with them on average; by how
-# much where all of the orders stand with the stated one, too.
-_PLACES, _BY_CHANCE = 400, 0.05
+# Probability that so many orders stand by chance, above which nothing is said for them; other
+# numbers of marks, in parts of the stated one, and by how much the logarithms of the peaks are
+# larger with them on average; by how much where all of the orders stand with the stated one, too.
+_BY_CHANCE = 0.05
 _OTHER_MARKS = (Fraction(1, 2), 2, Fraction(1, 3), 3, Fraction(1, 4), 4, Fraction(1, 8), 8)
 _LARGER, _FAR_LARGER = 0.7, 2.0
-# A family of harmonics beside the stated one: orders that may be those of a mesh, how near to a
-# multiple they are, and by how much the logarithm of each of their peaks is larger.
-_LEAST_MESH, _WHOLE, _BESIDE = 8, 1e-6, 1.6
+# A family of harmonics beside the stated one: orders that may be those of a mesh, and by how much
+# the logarithm of each of their peaks is larger.
+_LEAST_MESH, _BESIDE = 8, 1.6
 _MOST_VALIDATED = 100_000
-_UNUSED, _FEW = 0.25, 20  # of the time without a trigger cycle, and pulses in it
+_UNUSED = 0.25  # of the time, and of the pulses, without a trigger cycle
 _MOST_STRAYS = 0.05
 _OTHER_SIZE, _SURE = 3.0, 4.0  # times as large; standard errors
 
@@ -113,7 +112,7 @@ def _unfit(pulses: FloatArray, target: Mapping[str, Any]) -> list[str]:
     longest = int(np.argmax(used[1] - used[0]))
     start, end = float(used[0][longest]), float(used[1][longest])
     inside = int(np.count_nonzero((pulses >= start) & (pulses <= end)))
-    if end - start > _UNUSED * np.ptp(pulses) and inside > _FEW:
+    if end - start > _UNUSED * np.ptp(pulses) and inside > _UNUSED * pulses.size:
         of = f'{validator.pulses_per_revolution} marks a revolution'
         if target['missing_teeth']:
             of += f', {target["missing_teeth"]} of them missing'
@@ -165,8 +164,7 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
     places = ratio * np.asarray(orders)
     sizes = lines.logarithms(places)
     stand = sizes > 0.0
-    least, most = 0.8 * float(places.min()), 1.2 * float(places.max())
-    chance = float(np.mean(lines.logarithms(np.linspace(least, most, _PLACES)) > 0.0))
+    chance = lines.share(0.8 * float(places.min()), 1.2 * float(places.max()))
     count, listed = int(np.count_nonzero(stand)), ', '.join(f'{order:g}' for order in orders[:6])
     speed = share * (times.size - 1) / float(np.sum(np.diff(times) / np.maximum(
         np.diff(triggers.count[chosen]), 1)))
@@ -188,8 +186,8 @@ def weak_orders(recording: Recording, pulses: FloatArray, orders: Sequence[float
                     f'and ratio {ratio:.6g}: with pulses_per_revolution {fitting} instead of '
                     f'{marks} {better} (check_keyphasor finds out)',)
     base = round(min(orders))
-    if len(orders) < 2 or base < _LEAST_MESH or not all(
-            abs(order / base - round(order / base)) < _WHOLE for order in orders):
+    multiple = np.asarray(orders) / base
+    if len(orders) < 2 or base < _LEAST_MESH or not np.allclose(multiple, np.rint(multiple)):
         return ()
     for miscounted in (base - 1, base + 1, base - 2, base + 2):
         others = lines.logarithms(places * (miscounted / base))
