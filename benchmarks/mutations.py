@@ -9,11 +9,12 @@
 # the License.
 
 """
-Which numbers of the inference no published decision depends on.
+Which numbers of the package no published decision, and no test, depends on.
 
 `python benchmarks/mutations.py` moves each number in the constants of `inference` and `effects` by
 a factor of ten, up or else down, in a copy of the package, and looks whether the decision on one
-of the open rows (`decisions.py`) becomes another. What noticed is kept in `mutations.json` beside
+of the open rows (`decisions.py`) becomes another. For those of `keyphasor_check` and `pulses` it
+looks whether one of the tests of the folder fails. What noticed is kept in `mutations.json` beside
 this file, so that the next run asks it first, and the tests ask some of it.
 """
 
@@ -38,7 +39,10 @@ from decisions import published
 NOTICED = Path(__file__).with_suffix('.json')
 _ROOT = Path(__file__).resolve().parents[1]
 _PACKAGE = 'sa_jitter_ros'
-_ROOMS = 'inference', 'effects'
+_ROOMS = 'inference', 'effects', 'keyphasor_check', 'pulses'
+#: The tests of folders on whose numbers no row is asked.
+_TESTS = {'keyphasor_check': 'test_keyphasor_*.py', 'pulses': 'test_pulses_*.py'}
+_MARKS = 'not (build or campaign or processes or style)'
 _FACTOR = 10
 _LONGEST = 600.0  # s, of a row: a search that does not end is noticed
 
@@ -53,6 +57,13 @@ class Number:
     start: int
     end: int
     value: float
+
+    @property
+    def asked(self) -> list[str]:
+        """Return what may notice it: the open rows, or the files of tests of its folder."""
+        tests = _TESTS.get(self.name.split('.')[0])
+        return sorted(f'test/{path.name}' for path in (_ROOT / 'test').glob(tests)) if tests else (
+            cases())
 
     def moved(self, up: bool) -> str | None:
         """Return the number ten times larger or smaller as source; None where it is the same."""
@@ -103,9 +114,9 @@ def cases() -> list[str]:
 
 
 def noticed(number: Number, up: bool, asked: Sequence[str]) -> str:
-    """Return the first row that is decided otherwise with the moved number; '' if none is."""
+    """Return the first row, or test, that the moved number changes; '' if there is none."""
     moved = number.moved(up)
-    if moved is None:
+    if moved is None or not asked:
         return ''
     path = Path(_copy().name, number.path)
     before = path.read_text()
@@ -114,7 +125,7 @@ def noticed(number: Number, up: bool, asked: Sequence[str]) -> str:
     lines[number.line - 1] = line[:number.start] + moved + line[number.end:]
     path.write_text(''.join(lines))
     try:
-        return differs(asked)
+        return fails(asked) if asked[0].startswith('test/') else differs(asked)
     finally:
         path.write_text(before)
 
@@ -148,6 +159,27 @@ def differs(asked: Sequence[str]) -> str:
         return [line.strip() for line in names if line.strip() in asked][-1]
 
 
+def fails(tests: Sequence[str]) -> str:
+    """
+    Return the first of some tests, or files of them, that fails with the copy; '' if none does.
+
+    One that does not end has failed, too.
+    """
+    paths = f'pythonpath={_copy().name} {_ROOT / "benchmarks"}'
+    command = [sys.executable, '-m', 'pytest', '-x', '-q', '--tb=no', '-p', 'no:cacheprovider',
+               '-m', _MARKS, '-o', paths, *tests]
+    environment = {**os.environ, 'PYTHONPATH': _copy().name, 'PYTHONSAFEPATH': '1',
+                   'PYTHONDONTWRITEBYTECODE': '1'}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST,
+                              cwd=_ROOT, env=environment)
+    except subprocess.TimeoutExpired:
+        return tests[0]
+    names = [line.split(' ', 1)[1].split(' - ')[0] for line in done.stdout.splitlines()
+             if line.startswith(('FAILED ', 'ERROR '))]
+    return next(iter(names), '') if done.returncode else ''
+
+
 def kept() -> dict[str, list[str]]:
     """Return which way each number was moved before, and the row that noticed it, '' for none."""
     return json.loads(NOTICED.read_text()) if NOTICED.exists() else {}
@@ -168,27 +200,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument('--new', action='store_true', help='only numbers that nothing noticed yet')
     parser.add_argument('--stale', action='store_true',
                         help='only numbers that the row which noticed them no longer notices')
-    parser.add_argument('--rows', nargs='*', default=cases(), help='the rows that are asked')
+    parser.add_argument('--rows', nargs='*', help='the rows, or files of tests, that are asked')
     options = parser.parse_args(arguments)
     known = kept()
-    for number in numbers():
+    chosen = [number for number in numbers() if options.only in number.name]
+    for number in chosen:
         last, before = known.get(number.name, ['', ''])
-        if options.only not in number.name or (options.new and before):
+        if options.new and before:
             continue
         if options.stale and (not before or noticed(number, last == 'up', [before])):
             continue
         found = ['', '']
+        asked = number.asked if options.rows is None else options.rows
         for way in sorted(('up', 'down'), key=lambda item: item != last):
-            name = noticed(number, way == 'up', sorted(
-                options.rows, key=lambda item: item != before)) if options.rows else ''
+            name = noticed(number, way == 'up', [
+                *([before] if before else []), *(each for each in asked if each != before)])
             if name:
                 found = [way, name]
                 break
         known[number.name] = found
         print(f'{number.name} {number.value}: {" ".join(found)}', flush=True)
         NOTICED.write_text(json.dumps(known, indent=1, sort_keys=True) + '\n')
-    missed = [number.name for number in numbers() if not known.get(number.name, ['', ''])[1]]
-    print(f'{len(missed)} of {len(list(numbers()))} are noticed by nothing: {", ".join(missed)}')
+    missed = [number.name for number in chosen if not known.get(number.name, ['', ''])[1]]
+    print(f'{len(missed)} of {len(chosen)} are noticed by nothing: {", ".join(missed)}')
     return int(bool(missed))
 
 

@@ -32,12 +32,10 @@ FloatArray = NDArray[np.float64]
 
 _MOST_VALUES = 3_000_000
 _MOST_POINTS = 600_000
-_FEWEST_TURNS = 12
-_FEWEST_REVOLUTIONS = 10  # of a shaft whose own revolution shows as a line
 # Times the median of the spectrum around: a line; and one that noise makes in 5e-5 of places.
 _PROMINENT, _CLEAR = 7.0, 4.0
-# Bins on either side that a line has, and to which it leaks, and by how much it is larger there.
-_LOBE, _SKIRT, _ABOVE = 3, 7, 1.5
+# Bins of a line to either side, and how much larger it is than as many bins beside them.
+_LOBE, _ABOVE = 3, 1.5
 _NEIGHBOURHOOD = 100
 _MOST_LINES = 60
 _STRONGEST = 3e-3  # of the strongest line; below it are side lobes and distortion
@@ -94,15 +92,15 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
     Return the lines in `samples` (sample, channel) over the angle, also `weak` ones if asked.
 
     The shaft has `turned` (n,) at `times` (n,) in s; the first sample was at `start`. What leaks
-    from a line is none. None where the shaft hardly turns during the samples.
+    from a line is none. None where the orders of the shaft are not apart.
     """
-    end = start + (len(samples) - 1) / rate
+    end, skirt = start + (len(samples) - 1) / rate, 2 * _LOBE + 1
     inside = (times >= start) & (times <= end)
     times, turned = times[inside], turned[inside]
     most = min(_MOST_POINTS, _MOST_VALUES // samples.shape[1])
     count = int(np.searchsorted(times, times[0] + most / rate)) if times.size else 0
     times, turned = times[:count], turned[:count]
-    if times.size < 3 or turned[-1] - turned[0] < _FEWEST_TURNS:
+    if times.size < 3 or turned[-1] - turned[0] < 2 * skirt:
         return None
     step = 1.0 / float(turned[-1] - turned[0])
     spectrum = _spectrum(samples, (times - start) * rate, turned)
@@ -111,10 +109,10 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
     size = share.max(axis=1)
     level = (spectrum / np.maximum(spectrum.max(axis=0), tiny)).max(axis=1)
     peak = (size > (_CLEAR if weak else _PROMINENT)) & (level > (0.0 if weak else _STRONGEST))
-    found = np.flatnonzero(peak[_SKIRT:1 - _SKIRT]) + _SKIRT
-    around = share[found[:, None] + np.arange(-_SKIRT + 1, _SKIRT)]  # line, bin, channel
-    beside = np.delete(around, slice(_SKIRT - _LOBE, _SKIRT + _LOBE - 1), axis=1).max(axis=1)
-    top = around[:, _SKIRT - 2:_SKIRT + 1].argmax(axis=1) == 1
+    found = np.flatnonzero(peak[skirt:1 - skirt]) + skirt
+    around = share[found[:, None] + np.arange(-skirt + 1, skirt)]  # line, bin, channel
+    beside = np.delete(around, slice(skirt - _LOBE, skirt + _LOBE - 1), axis=1).max(axis=1)
+    top = around[:, skirt - 2:skirt + 1].argmax(axis=1) == 1
     found = found[np.any(top & (share[found] > np.maximum(_ABOVE * beside, _CLEAR)), axis=1)]
     if not weak:
         found = np.sort(found[np.argsort(-size[found])][:_MOST_LINES])
@@ -214,9 +212,8 @@ def _says(lines: Lines, family: list[int], count: int) -> tuple[float, bool]:
     whole = bool(np.all(np.abs(lines.places[family] - np.rint(lines.places[family])) < width))
     # It turns once in some marks of which a whole number makes a revolution.
     parts = np.array([part for part in range(2, count + 1) if count % part == 0])
-    once = lines.step * count < 1.0 / _FEWEST_REVOLUTIONS and bool(np.any(np.abs(
-        np.multiply.outer(parts, lines.places[family]) - 1.0) < _WIDTH * lines.step
-        * parts[:, None]))
+    once = bool(np.any(np.abs(np.multiply.outer(parts, lines.places[family]) - 1.0)
+                       < width * parts[:, None]))
     # Multiples of a line that is no multiple of 1/count are those of another shaft.
     return float(weight @ one) if on[0] else 0.0, whole or once
 
