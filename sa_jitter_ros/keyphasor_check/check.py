@@ -48,6 +48,7 @@ _DECLARED = math.log(300.0)  # what the statement of a recording says for a numb
 _LISTED = 0.01  # probability of an alternative that is listed
 _SURE = 0.9
 _MOST_ORDERS = 12
+_COSTS = 4  # stated orders of which a cost is given
 _MOST_SAMPLES = 12_000_000
 # Lines at whole orders of the tach shaft, beside those there by chance, with which it is the shaft
 # of interest; and the probability that another one is, all the same.
@@ -160,6 +161,11 @@ class _Check:
         return KeyphasorCheck(findings, warnings, fitted, per_revolution, self._rate,
                               self._from_waveform, from_marks is not None)
 
+    def _warn(self, code: str, text: str, *, spoils: bool = False) -> None:
+        """Add a warning, which `spoils` all stated orders."""
+        self._warnings.append(Warn(code, text, tuple(
+            (g, 100.0) for g in self._recording.orders[:_COSTS] if spoils)))
+
     # --- what is there ---
 
     def _pulses(self) -> FloatArray:
@@ -169,7 +175,7 @@ class _Check:
         detector = KeyphasorDetector()
         times = recording.keyphasor_pulses(detector=detector)
         if spikes := spikes_text(detector.state.spikes):
-            self._warnings.append(Warn('spikes', spikes))
+            self._warn('spikes', spikes)
         self._largest = float(np.max(np.abs(times), initial=0.0))
         whose = f'{times.size} pulses in {recording.duration:.4g} s'
         if times.size < FEWEST:
@@ -186,8 +192,7 @@ class _Check:
                 likely = mistakes[0]
                 others = ''.join(f'; or {item.code[5:]} ({item.probability:.0%})'
                                  for item in mistakes[1:] if item.probability > _LISTED)
-                self._warnings.append(Warn(likely.code, likely.text + others,
-                                           tuple((g, 100.0) for g in recording.orders[:4])))
+                self._warn(likely.code, likely.text + others, spoils=True)
                 times = (times - likely.shift) * likely.scale
                 self._rate *= likely.rate_scale
                 self._largest *= likely.scale
@@ -203,17 +208,17 @@ class _Check:
             return
         length = recording.tach.samples / recording.tach_rate
         if _KILO[0] < length / recording.duration < _KILO[1]:
-            self._warnings.append(Warn(
+            self._warn(
                 'unit_khz', f'the tach waveform spans {length:.6g} s, the vibration '
                 f'{recording.duration:.6g} s: tach_rate looks like kHz; give '
-                f'tach_rate={1e3 * recording.tach_rate:.10g}'))
+                f'tach_rate={1e3 * recording.tach_rate:.10g}')
             self._recording = replace(recording, tach_rate=1e3 * recording.tach_rate)
 
     def _span(self, times: FloatArray) -> None:
         end = self._start + self._recording.samples / self._rate
         text = other_span(times, self._start, end)
         if text and not {'span', 'no_overlap'} & {item.code for item in self._warnings}:
-            self._warnings.append(Warn('span', text))
+            self._warn('span', text)
             factor = rate_factor(times, self._start, end)
             self._other_rate = factor * self._rate if factor != 1.0 else 0.0
 
@@ -229,9 +234,9 @@ class _Check:
             samples = recording.read()
         bad = bad_channels(samples)
         for channel, reason in bad.items():
-            self._warnings.append(Warn(
+            self._warn(
                 'bad_channel', f'channel {recording.channel_names[channel]} {reason}: it is left '
-                'out; check its sensor, cable and range'))
+                'out; check its sensor, cable and range')
         good = [channel for channel in range(len(samples)) if channel not in bad]
         return np.nan_to_num(samples[good], nan=0.0, posinf=0.0, neginf=0.0) if good else None
 
@@ -258,15 +263,14 @@ class _Check:
         if probability[best] < _SURE:
             listed = ', '.join(f'{count} ({value:.0%})' for count, value in (
                 (best, probability[best]), *others[:4]))
-            self._warnings.append(Warn(
+            self._warn(
                 'marks_ambiguous', f'several numbers of marks a revolution fit: {listed}; count '
                 'the marks on the shaft, or measure its speed with a strobe, and give '
-                'pulses_per_revolution'))
+                'pulses_per_revolution')
         if declared > 1 and declared != best:
-            self._warnings.append(Warn(
+            self._warn(
                 'marks_contradict', f'the recording states {declared} marks a revolution, but the '
-                f'pulses show {best}: check pulses_per_revolution',
-                tuple((g, 100.0) for g in self._recording.orders[:4])))
+                f'pulses show {best}: check pulses_per_revolution', spoils=True)
         return Finding(best, None, '1', others, by), shown
 
     def _probabilities(self, numbered: NumberedPulses, found: Sequence[Pattern],
@@ -300,10 +304,10 @@ class _Check:
                                       (other, self._other_rate, others)))
         decides = ('time the length of the recording with a watch, or measure the speed of the '
                    'shaft once with a strobe')
-        self._warnings.append(Warn(
+        self._warn(
             'rate_ambiguous', f'the vibration is as long as the pulses with sample_rate='
             f'{self._other_rate:.10g}, so that the answer may be {answers}: {decides}',
-            tuple((g, 100.0) for g in self._recording.orders[:4])))
+            spoils=True)
         return replace(marks, decided_by=f'{marks.decided_by}; the sampling rate may be '
                        f'{self._other_rate:.10g} Hz: {decides}')
 
@@ -392,10 +396,10 @@ class _Check:
             reason = ('no vibration' if silent else
                       'no line of the vibration stands above the noise')
             if not silent:
-                self._warnings.append(Warn(
+                self._warn(
                     'no_orders', 'no order of the tach shaft stands above the noise of the '
                     'vibration: check that tach and vibration are of the same machine and time, '
-                    'and sample_rate'))
+                    'and sample_rate')
             return (Finding(stated if stated != 1.0 else None, None, '1', (), 'stated' if stated
                             != 1.0 else reason), Finding(None, None, '1', (), reason))
         if stated != 1.0:
@@ -413,21 +417,21 @@ class _Check:
         chosen = chosen[np.argsort(-strength[chosen])][:_MOST_ORDERS]
         listed = sorted({float(orders[k]) for k in chosen})
         if not listed:
-            self._warnings.append(Warn(
+            self._warn(
                 'no_orders', f'no order of a shaft at ratio {best:.6g} stands above the noise: '
-                'check ratio, pulses_per_revolution and sample_rate'))
+                'check ratio, pulses_per_revolution and sample_rate')
         if probability < _SURE and best != 1.0:
             text = ', '.join(f'{value:.6g} ({chance:.0%})'
                              for value, chance in ((best, probability), *others[:4]))
-            self._warnings.append(Warn(
+            self._warn(
                 'ratio_ambiguous', f'several ratios fit the lines of the vibration: {text}; give '
-                'the numbers of teeth (--teeth) or the ratio'))
+                'the numbers of teeth (--teeth) or the ratio')
         missing = [g for g in self._recording.orders if not np.any(
             near & (np.abs(orders - g) < 0.5))]
         if missing:
-            self._warnings.append(Warn(
+            self._warn(
                 'orders_weak', 'stated orders that do not stand above the noise: '
-                + ', '.join(f'{g:g}' for g in missing[:8])))
+                + ', '.join(f'{g:g}' for g in missing[:8]))
         return (Finding(best, lines.step * 0.1 if best != 1.0 and stated == 1.0 else None, '1',
                         tuple((ratio, round(value, 4)) for ratio, value in others
                               if value > _LISTED), by),
@@ -454,8 +458,6 @@ class _Check:
             return Finding(None, None, 's', (), why)
         return Finding(delay.delay, delay.standard_error, 's', (),
                        'phases of the orders turn alike with the speed')
-
-    # --- what it costs ---
 
 
 def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
