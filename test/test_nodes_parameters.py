@@ -153,10 +153,12 @@ def test_lists_may_become_empty_and_full_again(node_with):
 
 
 def test_override_without_parameter_is_named(node_with, capfd):
-    _, parameters = node_with(**{'rat': 2.0, 'use_sim_time': False,
+    _, parameters = node_with(**{'rat': 2.0, 'shaft': 1, 'use_sim_time': False,
                                  'qos_overrides./a.subscription.depth': 5})
     parameters.watch(check=lambda values: None, apply=lambda values: None)
     errors = capfd.readouterr().err
-    assert 'parameter rat is ignored: this node has no parameter of that name' in errors
+    assert ('parameter rat is ignored: this node has no parameter of that name, did you mean '
+            'rate?\n') in errors
+    assert 'parameter shaft is ignored: this node has no parameter of that name\n' in errors
     assert 'qos_overrides' not in errors
     assert 'use_sim_time' not in errors

@@ -18,6 +18,7 @@ that match none. Before a change it calls `check` with all new values, which rai
 """
 
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from itertools import pairwise
 import math
 import re
@@ -140,8 +141,10 @@ class ParameterSet:
         self._node.add_post_set_parameters_callback(self._changed)
         for name in sorted(set(self._node._parameter_overrides) - set(self._specifications)):
             if not name.startswith(('qos_overrides.', 'use_sim_time', 'start_type_')):
+                near = ' or '.join(get_close_matches(name, self._specifications, 2, cutoff=0.8))
                 self._node.get_logger().warning(
-                    f'parameter {name} is ignored: this node has no parameter of that name')
+                    f'parameter {name} is ignored: this node has no parameter of that name'
+                    + (f', did you mean {near}?' if near else ''))
 
     def _convert(self, parameters: list[rclpy.parameter.Parameter]
                  ) -> list[rclpy.parameter.Parameter]:

@@ -89,7 +89,8 @@ class TachDetector(MonitoringNode):
         self._pulse_flow = self.health.add(Flow(
             'pulse', 'pulse in the waveform', 'does the shaft turn? look at keyphasor, cable and '
             'threshold', after=('waveform',)))
-        self.create_steady_timer(BURST_PERIOD, self._send_waiting)
+        self._burst = self.create_steady_timer(BURST_PERIOD, self._send_waiting)
+        self._burst.cancel()  # it runs while pulses wait
         self.parameters.watch(check=detector_of, apply=self._apply)
         self.get_logger().info(f'started: pulses of keyphasor {self._keyphasor!r}')
 
@@ -157,6 +158,10 @@ class TachDetector(MonitoringNode):
     def _send_waiting(self) -> None:
         count = min(max(BURST, len(self._waiting) // 100), len(self._waiting))
         self._send(np.array([self._waiting.popleft() for _ in range(count)]))
+        if not self._waiting:
+            self._burst.cancel()
+        elif self._burst.is_canceled():
+            self._burst.reset()
 
     def _send(self, times: FloatArray) -> None:
         self._unsendable += self._output.publish(times, self._keyphasor)
