@@ -10,6 +10,8 @@
 
 """Channels that are NaN, now and then or for ever, or constant: they alone have no average."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
@@ -72,6 +74,20 @@ def test_a_channel_that_tells_nothing_changes_no_other_one(machine, value):
                                      '[1]: they have no average there']
         assert averager.counts['samples_non_finite'] == vibration.shape[1]
         assert averager.counts['cycles_dropped'] == 0
+
+
+def test_averages_whose_correction_was_refused_have_a_history_of_indicators_of_their_own(machine):
+    vibration, pulses = machine
+    found, _ = averages_of(vibration, pulses, correct_jitter=True,
+                           keyphasor_rate=1.0 / (np.sqrt(12.0) * JITTER))
+    raw = [replace(item, correction=replace(
+        item.correction, accepted=False, waveform=item.waveform)) for item in found]
+    mixed, corrected, refused = ShaftResults(), ShaftResults(), ShaftResults()
+    for one, other in zip(found, raw):
+        for average, alone in ((one, corrected), (other, refused)):
+            both, own = (item.of(average)['condition_indicator'] for item in (mixed, alone))
+            np.testing.assert_array_equal(both.values, own.values)
+
 
 
 @pytest.mark.parametrize('averaging', ['block', 'sliding', 'exponential'])

@@ -70,17 +70,22 @@ class AverageMessage:
 
 
 class ShaftResults:
-    """The results of the averages of one shaft; condition indicators depend on earlier ones."""
+    """
+    The results of the averages of one shaft; condition indicators depend on earlier ones.
+
+    Jitter leaves other waveforms in averages whose correction was refused: these have a history of
+    their own.
+    """
 
     def __init__(self, gear: GearSettings | None = None) -> None:
         self._gear = gear or GearSettings()
-        self._indicators = RunningIndicators(self._gear)
+        self._indicators: dict[bool, RunningIndicators] = {}  # by whether they are of corrected
         self.problem = ''  # why the latest average has no condition indicators
 
     def use(self, gear: GearSettings) -> None:
         """Use other mesh orders; the indicators forget earlier averages."""
         if gear != self._gear:
-            self._gear, self._indicators = gear, RunningIndicators(gear)
+            self._gear, self._indicators = gear, {}
 
     def of(self, average: Average) -> dict[str, AverageMessage]:
         """
@@ -111,21 +116,23 @@ class ShaftResults:
                       for name, content in envelope_tables(envelope).items()}
         self.problem = ''
         if np.isfinite(source.waveform).all(axis=1).any():
-            found |= self._indicate(header, source.waveform, source.parts)
+            found |= self._indicate(header, source.waveform, source.parts,
+                                    correction is not None and correction.accepted)
         return found
 
-    def _indicate(self, header: AverageHeader, waveform: FloatArray, parts: WaveformParts | None
-                  ) -> dict[str, AverageMessage]:
+    def _indicate(self, header: AverageHeader, waveform: FloatArray, parts: WaveformParts | None,
+                  corrected: bool) -> dict[str, AverageMessage]:
         """Return the condition indicators of a waveform, none where it lacks a mesh order."""
+        running = self._indicators.setdefault(corrected, RunningIndicators(self._gear))
         try:
-            self._indicators.update(waveform, parts)
+            running.update(waveform, parts)
         except SignalError:  # the number of channels has changed
-            self._indicators = RunningIndicators(self._gear)
-            self._indicators.update(waveform, parts)
+            self._indicators = {corrected: (running := RunningIndicators(self._gear))}
+            running.update(waveform, parts)
         except ParameterError as error:
             self.problem = str(error)
             return {}
-        found = self._indicators.get()
+        found = running.get()
         return {'condition_indicator': AverageMessage(header, found.values, found.names),
                 'condition_indicator_error': AverageMessage(
                     header, found.standard_errors, found.names)}
