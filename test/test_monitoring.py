@@ -369,6 +369,27 @@ def test_raw_amplitudes_are_monitored_on_request():
     assert monitor.monitors['input'].uncorrected == 1
 
 
+def test_what_a_keyphasor_takes_from_raw_amplitudes_is_no_change_and_damage_is():
+    machine = Machine(15)
+    monitor, lines = MachineMonitor('pump 3', ['input'], replace(
+        SETTINGS, allow_uncorrected=True)), []
+    for number in range(600):
+        machine.bias = 0.0 if number < 300 else 0.3
+        machine.corrected = number < 300 or number % 4 == 0
+        machine.gain[1, 1] = 1.0 if number < 450 else 2.0
+        arrays = machine.messages()
+        table = arrays[0].values
+        table[..., 1] /= 1.0 - machine.bias
+        table[..., 7] = table[..., 8] = 0.01
+        if machine.corrected:
+            table[..., 3], table[..., 10] = table[..., 1] / table[..., 5], 0.01
+        for kind, array in zip(KINDS, arrays):
+            lines += [f'{number}: {line}' for line in monitor.take('input', kind, array)]
+    assert lines
+    assert all(int(line.partition(':')[0]) > 450 and 'order 19 of input, channel 1' in line
+               for line in lines), lines
+
+
 def test_a_bearing_order_changes_alone_whatever_load_and_correction():
     machine = Machine(17)
     monitor = machine.monitor()

@@ -66,7 +66,9 @@ def test_learns_then_names_the_change(ros_graph):
     b, machine = MonitorBench(ros_graph), DrawnMachine(1)
     assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
     assert b.diagnostics()[:2] == (OK, 'no average received yet')
+    count = len(b.received['change'])
     b.play(machine, 30)
+    assert len(b.received['change']) - count == 30
     assert b.change()['baseline'] == {'averages': 30, 'complete': False}
     assert b.diagnostics()[:2] == (OK, 'learning: 30 of 40 averages of input at 16.6 Hz')
     b.play(machine, 50)
@@ -277,6 +279,38 @@ def test_corrupt_file_is_refused_and_kept(learned, capfd):
         assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
     assert capfd.readouterr().err.count('is no intact baseline') == 1
     assert path.read_bytes() == before
+
+
+def test_relearn_begins_a_baseline_and_keeps_the_file_of_the_old_one(learned):
+    machine, path, content = learned
+    before = path.read_bytes()
+    with running(baseline_file=str(path)) as b:
+        for number in (1, 2):
+            assert b.set_parameter('relearn', True) == (True, '')
+            assert b.change() == {'baseline': {'averages': 0, 'complete': False}, 'changes': []}
+            assert not b.node.get_parameter('relearn').value
+            assert b.diagnostics()[0] == OK
+            assert path.with_name(f'baseline.{number}.npz').exists()
+            assert path.with_name('baseline.1.npz').read_bytes() == before
+            b.play(machine, 50)
+            assert b.change() == {'baseline': {'averages': 50, 'complete': True}, 'changes': []}
+    with running(baseline_file=str(path.with_name('baseline.1.npz'))) as b:
+        assert b.change() == content
+    with pytest.raises(ParameterError, match='relearn is true: set it while the node runs'):
+        MonitorBench(Graph(), relearn=True)
+
+
+def test_relearn_sets_a_damaged_file_aside(learned):
+    machine, path, _ = learned
+    path.write_bytes(path.read_bytes()[:500])
+    before = path.read_bytes()
+    with running(baseline_file=str(path)) as b:
+        assert b.diagnostics()[0] == ERROR
+        assert b.set_parameter('relearn', True) == (True, '')
+        assert b.diagnostics()[0] == OK
+        b.play(machine, 50)
+        assert b.change()['baseline']['complete']
+    assert path.with_name('baseline.1.npz').read_bytes() == before
 
 
 def test_second_monitor_of_a_file_is_refused_until_the_first_has_ended(learned):

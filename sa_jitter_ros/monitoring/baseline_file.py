@@ -20,6 +20,7 @@ damage.
 from collections.abc import Mapping
 from dataclasses import asdict
 import fcntl
+from itertools import count
 import json
 import os
 from pathlib import Path
@@ -69,6 +70,22 @@ def lock_baseline(path: Path) -> TextIO | None:
     except OSError:  # a full disk, or a file system without locks
         pass
     return lock
+
+
+def set_aside(path: Path) -> None:
+    """
+    Give a file, if there is one, a name with a number, as `baseline.1.npz`.
+
+    Raises RecordingError, in one line, where that is not possible.
+    """
+    other = next(name for number in count(1) if not (
+        name := path.with_name(f'{path.stem}.{number}{path.suffix}')).exists())
+    try:
+        if path.exists():
+            path.rename(other)
+    except OSError as error:
+        raise RecordingError(f'{path}: the old baseline cannot be kept as {other.name}: '
+                             f'{error.strerror or error}') from error
 
 
 def write_baseline(path: Path, machine: str, monitors: Mapping[str, ShaftMonitor],

@@ -17,14 +17,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sa_jitter_ros.averaging.results import AverageMessage
+from numpy.typing import NDArray
+from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.monitoring.baseline_file import (
-    lock_baseline, read_baseline, write_baseline)
+    lock_baseline, read_baseline, set_aside, write_baseline)
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
+
+FloatArray = NDArray[np.float64]
 
 #: Topics of a shaft whose arrays make one average, by the names of their arrays.
 KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
@@ -33,6 +36,7 @@ KINDS = ('order_amplitude', 'condition_indicator', 'condition_indicator_error',
 _WAITING = 4
 # Averages without indicators after which a shaft is taken to have none.
 _WITHOUT = 3
+_ATTENUATION = AMPLITUDE_FIELDS.index('attenuation')
 
 
 class Pairing:
@@ -41,7 +45,8 @@ class Pairing:
 
     Each topic keeps its order: when an average is complete, those before it will not become more.
     Which kinds a shaft has is known from its `layout`, or when an average has waited in vain for
-    the others. With `allow_uncorrected` raw amplitudes count where there are no corrected ones.
+    the others. With `allow_uncorrected` raw amplitudes count where there are no corrected ones;
+    what the keyphasor takes from them is known from the latest corrected average.
     """
 
     def __init__(self, layout: Layout | None = None) -> None:
@@ -50,6 +55,7 @@ class Pairing:
             KINDS[0], *(KINDS[1:3] if layout.indicators else ()),
             *(KINDS[3:] if layout.bearings else ())}
         self._came: set[str] = set()
+        self._left: FloatArray | None = None  # of amplitudes by jitter
         self._waiting: dict[tuple[int, float], dict[str, AverageMessage]] = {}
 
     def add(self, kind: str, message: AverageMessage) -> list[MonitoredAverage]:
@@ -75,9 +81,14 @@ class Pairing:
 
     def _take(self, count: int) -> list[MonitoredAverage]:
         ready = [self._waiting.pop(item) for item in [*self._waiting][:count]]
-        return [monitored(parts[KINDS[0]], *(parts.get(kind) for kind in KINDS[1:]),
-                          allow_uncorrected=self.allow_uncorrected)
-                for parts in ready if KINDS[0] in parts]
+        return [self._whole(parts) for parts in ready if KINDS[0] in parts]
+
+    def _whole(self, parts: dict[str, AverageMessage]) -> MonitoredAverage:
+        left = parts[KINDS[0]].values[..., _ATTENUATION]
+        if self._left is None or left.shape != self._left.shape or np.isfinite(left).any():
+            self._left = left
+        return monitored(parts[KINDS[0]], *(parts.get(kind) for kind in KINDS[1:]),
+                         allow_uncorrected=self.allow_uncorrected, left=self._left)
 
 
 class MachineMonitor:
@@ -85,11 +96,11 @@ class MachineMonitor:
     The monitors of the shafts of a machine, whose baseline is kept in a file.
 
     `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
-    the process. Raises RecordingError for a file that cannot be used.
+    the process. With `anew` an older file is kept under another name, and not used. Raises RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
-                 path: Path | None = None) -> None:
+                 path: Path | None = None, *, anew: bool = False) -> None:
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
         self._others: dict[str, ShaftMonitor] = {}
@@ -97,6 +108,8 @@ class MachineMonitor:
         if path is not None:
             self._lock = lock_baseline(path)
             try:
+                if anew:
+                    set_aside(path)
                 found = read_baseline(path, machine, settings, 1.0 / len(shafts))
             except RecordingError:
                 self.close()

@@ -33,6 +33,8 @@ FloatArray = NDArray[np.float64]
 # changes the indicator by at most so many times as much.
 _POWERS = {'kurtosis': 4.0, 'fm4': 4.0, 'm6a': 6.0, 'm8a': 8.0, 'na4': 4.0, 'na4_star': 4.0,
            'nb4': 4.0, 'm6a_star': 6.0, 'm8a_star': 8.0}
+# A smaller share of an amplitude that jitter leaves is not known.
+_LEAST_LEFT = 0.1
 _FIELD = {name: place for place, name in enumerate(AMPLITUDE_FIELDS)}
 _OF_BEARING = {name: place for place, name in enumerate(ENVELOPE_FIELDS)}
 _NOUNS = {'order': 'order ', 'indicator': '', 'bearing': 'bearing order '}
@@ -125,13 +127,16 @@ class MonitoredAverage:
 
 def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
               errors: AverageMessage | None = None, envelope: AverageMessage | None = None, *,
-              allow_uncorrected: bool = False) -> MonitoredAverage:
+              allow_uncorrected: bool = False, left: FloatArray | None = None
+              ) -> MonitoredAverage:
     """
     Return what is monitored of the arrays of one average.
 
     Without corrected amplitudes, these and the indicators are unknown, because what is not
     corrected shows the keyphasor, too. With `allow_uncorrected` the raw ones, with their standard
-    errors, take their place. Raises MessageError for arrays whose channels or indicators differ.
+    errors, take their place; what the keyphasor has taken from them is in doubt, if it is known
+    what it has `left` (channel, order). Raises MessageError for arrays whose channels or
+    indicators differ.
     """
     table = amplitudes.values
     channels, count, _ = table.shape
@@ -147,11 +152,14 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
             variance = (errors.values / values) ** 2
     amplitude, error, noise = (table[..., _FIELD[name]] for name in (
         'corrected_amplitude', 'corrected_standard_error', 'noise_standard_deviation'))
+    lost = np.zeros(amplitude.shape)
     if allow_uncorrected and not np.isfinite(amplitude).any():
         amplitude, error = (table[..., _FIELD[name]]
                             for name in ('raw_amplitude', 'raw_standard_error'))
+        if left is not None:
+            lost = np.nan_to_num(amplitude * (1.0 / np.clip(left, _LEAST_LEFT, 1.0) - 1.0))
     noise = np.fmin(noise, error)
-    doubt = np.sqrt(np.maximum(error**2 - noise**2, 0.0))
+    doubt = np.sqrt(np.maximum(error**2 - noise**2, 0.0) + lost**2)
     power = np.array([_POWERS.get(name, 1.0) for name in names])
     total = np.nansum(amplitude**2, axis=1, keepdims=True)
     relative = np.sqrt(np.nansum(doubt**2, axis=1, keepdims=True)

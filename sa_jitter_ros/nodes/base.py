@@ -243,6 +243,9 @@ class MonitoringNode(Node):
     def update_counts(self) -> None:
         """Bring `counts` up to date before they are published."""
 
+    def keep_state(self) -> None:
+        """Write what has to outlast the node; it may go on afterwards."""
+
     def summary(self) -> tuple[str, dict[str, str]]:
         """Return the node's state in one line, and values to publish beside the counts."""
         return 'running', {}

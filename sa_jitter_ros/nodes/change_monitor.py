@@ -19,6 +19,7 @@ import time
 from typing import Any
 from urllib.parse import quote
 
+from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
@@ -38,6 +39,8 @@ PARAMETERS = (
     Parameter('baseline_file', '', 'file that keeps the baseline (.npz); empty: '
               'sa_jitter_ros/<hardware_id>.<node>.npz in ROS_HOME, by default ~/.ros; none: it is '
               'lost when the node ends', read_only=True),
+    Parameter('relearn', False, 'set to true at run time: learn a new baseline; the file of the '
+              'old one is kept beside the new one, with a number in its name'),
 )
 _NOT_KEPT = 'none'
 _SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens
@@ -56,16 +59,11 @@ class ChangeMonitor(MonitoringNode):
         self._values = values = self.parameters.values()
         shafts = values['shafts']
         require_shaft_names('shafts', shafts)
-        settings = Settings.of(values)
-        self._monitor: MachineMonitor | None = None
-        self._saved, self._was_complete = time.monotonic(), False
-        machine = values[HARDWARE_ID.name]
-        self._path = baseline_path(
-            values['baseline_file'], machine, self.get_fully_qualified_name())
-        try:
-            self._monitor = MachineMonitor(machine, shafts, settings, self._path)
-        except RecordingError as error:
-            self._fail('baseline', str(error))
+        if values['relearn']:
+            raise ParameterError('relearn is true: set it while the node runs')
+        self._path = baseline_path(values['baseline_file'], values[HARDWARE_ID.name],
+                                   self.get_fully_qualified_name())
+        self._begin()
         self._change = self.create_output(String, 'change', LATCHED_QOS)
         for shaft in shafts:
             for kind in KINDS:
@@ -75,24 +73,53 @@ class ChangeMonitor(MonitoringNode):
         self.parameters.watch(check=Settings.of, apply=self._apply)
         self._publish()
         if self._monitor is not None:
-            self._was_complete = self._monitor.is_complete
             self._show()
             known = (f'baseline of {self._monitor.averages} averages in {self._path}'
                      if self._path else 'the baseline is lost when the node ends')
             self.get_logger().info(f'started: monitors {", ".join(shafts)}; {known}')
 
-    def destroy_node(self) -> None:
-        """Keep the baseline and destroy the node."""
+    def _begin(self, *, anew: bool = False) -> None:
+        """Begin to monitor with the baseline of the file, or with none."""
+        values = self._values
+        self._monitor: MachineMonitor | None = None
+        self._saved, self._was_complete = time.monotonic(), False
+        reason = ''
+        try:
+            self._monitor = MachineMonitor(values[HARDWARE_ID.name], values['shafts'],
+                                           Settings.of(values), self._path, anew=anew)
+            self._was_complete = self._monitor.is_complete
+        except RecordingError as error:
+            reason = str(error)
+        self._fail('baseline', reason)
+
+    def keep_state(self) -> None:
+        """Write the baseline."""
         if self._monitor is not None:
             self._monitor.finish()
             if self._monitor.unsaved:
                 self._save(self._monitor)
-            self._monitor.close()
+
+    def destroy_node(self) -> None:
+        """Keep the baseline and destroy the node."""
+        self._close()
         super().destroy_node()
+
+    def _close(self) -> None:
+        self.keep_state()
+        if self._monitor is not None:
+            self._monitor.close()
 
     def _apply(self, values: Values) -> None:
         self._values = values
-        if self._monitor is not None:
+        if values['relearn']:
+            self._close()
+            for shaft in values['shafts']:
+                self._fail(f'baseline of {shaft}', '')
+            self._begin(anew=True)
+            self.get_logger().info('a new baseline is learnt')
+            self._publish()
+            self.set_parameters([RosParameter('relearn', value=False)])
+        elif self._monitor is not None:
             self._monitor.use(Settings.of(values))
             self._show()
 
@@ -111,6 +138,7 @@ class ChangeMonitor(MonitoringNode):
         self._flows.came(shaft, kind, decoded)
         if self._monitor is None:
             return
+        before = self._monitor.averages
         try:
             lines = self._monitor.take(shaft, kind, decoded)
         except ParameterError as error:
@@ -120,7 +148,7 @@ class ChangeMonitor(MonitoringNode):
             self._fail(f'baseline of {shaft}', '')
         for line in lines:
             self.get_logger().warning(line)
-        if self._monitor.unsaved:
+        if self._monitor.averages != before:
             self._show()
             self._publish()
             due = time.monotonic() - self._saved > _SAVE_PERIOD
