@@ -15,6 +15,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 from bench import assert_true, AveragerBench
 from builtin_interfaces.msg import Time
@@ -594,10 +595,10 @@ sys.exit(main())
 """
 
 
-def run(environment, *arguments):
+def run(environment, *arguments, before=''):
     """Start the node as a process."""
     return subprocess.Popen(
-        [sys.executable, '-c', RUN, '--ros-args', *arguments], env=environment, text=True,
+        [sys.executable, '-c', before + RUN, '--ros-args', *arguments], env=environment, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 
 
@@ -613,6 +614,35 @@ def test_main_ends_well_on_a_signal_with_a_parameter_file(process_environment, t
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     assert re.fullmatch(r'.*started: averages 12 trigger cycles of shaft\n', errors)
+
+
+@pytest.mark.processes
+def test_interrupts_that_repeat_end_it_well(process_environment):
+    process = run(process_environment)
+    assert process.stdout.readline() == 'spinning\n'
+    while process.poll() is None:
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.02)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 0
+    assert re.fullmatch(r'.*started: averages .*\n', errors)
+
+
+HANG = """
+import ctypes
+from rclpy.node import Node
+Node.destroy_node = lambda node: ctypes.PyDLL(None).sleep(600)  # keeps the interpreter's lock
+"""
+
+
+@pytest.mark.processes
+def test_middleware_that_hangs_does_not_keep_it(process_environment):
+    process = run(process_environment, before=HANG)
+    assert process.stdout.readline() == 'spinning\n'
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 0
+    assert '/synchronous_averager: the middleware hangs while it destroys the node' in errors
 
 
 @pytest.mark.processes

@@ -96,7 +96,8 @@ class MachineMonitor:
     The monitors of the shafts of a machine, whose baseline is kept in a file.
 
     `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
-    the process. With `anew` an older file is kept under another name, and not used. Raises RecordingError for a file that cannot be used.
+    the process. With `anew` an older file is kept under another name, and not used.
+    Raises RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,

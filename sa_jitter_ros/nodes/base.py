@@ -38,6 +38,7 @@ from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
+from sa_jitter_ros.nodes.lifetime import end_within, InterruptOnce, SECONDS
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.nodes.parameters import command_line_parameters, ParameterSet
 from sa_jitter_ros.parameter_file import require_regular_file
@@ -298,16 +299,21 @@ def _type_name(kind: type) -> str:
     return f'{package}/{folder}/{kind.__name__}'
 
 
-def run_node(node_class: Callable[..., Node], args: Sequence[str] | None = None) -> int:
+def run_node(node_class: Callable[..., MonitoringNode], args: Sequence[str] | None = None) -> int:
     """Run one node until SIGINT or SIGTERM; return 0, or 2 after one line on a bad argument."""
     return run_nodes([node_class], args)
 
 
-def run_nodes(node_classes: Sequence[Callable[..., Node]], args: Sequence[str] | None = None
-              ) -> int:
-    """Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`."""
+def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
+              args: Sequence[str] | None = None) -> int:
+    """
+    Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`.
+
+    The process is that of the nodes: it ends if the middleware hangs after such a signal.
+    """
     use_one_thread()
-    nodes: list[Node] = []
+    interrupt = InterruptOnce()
+    nodes: list[MonitoringNode] = []
     options: dict[str, Any] = {}
     given = sys.argv if args is None else args
     try:
@@ -340,10 +346,22 @@ def run_nodes(node_classes: Sequence[Callable[..., Node]], args: Sequence[str] |
         if rclpy.ok():  # else the shutdown interrupted a callback
             raise
     finally:
-        for node in nodes:
-            node.destroy_node()
-        rclpy.try_shutdown()
+        interrupt.ending = True
+        _end(nodes)
     return 0
+
+
+def _end(nodes: Sequence[MonitoringNode]) -> None:
+    """Keep the state of nodes, then destroy them."""
+    for node in nodes:
+        node.keep_state()
+    with end_within(SECONDS) as text:
+        for node in nodes:
+            text.value = (f'{node.get_fully_qualified_name()}: the middleware hangs while it '
+                          'destroys the node: ended without it, nothing is lost').encode()[:199]
+            node.destroy_node()
+        text.value = b'the middleware hangs while it shuts down: ended without it, nothing is lost'
+        rclpy.try_shutdown()
 
 
 def _check_parameter_files(args: Sequence[str]) -> bool:

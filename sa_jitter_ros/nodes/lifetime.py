@@ -1,0 +1,84 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+How a process of nodes ends: at the first SIGINT, and soon, whatever the middleware does.
+
+A hanging call of the middleware holds the lock of the Python interpreter: no Python thread can end
+the process then. A timer of the C library does, whose threads call functions of C.
+"""
+
+import atexit
+from collections.abc import Iterator
+from contextlib import contextmanager
+import ctypes
+import signal
+import threading
+from types import FrameType
+
+SECONDS = 3.0  # for the middleware, after the state of the nodes is kept
+_EXIT = 0.2  # s between the line that says so and the end
+_MONOTONIC, _THREAD = 1, 2  # CLOCK_MONOTONIC, SIGEV_THREAD
+
+
+class _Event(ctypes.Structure):
+    """`struct sigevent`: what a timer calls, with which value."""
+
+    _fields_ = [('value', ctypes.c_void_p), ('number', ctypes.c_int), ('notify', ctypes.c_int),
+                ('function', ctypes.c_void_p), ('rest', ctypes.c_char * 40)]
+
+
+class _Times(ctypes.Structure):
+    """`struct itimerspec`: interval and time, in seconds and nanoseconds each."""
+
+    _fields_ = [(name, ctypes.c_long) for name in ('every', 'every_ns', 'after', 'after_ns')]
+
+
+class InterruptOnce:
+    """A handler of SIGINT that interrupts Python once; later ones find it ending already."""
+
+    def __init__(self) -> None:
+        self.ending = False
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self)
+            # Python takes its handlers away when it ends.
+            atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Interrupt what runs, the first time."""
+        if not self.ending:
+            self.ending = True
+            raise KeyboardInterrupt
+
+
+@contextmanager
+def end_within(seconds: float) -> Iterator[ctypes.Array[ctypes.c_char]]:
+    """
+    End the process with status 0 if the block takes longer.
+
+    It writes the text of the yielded buffer to the standard error first: what the block does.
+    """
+    library = ctypes.CDLL(None)
+    text = ctypes.create_string_buffer(200)
+    timers = []
+    calls = ((seconds, 'warnx', ctypes.addressof(text)), (seconds + _EXIT, '_exit', 0))
+    for after, name, value in calls if hasattr(library, 'timer_create') else ():
+        function = ctypes.cast(getattr(library, name), ctypes.c_void_p)
+        event, timer = _Event(value, 0, _THREAD, function), ctypes.c_void_p()
+        if library.timer_create(_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
+            whole = int(after)
+            library.timer_settime(timer, 0, ctypes.byref(
+                _Times(0, 0, whole, round(1e9 * (after - whole)))), None)
+            timers.append(timer)
+    try:
+        yield text
+    finally:
+        for timer in timers:
+            library.timer_delete(timer)
