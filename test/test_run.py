@@ -63,6 +63,13 @@ def test_another_distribution(refusal, variable):
     assert 'humble is not supported' in refusal('test', **{variable: 'humble'})
 
 
+def test_distribution_without_wheels(refusal):
+    assert 'no wheels of ROS 2 lyrical: source it' in refusal(
+        'test', SA_JITTER_ROS_DISTRO='lyrical')
+    line = refusal('test', tool='python3', script='exit 1', ROS_DISTRO='lyrical')
+    assert 'imports rclpy of ROS 2 lyrical' in line
+
+
 def test_two_distributions(refusal):
     line = refusal('test', ROS_DISTRO='jazzy', SA_JITTER_ROS_DISTRO='kilted')
     assert 'SA_JITTER_ROS_DISTRO' in line
