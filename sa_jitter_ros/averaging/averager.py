@@ -33,7 +33,7 @@ from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
-from sa_jitter_ros.pulses.unit_check import likely_mistake, other_rate
+from sa_jitter_ros.pulses.unit_check import is_waveform, likely_mistake, other_rate
 from sa_jitter_ros.samples import SampleBlock
 
 if TYPE_CHECKING:
@@ -150,7 +150,12 @@ class Averager:
         samples = None if vibration is None else self._checked(vibration)
         found = []
         if pulse_times is not None:
-            found += self._stream.add_pulses(np.atleast_1d(np.asarray(pulse_times)))
+            times = np.atleast_1d(np.asarray(pulse_times))
+            if samples is not None and is_waveform(times, samples.shape[1]):
+                raise SignalError(
+                    f'pulse_times are {times.size} values that do not rise, as those of a sampled '
+                    'tach: give its pulse times, detect_pulses(tach, tach_rate)')
+            found += self._stream.add_pulses(times)
         if samples is not None and samples.size:
             self._channels = len(samples)
             for first in range(0, samples.shape[1], _PIECE):

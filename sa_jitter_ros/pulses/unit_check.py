@@ -28,6 +28,26 @@ _TOGETHER = 0.8  # of the longer one, that pulses and vibration have in common
 _EPOCH = 1e8  # s; later first pulses are counted since 1970
 
 
+# A waveform: its least number of values, the share of them that do not rise, or stay, and the
+# share of the number of samples of the vibration, of which a keyphasor shows far fewer pulses.
+_WAVEFORM, _FALLING, _STAYING, _DENSE = 16, 0.25, 0.5, 0.25
+
+
+def is_waveform(times: NDArray[Any], samples: int) -> bool:
+    """
+    Return whether pulse times beside so many samples of vibration are a sampled tach signal.
+
+    >>> wave = np.sin(0.1 * np.arange(1000))
+    >>> is_waveform(wave, 1000), is_waveform(np.sign(wave), 9000), is_waveform(np.sort(wave), 1000)
+    (True, True, False)
+    """
+    if times.ndim != 1 or times.size < _WAVEFORM or times.dtype.kind not in 'biuf':
+        return False
+    rise = np.diff(times.astype(np.float64))
+    return bool(np.mean(rise == 0.0) >= _STAYING or (
+        np.mean(rise <= 0.0) >= _FALLING and times.size >= _DENSE * samples))
+
+
 @dataclass(frozen=True)
 class Mistake:
     """
