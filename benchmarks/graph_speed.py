@@ -11,13 +11,17 @@
 """
 The averager over DDS, in a process of its own on one core: CPU share, latency, saturation.
 
-A source process publishes vibration at 93.75 kHz in real time, 40 pulses a second, on another
-core; this process receives the averages. `python benchmarks/graph_speed.py` writes its figures as
-JSON to the standard output. Clocks: CLOCK_MONOTONIC is one for all processes of a host.
+A source process publishes vibration in real time, 40 pulses a second, on another core; this
+process receives the averages. With `--bare MILLISECONDS...` a bare subscriber, which only looks at
+the arrays, takes the same messages beside the averager: what the transport alone costs.
+`python benchmarks/graph_speed.py` writes its figures as JSON to the standard output. Clocks:
+CLOCK_MONOTONIC is one for all processes of a host.
 """
 
 import argparse
+from contextlib import suppress
 from functools import partial
+from itertools import product
 import json
 import os
 from pathlib import Path
@@ -33,16 +37,19 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from sa_jitter_ros.nodes.base import INPUT_QOS, RESULT_QOS
-from sa_jitter_ros.nodes.messages import encode_pulse_reference, encode_samples
+from sa_jitter_ros.nodes.messages import (
+    encode_pulse_reference, encode_samples, encode_samples_float32)
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
 RATE = 93750.0  # Hz
 SPEED = 40.0  # Hz
-PATTERN = 9375  # samples, four revolutions: the vibration repeats
+# Of the comparison with a bare subscriber.
+BARE_RATE, BARE_CHANNELS, BARE_CYCLES = 1e5, 100, 40
+REVOLUTIONS = 4  # after which the vibration repeats
 ORDERS = (211.0, 401.0, 701.0)
 TRIGGER_CYCLES = 10
 MESSAGE_BYTES = 296_000  # at most
@@ -52,6 +59,10 @@ KEYS = ('samples_dropped', 'pulses_dropped', 'cycles_dropped', 'averages_dropped
 NODE = ('from sa_jitter_ros.nodes.synchronous_averager import main; raise SystemExit(main())')
 
 
+TYPES = {'Float64': (Float64MultiArray, encode_samples),
+         'Float32': (Float32MultiArray, encode_samples_float32)}
+
+
 def block_samples(channels: int, seconds: float) -> int:
     """Return how many samples of a channel go into a message."""
     return min(round(seconds * RATE), MESSAGE_BYTES // (8 * channels))
@@ -59,30 +70,33 @@ def block_samples(channels: int, seconds: float) -> int:
 
 # --- the source ----------------------------------------------------------------------------------
 
-def publish(channels: int, seconds: float, length: int) -> None:
+def publish(channels: int, seconds: float, length: int, rate: float = RATE,
+            kind: str = 'Float64', readers: int = 1) -> None:
     """Publish in real time; print when sample 0 was due and how late messages were, as JSON."""
     context = rclpy.Context()
     context.init(args=[])
     node = rclpy.create_node('source', context=context)
-    vibration = node.create_publisher(Float64MultiArray, 'vibration', INPUT_QOS)
+    message_type, encode = TYPES[kind]
+    vibration = node.create_publisher(message_type, 'vibration', INPUT_QOS)
     tach = node.create_publisher(TimeReference, 'tach_pulse', INPUT_QOS)
-    while not (vibration.get_subscription_count() and tach.get_subscription_count()):
+    while not (vibration.get_subscription_count() >= readers and tach.get_subscription_count()):
         time.sleep(0.05)
     time.sleep(0.5)
-    angle = 2.0 * np.pi * SPEED / RATE * np.arange(PATTERN)
+    pattern = round(REVOLUTIONS * rate / SPEED)
+    angle = 2.0 * np.pi * SPEED / rate * np.arange(pattern)
     wave = sum(np.cos(order * angle + np.arange(channels)[:, None]) for order in ORDERS)
     wave = np.concatenate([wave, wave], axis=1)
     late, sent = [], 0
     start = time.monotonic()
-    for first in range(0, round(seconds * RATE), length):
+    for first in range(0, round(seconds * rate), length):
         samples = np.concatenate(  # a block may be longer than the pattern
-            [wave[:, at % PATTERN:at % PATTERN + min(PATTERN, first + length - at)]
-             for at in range(first, first + length, PATTERN)], axis=1)
-        block = SampleBlock(samples, first / RATE, RATE, first)
-        due = start + (first + length) / RATE
+            [wave[:, at % pattern:at % pattern + min(pattern, first + length - at)]
+             for at in range(first, first + length, pattern)], axis=1)
+        block = SampleBlock(samples, first / rate, rate, first)
+        due = start + (first + length) / rate
         time.sleep(max(due - time.monotonic(), 0.0))
-        vibration.publish(encode_samples(block))
-        while sent / SPEED < (first + length) / RATE:
+        vibration.publish(encode(block))
+        while sent / SPEED < (first + length) / rate:
             tach.publish(encode_pulse_reference(sent / SPEED, 'keyphasor'))
             sent += 1
         late.append(time.monotonic() - due)
@@ -91,6 +105,16 @@ def publish(channels: int, seconds: float, length: int) -> None:
                       'cpu': cpu}), flush=True)
     time.sleep(3.0)  # reliable messages may be asked for again
     context.try_shutdown()
+
+
+def subscribe(kind: str) -> None:
+    """Take vibration and look at the arrays, until a signal."""
+    rclpy.init(args=[])
+    node = rclpy.create_node('bare')
+    node.create_subscription(TYPES[kind][0], 'vibration', lambda message: np.asarray(message.data),
+                             INPUT_QOS)
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(node)
 
 
 # --- one measurement -----------------------------------------------------------------------------
@@ -210,6 +234,47 @@ def measure(channels: int, seconds: float, *, large: bool = False, block_seconds
             'diagnostics': _diagnostics(sink)}
 
 
+def compare(milliseconds: float, kind: str, seconds: float, *, large: bool) -> dict[str, Any]:
+    """Return the CPU shares of averager and bare subscriber, of the same messages."""
+    length = round(1e-3 * milliseconds * BARE_RATE)
+    averager = subprocess.Popen(
+        [sys.executable, '-c', NODE, '--ros-args', '--log-level', 'error',
+         '-p', f'trigger_cycles:={BARE_CYCLES}', '-p', f'shaft.orders:={list(ORDERS)}',
+         '-p', f'sample_rate:={BARE_RATE}', '-p', f'vibration_type:=std_msgs/{kind}MultiArray'],
+        env=transport(large))
+    command = [sys.executable, __file__]
+    bare = subprocess.Popen([*command, '--subscribe', kind], env=transport(large))
+    context = rclpy.Context()
+    context.init(args=[])
+    sink, executor = Sink(context), SingleThreadedExecutor(context=context)
+    executor.add_node(sink.node)
+    source = subprocess.Popen(
+        [*command, '--publish', str(BARE_CHANNELS), str(seconds), str(length), str(BARE_RATE),
+         kind, '2'], stdout=subprocess.PIPE, env=transport(large))
+    children, shares = (averager, bare), []
+    try:
+        end = time.monotonic() + 60.0
+        while not sink.arrivals and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.2)
+        before = [usage(child.pid)[0] for child in children]
+        begin = time.monotonic()
+        while time.monotonic() < begin + seconds - 2.0:
+            executor.spin_once(timeout_sec=0.2)
+        shares = [(usage(child.pid)[0] - used) / (time.monotonic() - begin)
+                  for child, used in zip(children, before)]
+        peak = usage(averager.pid)[1]
+    finally:
+        source.kill()
+        for child in children:
+            child.send_signal(signal.SIGINT)
+        for child in (*children, source):
+            child.wait(timeout=30.0)
+        context.try_shutdown()
+    return {'milliseconds': milliseconds, 'type': kind, 'large': large, 'averager': shares[0],
+            'bare': shares[1], 'ratio': shares[0] / shares[1], 'peak_megabytes': peak,
+            'averages': len(sink.arrivals), 'diagnostics': _diagnostics(sink)}
+
+
 def _latency(sink: Sink, start: float, length: int, seconds: float) -> dict[str, float]:
     """Milliseconds to the arrival from the last pulse, and from when all it needs was sent."""
     ends, arrivals = np.array(sink.ends), np.array(sink.arrivals)
@@ -249,13 +314,26 @@ def main() -> int:
                         help='channels with the shared memory of config/fastdds.xml')
     parser.add_argument('--latency-seconds', type=float, default=60.0,
                         help='of the two runs at 8 channels from which latency is taken')
-    parser.add_argument('--publish', nargs=3, help=argparse.SUPPRESS)
+    parser.add_argument('--bare', type=float, nargs='+', metavar='MILLISECONDS',
+                        help=f'compare with a bare subscriber, {BARE_CHANNELS} channels at '
+                        f'{1e-3 * BARE_RATE:g} kHz in messages of so many ms, and nothing else')
+    parser.add_argument('--publish', nargs='+', help=argparse.SUPPRESS)
+    parser.add_argument('--subscribe', help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.publish:
-        channels, seconds, length = options.publish
-        publish(int(channels), float(seconds), int(length))
+        channels, seconds, length, *others = options.publish
+        publish(int(channels), float(seconds), int(length),
+                *([float(others[0]), others[1], int(others[2])] if others else ()))
+        return 0
+    if options.subscribe:
+        subscribe(options.subscribe)
         return 0
     os.environ.update(ROS_AUTOMATIC_DISCOVERY_RANGE='LOCALHOST', ROS_DOMAIN_ID=str(free_domain()))
+    if options.bare:
+        for milliseconds, kind, large in product(options.bare, TYPES, (False, True)):
+            print(json.dumps(compare(milliseconds, kind, options.seconds, large=large)),
+                  flush=True)
+        return 0
     found: dict[str, Any] = {'load': f'{os.getloadavg()[0]:.1f}', 'runs': [], 'latency': []}
     for channels, large in [*((count, False) for count in options.channels),
                             *((count, True) for count in options.large)]:

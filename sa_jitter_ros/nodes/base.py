@@ -24,7 +24,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import rclpy
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -64,6 +64,9 @@ def _incompatibility(subscription: Subscription, policy: str) -> str:
 _OVERRIDABLE = QoSOverridingOptions(policy_kinds=(
     QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
     QoSPolicyKind.DURABILITY))
+# A subscriber logs by itself that its quality of service is incompatible. An executor would ask
+# every publisher for such events each time that it waits.
+_NO_EVENTS = PublisherEventCallbacks(use_default_callbacks=False)
 # Given to rclpy as copies: it writes the user's overrides into the profile that it gets.
 INPUT_QOS = _reliable(200, DurabilityPolicy.VOLATILE)
 RESULT_QOS = _reliable(10, DurabilityPolicy.VOLATILE)
@@ -100,7 +103,8 @@ class MonitoringNode(Node):
         self._last_warning = ''
         self._logged: dict[str, float] = {}  # kinds of warnings, and when they were logged
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10,
+                                                  event_callbacks=_NO_EVENTS)
         self.create_steady_timer(1.0, self.publish_diagnostics)
 
     # --- building blocks ---
@@ -153,7 +157,8 @@ class MonitoringNode(Node):
 
     def create_output(self, kind: type, topic: str, qos: QoSProfile = RESULT_QOS) -> Publisher:
         """Return the publisher of a result."""
-        return self.create_publisher(kind, topic, copy(qos), qos_overriding_options=_OVERRIDABLE)
+        return self.create_publisher(kind, topic, copy(qos), event_callbacks=_NO_EVENTS,
+                                     qos_overriding_options=_OVERRIDABLE)
 
     # --- warnings and diagnostics ---
 

@@ -30,7 +30,6 @@ from std_msgs.msg import Float64MultiArray
 
 FloatArray = NDArray[np.float64]
 
-MAX_MESSAGE_BYTES = 300_000
 TRANSPORT_BYTES_PER_SECOND = 100e6
 MAX_LAG = 0.5  # s; a stream that lags more continues from now instead of catching up
 PROGRESS_PERIOD = 5.0  # s between log lines on progress
@@ -40,7 +39,9 @@ PLAYBACK_PARAMETERS = (
               maximum=1000.0),
     Parameter('playing', True, 'set false to pause, true to continue'),
     Parameter('block_seconds', 0.05, 'machine time in a message; less if the message would exceed '
-              '300 kB', unit='s', minimum=0.001, maximum=1.0, read_only=True),
+              'message_bytes', unit='s', minimum=0.001, maximum=1.0, read_only=True),
+    Parameter('message_bytes', 300_000, 'largest message; more only with the shared memory of '
+              'config/fastdds.xml', unit='B', minimum=10_000, maximum=16_000_000, read_only=True),
     Parameter('wait_seconds', 3.0, 'longest time to wait for subscribers before the start',
               unit='s', minimum=0.0, maximum=60.0, read_only=True),
     Parameter('vibration_type', 'std_msgs/Float64MultiArray', 'message type of vibration and '
@@ -127,9 +128,9 @@ class PlaybackNode(MonitoringNode):
 
     def block_samples(self, sample_rate: float, channels: int) -> int:
         """Return the number of samples in a message."""
-        seconds: float = self.parameters.values()['block_seconds']
-        most = (MAX_MESSAGE_BYTES - 4096) // (8 * channels)
-        return max(1, min(round(seconds * sample_rate), most))
+        values = self.parameters.values()
+        seconds, most = float(values['block_seconds']), int(values['message_bytes']) - 4096
+        return max(1, min(round(seconds * sample_rate), most // (8 * channels)))
 
     def begin(self, *, portion_seconds: float, portion_bytes: int, pulses: bool,
               waveform: bool) -> None:

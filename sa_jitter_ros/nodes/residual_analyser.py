@@ -52,7 +52,7 @@ PARAMETERS = (
 )
 _SIGNIFICANT = 0.02  # p value of a residual that is no chance
 _FEWEST = 4  # averages that a search for the cause takes
-_PERIOD = 0.1  # s between the steps of the loop
+_PERIOD = 0.2  # s between the steps of the loop
 _FIND_TIMEOUT = 3.0  # s to find the predictor
 _ANSWER_TIMEOUT = 15.0  # s for its answer, which comes after a new prediction
 
