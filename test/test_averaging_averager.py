@@ -197,7 +197,7 @@ def test_parameters_that_cannot_be_used_are_refused(options, text):
     (['a', 'b'], PULSES, 'real numbers'), (VIBRATION, ['a'], 'real numbers'),
     (VIBRATION, PULSES[None], 'pulse times have'), (VIBRATION, [], 'make 0 whole'),
     (VIBRATION[:, :0], PULSES, 'make 0 whole'),
-    (VIBRATION, VIBRATION[0], "pulse_times are 4000 values that do not rise"),
+    (VIBRATION, VIBRATION[0], 'pulse_times are 4000 values that do not rise'),
     (VIBRATION, None, r'those of a recording are recording.keyphasor_pulses\(\)'),
     (ArraySource(VIBRATION), PULSES, r'give all of them as an array, recording.read\(\)'),
     (Recording(ArraySource(VIBRATION), RATE), PULSES, r'recording.read\(\)')])

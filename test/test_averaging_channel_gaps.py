@@ -89,7 +89,6 @@ def test_averages_whose_correction_was_refused_have_a_history_of_indicators_of_t
             np.testing.assert_array_equal(both.values, own.values)
 
 
-
 @pytest.mark.parametrize('averaging', ['block', 'sliding', 'exponential'])
 def test_a_gap_of_one_channel_costs_its_averages_only(machine, averaging):
     vibration, pulses = machine

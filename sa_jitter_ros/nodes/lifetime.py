@@ -28,6 +28,10 @@ _EXIT = 0.2  # s between the line that says so and the end
 _MONOTONIC, _THREAD = 1, 2  # CLOCK_MONOTONIC, SIGEV_THREAD
 
 
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
 class _Event(ctypes.Structure):
     """`struct sigevent`: what a timer calls, with which value."""
 
@@ -46,7 +50,7 @@ class InterruptOnce:
 
     def __init__(self) -> None:
         self.ending = False
-        if threading.current_thread() is threading.main_thread():
+        if _in_main_thread():
             signal.signal(signal.SIGINT, self)
             # Python takes its handlers away when it ends.
             atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
@@ -61,15 +65,17 @@ class InterruptOnce:
 @contextmanager
 def end_within(seconds: float) -> Iterator[ctypes.Array[ctypes.c_char]]:
     """
-    End the process with status 0 if the block takes longer.
+    End the process with status 0 if the block takes longer, in its main thread.
 
-    It writes the text of the yielded buffer to the standard error first: what the block does.
+    In another thread the process is somebody else's. It writes the text of the yielded buffer to
+    the standard error first: what the block does.
     """
     library = ctypes.CDLL(None)
     text = ctypes.create_string_buffer(200)
     timers = []
     calls = ((seconds, 'warnx', ctypes.addressof(text)), (seconds + _EXIT, '_exit', 0))
-    for after, name, value in calls if hasattr(library, 'timer_create') else ():
+    possible = _in_main_thread() and hasattr(library, 'timer_create')
+    for after, name, value in calls if possible else ():
         function = ctypes.cast(getattr(library, name), ctypes.c_void_p)
         event, timer = _Event(value, 0, _THREAD, function), ctypes.c_void_p()
         if library.timer_create(_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0:
