@@ -21,10 +21,13 @@ from contextlib import contextmanager
 import ctypes
 import signal
 import threading
+import time
 from types import FrameType
 
 SECONDS = 3.0  # for the middleware, after the state of the nodes is kept
+_AFTERWARDS = 1.0  # s more for the end of Python
 _EXIT = 0.2  # s between the line that says so and the end
+_SOON = 0.5  # s in which a process ends that has nothing else to do
 _MONOTONIC, _THREAD = 1, 2  # CLOCK_MONOTONIC, SIGEV_THREAD
 
 
@@ -62,17 +65,10 @@ class InterruptOnce:
             raise KeyboardInterrupt
 
 
-@contextmanager
-def end_within(seconds: float) -> Iterator[ctypes.Array[ctypes.c_char]]:
-    """
-    End the process with status 0 if the block takes longer, in its main thread.
-
-    In another thread the process is somebody else's. It writes the text of the yielded buffer to
-    the standard error first: what the block does.
-    """
+def _arm(seconds: float, text: ctypes.Array[ctypes.c_char]) -> list[ctypes.c_void_p]:
+    """Start timers that write a text and end the process; return them."""
     library = ctypes.CDLL(None)
-    text = ctypes.create_string_buffer(200)
-    timers = []
+    timers: list[ctypes.c_void_p] = []
     calls = ((seconds, 'warnx', ctypes.addressof(text)), (seconds + _EXIT, '_exit', 0))
     possible = _in_main_thread() and hasattr(library, 'timer_create')
     for after, name, value in calls if possible else ():
@@ -83,8 +79,30 @@ def end_within(seconds: float) -> Iterator[ctypes.Array[ctypes.c_char]]:
             library.timer_settime(timer, 0, ctypes.byref(
                 _Times(0, 0, whole, round(1e9 * (after - whole)))), None)
             timers.append(timer)
+    return timers
+
+
+@contextmanager
+def end_within(seconds: float) -> Iterator[ctypes.Array[ctypes.c_char]]:
+    """
+    End the process with status 0 if the block, and the end of Python after it, take longer.
+
+    It writes the text of the yielded buffer to the standard error first: what the block does. The
+    process has to be that of the nodes: nothing happens in another thread than the main one, nor
+    at the end of a Python that goes on for a while after the block.
+    """
+    text, deadline = ctypes.create_string_buffer(200), time.monotonic() + seconds
+    timers = _arm(seconds, text)
     try:
         yield text
     finally:
         for timer in timers:
-            library.timer_delete(timer)
+            ctypes.CDLL(None).timer_delete(timer)
+    done = time.monotonic()
+
+    def at_exit() -> None:
+        now = time.monotonic()
+        if now - done < _SOON:
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(text))  # Python takes it away else
+            _arm(max(deadline - now, 0.0) + _AFTERWARDS, text)
+    atexit.register(at_exit)
