@@ -10,7 +10,7 @@
 
 """The parameters of one node in a ROS parameter file, read and written without ROS."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 import re
 import stat
@@ -41,11 +41,27 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     tags create no objects; aliases are refused, as in rcl. Raises ParameterError, in one line, for
     a file that is missing, too large, nested too deep, or without parameters of the node.
     """
+    sections = [section for name, section in _sections(_content(path), '')
+                if name.rsplit('/', 1)[-1] in (node, '*', '**')]
+    if not sections:
+        raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
+                             f'"{node}:" or "/**:" and "ros__parameters:"')
+    return {name: value for section in sections for name, value in _flattened(section, '')}
+
+
+def named_parameters(path: Path, nodes: Collection[str]) -> dict[str, Any]:
+    """Read the parameters in sections of named nodes alone, in any namespace, as above."""
+    return {name: value for key, section in _sections(_content(path), '')
+            if key.rsplit('/', 1)[-1] in nodes for name, value in _flattened(section, '')}
+
+
+def _content(path: Path) -> Any:
+    """Return the content of a parameter file; raises ParameterError."""
     try:
         require_regular_file(path)
         text = path.read_text(encoding='utf-8')
         _check_structure(text)
-        content = yaml.load(text, _Loader)
+        return yaml.load(text, _Loader)
     except ParameterError as error:
         raise ParameterError(f'{path}: {error}') from error
     except OSError as error:
@@ -53,12 +69,6 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
                              'file that can be read') from error
     except Exception as error:  # malformed tags raise exceptions of many types
         raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
-    sections = [section for name, section in _sections(content, '')
-                if name.rsplit('/', 1)[-1] in (node, '*', '**')]
-    if not sections:
-        raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
-                             f'"{node}:" or "/**:" and "ros__parameters:"')
-    return {name: value for section in sections for name, value in _flattened(section, '')}
 
 
 def section_text(node: str, parameters: Mapping[str, Any],

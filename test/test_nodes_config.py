@@ -28,6 +28,7 @@ from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
 from sa_jitter_ros.nodes.live_view import LiveView
 from sa_jitter_ros.nodes.machine_simulator import MachineSimulator
 from sa_jitter_ros.nodes.recording_player import RecordingPlayer
+from sa_jitter_ros.nodes.renaming import given_parameters
 from sa_jitter_ros.nodes.residual_analyser import ResidualAnalyser
 from sa_jitter_ros.nodes.synchronous_averager import SynchronousAverager
 from sa_jitter_ros.nodes.tach_detector import TachDetector
@@ -145,11 +146,14 @@ CHAIN = 'from sa_jitter_ros.commands.chain import main; raise SystemExit(main())
 
 
 @pytest.mark.processes
-def test_chain_runs_its_nodes_in_one_process(process_environment):
+def test_chain_runs_its_nodes_in_one_process(process_environment, tmp_path):
+    own = tmp_path / 'own.yaml'  # as launch writes what a launch file gives to `chain`
+    own.write_text('/rig/first:\n  ros__parameters:\n    port: 0\n    acquisitions: 7\n')
     process = subprocess.Popen(
         [sys.executable, '-c', CHAIN, '--params', str(MACHINE), '--with', 'live_view',
          'change_monitor',
-         '--ros-args', '-p', 'port:=0', '-p', 'trigger_cycles:=12'],
+         '--ros-args', '-r', '__node:=first', '-r', '__ns:=/rig', '--params-file', str(own),
+         '-p', 'trigger_cycles:=12'],
         env=process_environment, text=True, stderr=subprocess.PIPE)
     lines = []
     while sum('started' in line for line in lines) < 5:
@@ -159,9 +163,26 @@ def test_chain_runs_its_nodes_in_one_process(process_environment):
     _, errors = process.communicate(timeout=600)
     assert process.returncode == 0, errors
     text = ''.join(lines)  # -p wins over the section of the node
-    assert '[synchronous_averager]: started: averages 12 trigger cycles of input' in text
+    assert '[rig.synchronous_averager]: started: averages 12 trigger cycles of input' in text
     for name in ('jitter_predictor', 'residual_analyser', 'live_view', 'change_monitor'):
-        assert f'[{name}]: started' in text
+        assert f'[rig.{name}]: started' in text
+
+
+@pytest.mark.parametrize(('args', 'expected'), [
+    ([], {}),
+    (['-p', 'a:=1'], {'a': 1}),
+    (['-r', '__node:=mine'], {'trigger_cycles': 30, 'shafts': ['input'], 'b': 3}),
+    (['-r', 'synchronous_averager:__node:=mine', '-p', 'mine:b:=4', '-p', 'other:b:=5'],
+     {'trigger_cycles': 30, 'b': 4}),
+    (['-r', 'other:__node:=mine'], {})])
+def test_renamed_node_reads_its_section(tmp_path, args, expected):
+    own = tmp_path / 'own.yaml'
+    own.write_text('mine:\n  ros__parameters:\n    b: 3\n')
+    found = {item.name: item.value for item in given_parameters('synchronous_averager', [
+        '--ros-args', '--params-file', str(MACHINE), '--params-file', str(own), *args])}
+    assert found.items() >= expected.items()
+    assert bool(found) == bool(expected)
+    assert 'hardware_id' not in found  # of `/**`, which rcl gives to every node
 
 
 def test_chain_names_the_nodes_that_it_can_add(capsys):

@@ -11,7 +11,8 @@
 """
 Command `chain`: averager, predictor and analyser in one process and one executor.
 
-It needs a third of the memory of three processes. Arguments behind --ros-args are those of ROS 2.
+It needs a third of the memory of three processes. Arguments behind --ros-args are those of ROS 2;
+the nodes keep their names where one is given to the chain, whose section in a file is for all.
 """
 
 import argparse
@@ -22,6 +23,7 @@ import sys
 
 from sa_jitter_ros.commands.command_line import Parser
 from sa_jitter_ros.nodes.base import run_nodes
+from sa_jitter_ros.nodes.renaming import common_name
 
 NODES = ('synchronous_averager', 'jitter_predictor', 'residual_analyser')
 OTHERS = ('change_monitor', 'live_view', 'tach_detector')
@@ -47,7 +49,8 @@ def main(args: Sequence[str] | None = None) -> int:
     classes = [getattr(import_module(f'sa_jitter_ros.nodes.{name}'),
                        name.title().replace('_', ''))
                for name in dict.fromkeys((*NODES, *options.others))]
-    return run_nodes(classes, ['--ros-args', *file, *given[split + 1:]])
+    ros, name = common_name(given[split + 1:])  # three nodes of one name are none
+    return run_nodes(classes, ['--ros-args', *file, *ros], process=('chain', name or 'chain'))
 
 
 if __name__ == '__main__':

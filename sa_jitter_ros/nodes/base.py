@@ -40,7 +40,8 @@ from sa_jitter_ros.errors import MessageError, ParameterError, SaJitterError
 from sa_jitter_ros.nodes.health import first_of, Flow, Health, Level
 from sa_jitter_ros.nodes.lifetime import end_within, InterruptOnce, SECONDS
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
-from sa_jitter_ros.nodes.parameters import command_line_parameters, ParameterSet
+from sa_jitter_ros.nodes.parameters import ParameterSet
+from sa_jitter_ros.nodes.renaming import given_parameters
 from sa_jitter_ros.parameter_file import require_regular_file
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, STALE_AFTER
 
@@ -310,21 +311,19 @@ def run_node(node_class: Callable[..., MonitoringNode], args: Sequence[str] | No
 
 
 def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
-              args: Sequence[str] | None = None) -> int:
+              args: Sequence[str] | None = None, process: Sequence[str] = ()) -> int:
     """
     Run nodes in one executor until SIGINT or SIGTERM; return the status of `run_node`.
 
     The process is that of the nodes: it ends if the middleware hangs after such a signal.
+    `process` are names under which a file may have parameters of all these nodes.
     """
     use_one_thread()
     interrupt = InterruptOnce()
     nodes: list[MonitoringNode] = []
-    options: dict[str, Any] = {}
     given = sys.argv if args is None else args
     try:
-        if _check_parameter_files(given):
-            # rcl lets the section of a node in a file win over -p for all nodes.
-            options['parameter_overrides'] = command_line_parameters(given)
+        _check_parameter_files(given)
         rclpy.init(args=args)
     except (ParameterError, RuntimeError) as error:  # rcl cannot read the command line or a file
         print(f'error: {error}', file=sys.stderr)
@@ -332,7 +331,9 @@ def run_nodes(node_classes: Sequence[Callable[..., MonitoringNode]],
     try:
         try:
             for node_class in node_classes:
-                nodes.append(node_class(**options))
+                name = re.sub('(?<=.)(?=[A-Z])', '_', node_class.__name__).lower()
+                nodes.append(node_class(
+                    parameter_overrides=given_parameters(name, given, process)))
         except (InvalidParameterTypeException, RuntimeError) as error:  # of rclpy's own parameters
             if rclpy.ok():
                 print(f'error: {error}', file=sys.stderr)
@@ -369,14 +370,12 @@ def _end(nodes: Sequence[MonitoringNode]) -> None:
         rclpy.try_shutdown()
 
 
-def _check_parameter_files(args: Sequence[str]) -> bool:
-    """Return whether there are any; raise ParameterError for one that rcl would read for ever."""
-    names = [name for option, name in pairwise(args) if option == '--params-file']
-    for name in names:
+def _check_parameter_files(args: Sequence[str]) -> None:
+    """Raise ParameterError for a file that rcl would read for ever."""
+    for name in (name for option, name in pairwise(args) if option == '--params-file'):
         try:
             require_regular_file(Path(name))
         except ParameterError as error:
             raise ParameterError(f'{name}: {error}') from None
         except OSError:
             pass  # rcl says what is wrong
-    return bool(names)

@@ -17,7 +17,7 @@ that match none. Before a change it calls `check` with all new values, which rai
 `SaJitterError` to refuse the change; after the change it calls `apply`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
 from itertools import pairwise
 import math
@@ -69,9 +69,10 @@ def as_ros_parameter(name: str, value: Any, element: type = float) -> rclpy.para
     return rclpy.parameter.Parameter(name, value=value)
 
 
-def command_line_parameters(args: Sequence[str]) -> list[rclpy.parameter.Parameter]:
+def command_line_parameters(args: Sequence[str], nodes: Collection[str] = ()
+                            ) -> list[rclpy.parameter.Parameter]:
     """
-    Return the parameters of all nodes on a command line, `-p NAME:=VALUE`.
+    Return the parameters of all nodes on a command line, `-p NAME:=VALUE`, and of some by name.
 
     >>> [(item.name, item.value) for item in command_line_parameters(
     ...     ['--ros-args', '-p', 'rate:=5e-6', '--param', 'shafts:=[a, b]', '-p', 'node:x:=1'])]
@@ -80,7 +81,8 @@ def command_line_parameters(args: Sequence[str]) -> list[rclpy.parameter.Paramet
     found = []
     for option, rule in pairwise(args):
         name, separator, text = rule.partition(':=')
-        if option in ('-p', '--param') and separator and ':' not in name:
+        node, _, name = name.rpartition(':')
+        if option in ('-p', '--param') and separator and node in ('', *nodes):
             try:
                 found.append(rclpy.parameter.Parameter(name, value=value_of(text)))
             except (ParameterError, TypeError):
