@@ -160,5 +160,5 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         raise ModelError(f'{path}: {one_line(error)}') from error
     others = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # of the node, not of the model
     unknown = sorted(name for name in values if name not in (*known, *others)
-                     and not name.startswith('qos_overrides.'))
+                     and not name.startswith(('qos_overrides.', 'machine.')))
     return replace(declaration, unknown=tuple(unknown))

@@ -274,7 +274,8 @@ def node(name, *arguments, document=ROOT / 'README.md'):
 
 def undeclared(made):
     """Return overrides that match no parameter of a node."""
-    return [name for name in made._parameter_overrides if not made.has_parameter(name)]
+    return [name for name in made._parameter_overrides
+            if not (made.has_parameter(name) or name.startswith('machine.'))]  # of all nodes
 
 
 def topics_of(made):
@@ -551,6 +552,7 @@ ORDINARY = {
     *(f'config/{path.name}' for path in (ROOT / 'config').iterdir()),
     'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'mark', 'indicator', 'time_ref',
     'source', 'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
+    'diagnostic_msgs/DiagnosticArray', 'header.stamp', 'sequence', 'trigger_speed_hz',
     'qos_overrides.<topic>.subscription.reliability', 'std_msgs/Float64MultiArray'}
 
 

@@ -19,7 +19,7 @@ import time
 
 from bench import assert_true, AveragerBench
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from machine import Machine
 import numpy as np
 import pytest
@@ -46,6 +46,54 @@ def bench(ros_graph):
 
 
 # --- what is published ---------------------------------------------------------------------------
+
+
+def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
+    summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
+    given = {'gear_box.unit': 'g', 'gear_box.sensitivity': 0.5, 'motor.unit': 'm/s^2'}
+    b = bench(hardware_id='rig', overrides=[
+        Parameter(f'machine.channels.{key}', value=value) for key, value in given.items()])
+    b.play(MACHINE, 2.0)
+    assert len(summaries) == len(b.amplitudes()) > 2
+    average = b.amplitudes()[-1]
+    status, motor = summaries[-1].status
+    assert motor.name == 'shaft: motor'
+    assert motor.values[2].value.endswith(' m/s^2, attenuation nan')
+    assert (status.name, status.hardware_id, status.level) == (
+        'shaft: gear_box', 'rig', DiagnosticStatus.OK)
+    stamp = summaries[-1].header.stamp
+    assert stamp.sec + 1e-9 * stamp.nanosec == pytest.approx(average.header.end_time, abs=1e-8)
+    values = {item.key: item.value for item in status.values}
+    assert values.pop('sequence') == str(average.header.sequence)
+    assert float(values.pop('trigger_speed_hz')) == pytest.approx(MACHINE.speed, rel=1e-5)
+    assert [*values][:3] == ['1', '7', '23']
+    for row, order in zip(average.values[0], ORDERS):
+        found = re.fullmatch(r'(\S+) \+- (\S+) g, attenuation nan', values[f'{order:g}'])
+        assert float(found[1]) == pytest.approx(
+            2.0 * abs(MACHINE.components[order][0]), rel=1e-3)  # volts over 0.5 V per g
+        assert float(found[2]) == pytest.approx(1.96 * row[8], rel=0.06)
+    assert values['rms'].endswith(' g')
+    assert 'kurtosis' in values
+
+
+def test_summaries_of_sliding_averages_come_once_a_second(ros_graph, bench):
+    summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
+    b = bench(averaging='sliding')
+    b.play(MACHINE, 4.0)
+    assert len(b.amplitudes()) > 50
+    assert 3 <= len(summaries) <= 4
+    assert summaries[0].status[0].name == 'shaft: channel 0'
+
+
+def test_channels_that_a_machine_file_does_not_tell_apart_are_refused(bench):
+    b = bench(overrides=[
+        Parameter(f'machine.channels.{name}.sensitivity', value=0.1) for name in 'abc'])
+    b.play(MACHINE, 1.0)
+    assert not b.amplitudes()
+    level, text, values = b.diagnostics()
+    assert level == DiagnosticStatus.WARN
+    assert 'machine.channels has a, b, c, the vibration 2 channels' in values.get('problems', text)
+    assert int(values['messages_rejected']) > 0
 
 
 def test_outputs_are_those_of_the_machine(bench):

@@ -127,6 +127,15 @@ def test_recording_of_other_make_is_played_by_its_fields(ros_graph, recording, t
     assert len(player.pulses) == np.count_nonzero(recording.pulse_times < 7.0)
 
 
+def test_sensitivities_in_another_order_than_the_channels_are_refused(bench, recording):
+    named = replace(recording, channel_names=('a', 'b'))
+    swapped = {f'machine__channels__{name}__sensitivity': size
+               for name, size in (('b', 0.1), ('a', 0.2))}
+    with pytest.raises(ParameterError, match='list the channels in its order'):
+        bench(named, **swapped)
+    bench(named, **dict(reversed(swapped.items())))
+
+
 def test_waveform_and_pulses_together(bench, recording):
     player = bench(tach='both')
     player.play()

@@ -70,10 +70,12 @@ def bench(ros_graph):
 
 def test_published_signals_are_those_of_the_machine(bench):
     simulator = bench(tach='both', start_time=100.0, channel_gains=[1.0, 0.5],
-                      pulses_per_revolution=2, seed=3, speed_fluctuation_std=1e-3)
+                      pulses_per_revolution=2, seed=3, speed_fluctuation_std=1e-3,
+                      **{'machine.channels.1.sensitivity': 0.25})
     simulator.play()
     machine = simulator.node.machine
-    np.testing.assert_array_equal(simulator.samples('vibration'), machine.vibration(0, 10_000))
+    np.testing.assert_array_equal(simulator.samples('vibration'),  # volts
+                                  machine.vibration(0, 10_000) * [[1.0], [0.25]])
     np.testing.assert_array_equal(simulator.samples('tach_waveform')[0],
                                   machine.tach_waveform(0, 24_000))
     wanted = machine.pulses(0.0, 2.0)

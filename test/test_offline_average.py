@@ -11,6 +11,7 @@
 """Recordings averaged into files: what they hold, what is left out, and what bad input costs."""
 
 import csv
+from dataclasses import replace
 import json
 import os
 from pathlib import Path
@@ -116,7 +117,7 @@ def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
     assert list(rows[0]) == [
         'recording', 'shaft', 'sequence', 'start_time', 'end_time', 'trigger_speed',
         'trigger_cycles', 'discarded_cycles', 'channel', *AMPLITUDE_FIELDS, 'channel_name',
-        'note']
+        'unit', 'note']
     assert len(rows) == 4 * 2 * (1 + 2)
     arrays = np.load(out / 'rig' / 'averages.npz')
     row, = (row for row in rows if (row['shaft'], row['sequence'], row['channel'], row['order'])
@@ -129,6 +130,37 @@ def test_the_table_has_a_row_for_each_average_channel_and_order(rig, tmp_path):
     summary, = table(out / 'recordings.csv')
     assert (summary['averages'], summary['trigger_cycles'], summary['error']) == ('8', '82', '')
     assert not any(row['note'] for row in rows)
+
+
+@pytest.mark.parametrize(('unit', 'volts'), [('V', 1.0), ('mV', 1e-3), ('', 1.0)])
+def test_volts_become_units_once(recording, rig, tmp_path, unit, volts):
+    sensitivity = np.array([[0.1], [-0.05]])
+    write_npz(tmp_path / 'volts.npz', replace(
+        recording, units=(unit,),
+        vibration=ArraySource(recording.read() * sensitivity / volts)))
+    channels = MACHINE + """/**:
+  ros__parameters:
+    machine:
+      channels:
+        free_end: {unit: m/s^2, sensitivity: -0.05}
+        drive end: {unit: m/s^2, sensitivity: 0.1}
+"""
+    (tmp_path / 'volts.yaml').write_text(channels)
+    assert run(rig, '--params', tmp_path / 'machine.yaml', '--output', tmp_path / 'a') == 0
+    assert run(tmp_path / 'volts.npz', '--params', tmp_path / 'volts.yaml',
+               '--output', tmp_path / 'b') == 0
+    for plain, scaled in zip(table(tmp_path / 'a/rig/averages.csv'),
+                             table(tmp_path / 'b/volts/averages.csv'), strict=True):
+        assert scaled['unit'] == plain['unit'] == 'm/s^2'
+        assert float(scaled['raw_amplitude']) == pytest.approx(float(plain['raw_amplitude']))
+        assert float(scaled['raw_phase']) == pytest.approx(float(plain['raw_phase']), abs=1e-9)
+
+
+def test_sensitivity_of_a_channel_that_is_in_units_is_refused(rig, tmp_path, capsys):
+    (tmp_path / 'machine.yaml').write_text(
+        MACHINE + '    machine.channels.free_end.sensitivity: 0.1\n')
+    assert run(rig, '--params', tmp_path / 'machine.yaml', '--output', tmp_path / 'a') == 2
+    assert 'comes in m/s^2, not in V: leave it out' in capsys.readouterr().err
 
 
 def test_an_order_beyond_the_band_has_a_note(rig, tmp_path):

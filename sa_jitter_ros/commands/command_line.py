@@ -23,6 +23,8 @@ from typing import Any, NoReturn
 import warnings
 
 from sa_jitter_ros.errors import DataWarning, ParameterError
+from sa_jitter_ros.offline.settings import AVERAGER, section
+from sa_jitter_ros.recordings.channel_units import channels_of
 from sa_jitter_ros.recordings.fields import fields_of
 
 _OBJECTS = 1_000_000  # new ones after which Python looks for garbage, as a rule 700
@@ -152,7 +154,10 @@ def _count(text: str) -> int:
 
 def read_options(options: argparse.Namespace) -> dict[str, Any]:
     """Return the options that were given, as keywords of `read`; raises ParameterError."""
-    return {**_given(options), **fields_of(options.fields)}
+    params = getattr(options, 'params', None) or getattr(options, 'declared', None)
+    channels = channels_of(section(params, AVERAGER))
+    return {**_given(options), **fields_of(options.fields),
+            **({'channels': channels} if channels else {})}
 
 
 def player_options(options: argparse.Namespace) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from sa_jitter_ros.keyphasor_check.plausibility import doubts
 from sa_jitter_ros.offline.settings import choose
 from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import Recording
+from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
 
 SIMULATED_SECONDS = 20.0
 
@@ -64,13 +65,10 @@ class Plan:
 def plan_simulation(params: Path) -> Plan:
     """Return the plan for the simulated gearbox of a machine file; raises SaJitterError."""
     gains = read_parameters(params, 'machine_simulator').get('channel_gains', [1.0])
-    labels = read_parameters(params, 'live_view')
-    names = labels.get('channel_names', [])
-    if len(names) != len(gains):
-        names = [f'channel {i}' for i in range(len(gains))]
+    channels = scale_of(channels_of(read_parameters(params, 'machine_simulator')), len(gains))
     plan = Plan(
         source='machine_simulator', source_parameters={}, title='simulated gearbox',
-        seconds=SIMULATED_SECONDS, channels=tuple(names), unit=labels.get('vibration_unit', ''),
+        seconds=SIMULATED_SECONDS, channels=channels.names, unit=channels.units[0],
         speed=0.0, keyphasor_rate=0.0, pulses_per_revolution=1, ratio=1.0, trigger_cycles=1,
         orders=())
     planned = with_machine(plan, params)

@@ -10,6 +10,9 @@
 
 """Publishers of the averager's results for one shaft."""
 
+import math
+
+from diagnostic_msgs.msg import DiagnosticArray
 import numpy as np
 from rclpy.publisher import Publisher
 from sa_jitter_ros.averaging.average import Average
@@ -18,6 +21,8 @@ from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import encode_average
+from sa_jitter_ros.nodes.summary import summary_of
+from sa_jitter_ros.recordings.channel_units import ChannelScale
 from std_msgs.msg import Float64MultiArray
 
 ROUNDING = 1e-9  # relative scatter of a constant that was resampled
@@ -33,6 +38,8 @@ class ShaftOutput:
             for kind in ('synchronous_average', 'standard_error', 'order_amplitude',
                          'condition_indicator', 'condition_indicator_error', 'corrected_average',
                          'pulse_error', 'envelope_amplitude', 'envelope_spectrum')}
+        self._summary = node.create_output(DiagnosticArray, f'{name}/summary')
+        self._summarised = -math.inf  # s, end of the latest average in a summary
         self._results = ShaftResults()
         self._refusals = Shortfall()
         self.published = self.refused = 0
@@ -42,10 +49,16 @@ class ShaftOutput:
         """Use other mesh orders; the indicators forget earlier averages."""
         self._results.use(gear)
 
-    def publish(self, average: Average) -> None:
-        """Publish one average."""
-        for kind, result in self._results.of(average).items():
+    def publish(self, average: Average, channels: ChannelScale, pause: float) -> None:
+        """Publish one average of channels; a summary, if it ends a `pause` (s) after the last."""
+        results = self._results.of(average)
+        for kind, result in results.items():
             self._publishers[kind].publish(encode_average(kind, result))
+        since = average.end_time - self._summarised
+        if not 0.0 <= since < pause and self._summary.get_subscription_count():
+            self._summarised = average.end_time
+            self._summary.publish(summary_of(
+                self._name, results, channels, self._node.hardware_id))
         self.published += 1
         self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])

@@ -163,6 +163,11 @@ class MonitoringNode(Node):
 
     # --- warnings and diagnostics ---
 
+    @property
+    def hardware_id(self) -> str:
+        """Return the name of the machine, or of this computer."""
+        return str(self.get_parameter(HARDWARE_ID.name).value or socket.gethostname())
+
     def warn(self, text: str) -> None:
         """
         Log a warning, and show it in the next diagnostics.
@@ -282,7 +287,7 @@ class MonitoringNode(Node):
         status = DiagnosticStatus(
             level=bytes([level]), name=self.get_fully_qualified_name().lstrip('/'),
             message=first_of(problems) or (f'{", ".join(grown)} increased' if grown else text),
-            hardware_id=self.get_parameter(HARDWARE_ID.name).value or socket.gethostname())
+            hardware_id=self.hardware_id)
         self._reported, self._last_warning = dict(self.counts), ''
         shown = {**{key: str(count) for key, count in self.counts.items()},
                  **self.health.ages(), **values}

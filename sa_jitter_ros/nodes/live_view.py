@@ -44,9 +44,10 @@ PARAMETERS = (
               'port', minimum=0, maximum=65535, read_only=True),
     Parameter('open_to_network', False, 'allow a host that other machines can reach; everybody '
               'who can reach it sees everything', read_only=True),
-    Parameter('vibration_unit', '', 'unit of the vibration, for labels'),
-    Parameter('channel_names', [], 'names of the vibration channels, for labels',
-              element=str),
+    Parameter('vibration_unit', '', 'unit of the vibration, for labels; empty: that of '
+              'machine.channels'),
+    Parameter('channel_names', [], 'names of the vibration channels, for labels; empty: those of '
+              'machine.channels', element=str),
 )
 
 
@@ -124,6 +125,7 @@ class LiveView(MonitoringNode):
         if not (is_loopback(values['host']) or values['open_to_network']):
             raise ParameterError(f'other machines can reach host {values["host"]!r}: set host to '
                                  '127.0.0.1, or allow it by open_to_network: true')
+        self._channels = self.parameters.declare_channels()
         self._board = Board()
         self._averages = 0
         self._speeds: list[float] = []
@@ -161,8 +163,12 @@ class LiveView(MonitoringNode):
         super().destroy_node()
 
     def _apply(self, values: Values) -> None:
+        units = {item['unit'] for item in self._channels.values()}
         self._labels = shown = {
-            key: values[key] for key in ('shafts', 'vibration_unit', 'channel_names')}
+            'shafts': values['shafts'],
+            'vibration_unit': values['vibration_unit'] or (
+                units.pop() if len(units) == 1 else ''),
+            'channel_names': values['channel_names'] or [*self._channels]}
         self._board.put('settings', lambda: shown, data=False)
 
     # --- messages ---

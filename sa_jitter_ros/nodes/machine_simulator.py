@@ -24,6 +24,7 @@ from sa_jitter_ros.nodes.base import run_node
 from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import (
     Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, require_shaft_names, Values)
+from sa_jitter_ros.recordings.channel_units import scale_of
 from sa_jitter_ros.samples import SampleBlock
 from sa_jitter_ros.simulation import (
     AdditiveNoise, band_limited, ChippedTooth, Component, DeclaredJitter, Effect, Gearbox,
@@ -166,8 +167,10 @@ class MachineSimulator(PlaybackNode):
         require_shaft_names('shafts', shafts)
         for shaft in shafts:
             self.parameters.declare(shaft_parameters(shaft))
+        named = self.parameters.declare_channels()
         self._values = values = self.parameters.values()
         self.machine = machine_of(values)
+        self._volts = scale_of(named, self.machine.channels)
         rate, channels = self.machine.sample_rate, self.machine.channels
         self._block = self.block_samples(rate, channels)
         self._samples = round(values['duration'] * rate)
@@ -206,7 +209,8 @@ class MachineSimulator(PlaybackNode):
     def _portion(self, start: int, stop: int) -> Portion:
         machine, origin = self.machine, self._values['start_time']
         rate, tach_rate = machine.sample_rate, machine.keyphasor.rate
-        vibration = SampleBlock(machine.vibration(start, stop), origin + start / rate, rate, start)
+        vibration = SampleBlock(machine.vibration(start, stop) * self._volts.divisor,
+                                origin + start / rate, rate, start)
         waveform: tuple[SampleBlock, ...] = ()
         if self._with_waveform:
             low, high = round(start / rate * tach_rate), round(stop / rate * tach_rate)

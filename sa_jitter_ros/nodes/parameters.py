@@ -31,6 +31,7 @@ import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
 from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
 
 
 def descriptor_of(item: Parameter) -> ParameterDescriptor:
@@ -117,6 +118,13 @@ class ParameterSet:
             if value == [] and not item.read_only:  # rclpy declares an empty list as bytes
                 self._node.set_parameters([as_ros_parameter(item.name, value, item.kind)])
             self._specifications[item.name] = item
+
+    def declare_channels(self) -> Channels:
+        """Declare what the machine file says of the channels, and return it."""
+        given = {name: self._node._parameter_overrides[name].value
+                 for name in self._node._parameter_overrides if name in self.given}
+        self.declare(channel_parameters(given))
+        return channels_of(given)
 
     @property
     def given(self) -> frozenset[str]:

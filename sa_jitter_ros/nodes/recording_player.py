@@ -25,6 +25,7 @@ from sa_jitter_ros.nodes.playback import PlaybackNode, Portion
 from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings import read, Recording
 from sa_jitter_ros.recordings.channel_check import usable_channels
+from sa_jitter_ros.recordings.channel_units import in_units, scale_of
 from sa_jitter_ros.recordings.fields import fields_of
 from sa_jitter_ros.samples import SampleBlock
 
@@ -73,7 +74,15 @@ class RecordingPlayer(PlaybackNode):
             values['recording'], keyphasor=values['recorded_keyphasor'], **fields,
             **{name: values[name] for name in (
                 'acquisition', 'vibration_channels', 'tach_channel', 'time_column')})
-        for remark in recording.remarks:
+        channels = self.parameters.declare_channels()
+        # It is played as it is; who takes it brings it into units, by the order of the channels.
+        units, count = recording.units, recording.channels
+        if channels and np.any(scale_of(channels, recording.channel_names, units).divisor
+                               != scale_of(channels, count, units).divisor):
+            raise ParameterError('machine.channels has another order than the recording '
+                                 f'({", ".join(recording.channel_names)}): messages carry no '
+                                 'names, list the channels in its order')
+        for remark in in_units(recording, channels).remarks:
             self.warn(remark)
         recording, remarks = usable_channels(recording)
         self._recording = recording

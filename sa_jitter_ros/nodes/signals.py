@@ -10,16 +10,19 @@
 
 """Sampled signals in and tach pulses out, in the message types that the user chose."""
 
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.errors import MessageError, ParameterError
 from sa_jitter_ros.nodes.base import INPUT_QOS, MonitoringNode
 from sa_jitter_ros.nodes.messages import (
     encode_pulse_array, encode_pulse_reference, known_type, PULSE_TYPES, SAMPLE_TYPES,
     SampleDecoder)
 from sa_jitter_ros.parameters import Parameter, Values
+from sa_jitter_ros.recordings.channel_units import Channels, scale_of
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import TimeReference
 
@@ -32,10 +35,17 @@ TACH_TYPE = Parameter(
 
 
 class SampleInput:
-    """Decodes the samples of one topic, and warns of those without header and of a wrong rate."""
+    """
+    Decodes the samples of one topic, and warns of those without header and of a wrong rate.
 
-    def __init__(self, node: MonitoringNode, values: Values) -> None:
-        self._node = node
+    With `channels` the samples are in their units, and `scale` has names and units of those of
+    the latest message.
+    """
+
+    def __init__(self, node: MonitoringNode, values: Values,
+                 channels: Channels = MappingProxyType({})) -> None:
+        self._node, self._channels = node, channels
+        self.scale = scale_of({}, 0)
         key = known_type('vibration_type', values['vibration_type'], SAMPLE_TYPES)
         self.message_type = SAMPLE_TYPES[key]
         self._decoder = SampleDecoder(key, sample_rate=values['sample_rate'],
@@ -49,7 +59,12 @@ class SampleInput:
         if self._decoder.counted and not self._warned:
             self._warned = True
             self._node.warn(NO_HEADER)
-        return block
+        if len(block.samples) != len(self.scale.names):
+            try:
+                self.scale = scale_of(self._channels, len(block.samples))
+            except ParameterError as error:
+                raise MessageError(str(error)) from None
+        return replace(block, samples=self.scale.apply(block.samples)) if self._channels else block
 
     def show_warning(self) -> None:
         """Say in the next diagnostics what is wrong with the samples."""

@@ -37,6 +37,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 FloatArray = NDArray[np.float64]
 
 _LATEST = 6  # averages that tell whether orders hold lines
+_SUMMARY_PAUSE = 1.0  # s between summaries of averages that come once a trigger cycle
 MOST_SOURCES = 100  # names of keyphasors that are remembered
 
 
@@ -64,7 +65,7 @@ class SynchronousAverager(MonitoringNode):
         self._sources: set[str] = set()  # of tach pulses
         self._other_keyphasors = 0
         self._cycles_per_second = 0.0
-        self._samples = SampleInput(self, values)
+        self._samples = SampleInput(self, values, self.parameters.declare_channels())
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
         self._target = self.create_output(Float64MultiArray, 'target_geometry', LATCHED_QOS)
@@ -141,9 +142,10 @@ class SynchronousAverager(MonitoringNode):
 
     def _publish(self, averages: Sequence[tuple[str, Average]]) -> None:
         revolutions = keyphasor_parameters(self._values).revolutions_per_trigger
+        pause = 0.0 if self._values['averaging'] == 'block' else _SUMMARY_PAUSE
         for name, average in averages:
             self._average_flow.came()
-            self._shafts[name].publish(average)
+            self._shafts[name].publish(average, self._samples.scale, pause)
             self.set_missing(f'orders of {name}', without_amplitude(average.refused))
             if f'{name}.orders' in self.parameters.given:
                 self._latest[name].append(average)

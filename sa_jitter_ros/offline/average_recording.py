@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
-_VERSION = 2  # of the files: those of another one are written again
+_VERSION = 3  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 

@@ -116,15 +116,15 @@ def _typed(name: str, array: Any) -> Any:
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
     of_order = series[0]['order_amplitude_fields'].tolist()
-    writer.writerow([*_COLUMNS, *of_order, 'channel_name', 'note'])
+    writer.writerow([*_COLUMNS, *of_order, 'channel_name', 'unit', 'note'])
     for item in series:
         header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
         for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]
-            for channel, name, orders in zip(signals.channels, signals.channel_names,
-                                             table.tolist()):
-                writer.writerows([*start, channel, *values, name, note]
+            for channel, name, unit, orders in zip(signals.channels, signals.channel_names,
+                                                   signals.units, table.tolist()):
+                writer.writerows([*start, channel, *values, name, unit, note]
                                  for values, note in zip(orders, notes))
 
 

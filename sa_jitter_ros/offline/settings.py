@@ -84,7 +84,7 @@ class MachineFile:
             raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}: give some of '
                                  f'{", ".join(sorted(known))}')
         unknown = sorted(name for name in values if name not in (*known, *_OF_NODE)
-                         and not name.startswith('qos_overrides.'))
+                         and not name.startswith(('qos_overrides.', 'machine.')))
         if params is not None and not known.keys() & (values.keys() - overrides.keys()):
             raise ParameterError(f'{params}: no parameter of {AVERAGER}: give a file with its '
                                  f'section, "/**/{AVERAGER}:" and "ros__parameters:"')

@@ -14,11 +14,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import os
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.recordings.bag_format import open_bag
 from sa_jitter_ros.recordings.channel_map import ChannelMap
+from sa_jitter_ros.recordings.channel_units import Channels, channels_of, in_units, PREFIX
 from sa_jitter_ros.recordings.csv_format import open_csv
 from sa_jitter_ros.recordings.fields import given_fields, require_fields, SAMPLE_FIELDS
 from sa_jitter_ros.recordings.mat_format import open_mat
@@ -36,7 +38,8 @@ SUFFIXES = ('.npz', '.mat', '.wav', *_LISTS, '.mcap', '.db3')
 
 def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str = '',
          vibration_channels: Sequence[str | int] = (), tach_channel: str | int = '',
-         time_column: str | int = '', pulses_suffice: bool = False, **fields: Any) -> Recording:
+         time_column: str | int = '', pulses_suffice: bool = False,
+         channels: Channels = MappingProxyType({}), **fields: Any) -> Recording:
     """
     Open a recording of any format; its samples are read later, in blocks of bounded memory.
 
@@ -60,6 +63,9 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
         `time` or `t`.
     pulses_suffice
         Read a `.npz` or `.mat` without vibration, too, as one whose vibration is a single NaN.
+    channels
+        `unit` and `sensitivity` (V per unit) of vibration channels by their names, as in
+        `machine.channels` of a machine file: `{'bearing': {'unit': 'g', 'sensitivity': 0.1}}`.
     fields
         Values that are not in the file, or replace those of the file, by their names in
         `Recording`: `sample_rate` (Hz), `start_time` (s), `pulse_times` (s),
@@ -127,6 +133,9 @@ def read(path: str | os.PathLike[str], *, acquisition: int = 0, keyphasor: str =
         if not 0 <= acquisition < recording.acquisitions:
             raise RecordingError(f'acquisition {acquisition}: the file has '
                                  f'{recording.acquisitions}, numbered from 0')
+        recording = in_units(recording, channels_of({
+            f'{PREFIX}{name}.{field}': value for name, values in channels.items()
+            for field, value in values.items()}))
         return replace(recording, description=recording.description or path.name, path=str(path))
 
 
