@@ -35,6 +35,7 @@ from shutil import copyfile
 import subprocess
 import sys
 import tempfile
+from types import SimpleNamespace
 
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -423,7 +424,8 @@ def table_of_parameters():
              'The first table has those that are the same in several nodes.', '',
              '`<shaft>` stands for each name in `shafts`. A float parameter accepts an integer. '
              'A *fixed* parameter is read when the node starts. `ros2 param describe` prints the '
-             'same. `python test/test_docs.py` writes this page.',
+             'same. `python test/test_docs.py` writes this page. Units of channels: '
+            '[interfaces.md](interfaces.md#units-of-the-channels).',
              '', '## Several nodes', *table('parameter', 'nodes', 'default', 'allowed', 'meaning')]
     lines += [f'| {key} | {those(nodes)} | {" | ".join(rest)} |'
               for (key, *rest), nodes in nodes_of.items()
@@ -552,7 +554,8 @@ ORDINARY = {
     *(f'config/{path.name}' for path in (ROOT / 'config').iterdir()),
     'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'mark', 'indicator', 'time_ref',
     'source', 'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
-    'diagnostic_msgs/DiagnosticArray', 'header.stamp', 'sequence', 'trigger_speed_hz',
+    'sa_jitter_ros.nodes.messages', *vars(messages), 'diagnostic_msgs/DiagnosticArray',
+    'header.stamp', 'sequence', 'trigger_speed_hz',
     'qos_overrides.<topic>.subscription.reliability', 'std_msgs/Float64MultiArray'}
 
 
@@ -561,6 +564,23 @@ def test_names_in_backticks_exist(name):
     words = {re.sub('[./]data$', '', word) for word in words_in(ROOT / 'docs' / name)
              if re.fullmatch(r'[a-z<][a-z0-9_<>./]+', word)}
     assert not words - known_words() - ORDINARY - EFFECTS.keys()
+
+
+def test_the_subscriber_reads_averages(ros_graph):
+    block, = (block for block in BLOCKS if 'class Watch(Node)' in block.text)
+    namespace = {}
+    exec(block.text, namespace)
+    watch = ros_graph.add(namespace['Watch'])
+    lines = []
+    watch.get_logger = lambda: SimpleNamespace(info=lines.append)
+    values = np.zeros((2, 1, len(messages.AMPLITUDE_FIELDS)))
+    values[0, 0, :2] = 19.0, 0.5
+    ros_graph.publish('shaft/order_amplitude', messages.encode_average(
+        'order_amplitude', messages.AverageMessage(
+            messages.AverageHeader(0.0, 2.4, 0, 40, 96, 16.6), values,
+            messages.AMPLITUDE_FIELDS)))
+    ros_graph.settle()
+    assert lines == ['2.4 s: order 19: 0.5']
 
 
 def test_every_topic_is_in_the_interfaces():

@@ -97,6 +97,9 @@ def require_node_name(parameter: str, name: str) -> None:
         raise ParameterError(f'{parameter} is {name!r}: give the name of a node, with or without '
                              'its namespace')
 
+# Parameters of rclpy, and what only some nodes use of the machine.
+_OF_OTHERS = ('qos_overrides.', 'use_sim_time', 'start_type_', 'machine.')
+
 
 class ParameterSet:
     """The parameters of one node, with converted values."""
@@ -150,7 +153,7 @@ class ParameterSet:
         self._node.add_on_set_parameters_callback(self._validate)
         self._node.add_post_set_parameters_callback(self._changed)
         for name in sorted(set(self._node._parameter_overrides) - set(self._specifications)):
-            if not name.startswith(('qos_overrides.', 'use_sim_time', 'start_type_')):
+            if not name.startswith(_OF_OTHERS):
                 near = ' or '.join(get_close_matches(name, self._specifications, 2, cutoff=0.8))
                 self._node.get_logger().warning(
                     f'parameter {name} is ignored: this node has no parameter of that name'
