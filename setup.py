@@ -27,7 +27,8 @@ NODES = (
     'synchronous_averager',
     'tach_detector',
 )
-COMMANDS = ('average', 'chain', 'check_keyphasor', 'close_loop', 'demo', 'design')
+COMMANDS = (
+    'average', 'chain', 'check_keyphasor', 'close_loop', 'demo', 'design', 'layouts')
 
 
 def scripts():

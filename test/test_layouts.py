@@ -8,194 +8,83 @@
 # or implied. See the License for the specific language governing permissions and limitations under
 # the License.
 
-"""
-The layouts for PlotJuggler and Foxglove, and the configuration of the diagnostic aggregator.
-
-The layouts name elements of arrays, whose places follow from the messages: `python
-test/test_layouts.py` writes them into config/.
-"""
+"""The layouts for PlotJuggler and Foxglove, and the configuration of the aggregator."""
 
 from collections.abc import Iterator
-from dataclasses import fields
 from importlib import import_module
 import json
 from pathlib import Path
 import re
 import xml.etree.ElementTree as ET
 
+import numpy as np
 import pytest
-from rclpy.context import Context
-from sa_jitter_ros.averaging.indicators import INDICATORS
-from sa_jitter_ros.nodes.messages import (
-    AMPLITUDE_FIELDS, AverageHeader, PREDICTION_FIELDS, PredictionMessage, RESIDUAL_FIELDS,
-    ResidualMessage)
+from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageHeader, AverageMessage
+from sa_jitter_ros.commands import layouts
+from sa_jitter_ros.nodes.messages import encode_average
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 CONFIG = ROOT / 'config'
-PLOTJUGGLER = CONFIG / 'plotjuggler.xml'
-FOXGLOVE = CONFIG / 'foxglove.json'
-ORDERS = 3  # of the averager's default
-COLOURS = ('#1f77b4', '#d62728', '#2ca02c')
-# Topic to the number of its header elements and the names of its last dimension.
-TABLES = {
-    '/shaft/order_amplitude': (len(fields(AverageHeader)), AMPLITUDE_FIELDS),
-    '/shaft/condition_indicator': (len(fields(AverageHeader)), INDICATORS),
-    '/prediction': (len(fields(PredictionMessage)) - 1, PREDICTION_FIELDS),
-    '/residual': (len(fields(ResidualMessage)) - 1, RESIDUAL_FIELDS)}
-SPEED = '/shaft_speed'
-TEXTS = '/missing_effect', '/change'  # JSON
-WAVEFORMS = ('/shaft/synchronous_average', '/shaft/corrected_average')
-# Title, and per curve the topic, the field and the row (order of channel 0, or channel).
-PLOTS = {
-    'Amplitude, raw': [('/shaft/order_amplitude', 'raw_amplitude', k) for k in range(ORDERS)],
-    'Amplitude, corrected': [
-        ('/shaft/order_amplitude', 'corrected_amplitude', k) for k in range(ORDERS)],
-    'Attenuation, measured': [('/shaft/order_amplitude', 'attenuation', k) for k in range(ORDERS)],
-    'Attenuation, predicted': [('/prediction', 'mean_attenuation', k) for k in range(ORDERS)],
-    'Residual over its standard error': [('/residual', 'z', k) for k in range(ORDERS)],
-    'Condition indicators': [
-        ('/shaft/condition_indicator', name, 0) for name in ('rms', 'kurtosis', 'crest_factor')]}
+SHIPPED = CONFIG / 'machine.yaml'
+NODES = ('synchronous_averager', 'jitter_predictor', 'residual_analyser', 'change_monitor')
+TWO_SHAFTS = """
+/**:
+  ros__parameters:
+    machine:
+      channels:
+        case: {unit: g, sensitivity: 0.1}
+        foot: {unit: g}
+/**/synchronous_averager:
+  ros__parameters:
+    shafts: [wheel, pinion]
+    wheel.orders: [61.0, 122.0]
+    pinion.orders: [19.0, 38.5]
+/**/jitter_predictor:
+  ros__parameters:
+    shafts: [wheel, pinion]
+    wheel.orders: [61.0]
+    pinion.orders: [19.0, 38.5]
+/**/change_monitor:
+  ros__parameters:
+    shafts: [wheel, pinion]
+"""
 
 
-def element(topic: str, field: str, row: int) -> int:
-    """Return the index in `data` of a field of a row."""
-    header, names = TABLES[topic]
-    return header + len(names) * row + names.index(field)
+@pytest.fixture(params=['shipped', 'two_shafts'])
+def written(request, tmp_path):
+    """Return a machine file, a folder with its layouts, and the namespace."""
+    params, namespace = SHIPPED, ''
+    if request.param == 'two_shafts':
+        params, namespace = tmp_path / 'two.yaml', '/rig/a'
+        params.write_text(TWO_SHAFTS)
+    assert layouts.main(['--params', str(params), '--output', str(tmp_path / 'out'),
+                         '--namespace', namespace]) == 0
+    return params, tmp_path / 'out', namespace
 
 
-def label(field: str, row: int) -> str:
-    """Return what a legend calls a curve."""
-    return field.replace('_', ' ') if field in INDICATORS else f'order {row + 1}'
-
-
-def plotjuggler() -> str:
-    """Return the layout of PlotJuggler: a tab of six plots under the speed."""
-    root = ET.Element('root')
-    tabs = ET.SubElement(root, 'tabbed_widget', parent='main_window', name='Main Window')
-    tab = ET.SubElement(tabs, 'Tab', tab_name='synchronous average', containers='1')
-    rows: list[list[tuple[str, list[str]]]] = [[('Speed of the tach shaft', [f'{SPEED}/data'])]]
-    curves = [(title, [f'{topic}/data[{element(topic, field, row)}]'
-                       for topic, field, row in items]) for title, items in PLOTS.items()]
-    rows += [curves[i:i + 2] for i in range(0, len(curves), 2)]
-    outer = splitter(ET.SubElement(tab, 'Container'), '-', len(rows))
-    for items in rows:
-        inner = splitter(outer, '|', len(items))
-        for title, names in items:
-            plot = ET.SubElement(ET.SubElement(inner, 'DockArea', name=title), 'plot',
-                                 style='Lines', mode='TimeSeries', flip_x='false', flip_y='false')
-            ET.SubElement(plot, 'limitY')
-            for name, colour in zip(names, COLOURS):
-                ET.SubElement(plot, 'curve', name=name, color=colour)
-    ET.SubElement(tabs, 'currentTabIndex', index='0')
-    ET.SubElement(root, 'use_relative_time_offset', enabled='1')
-    plugin = ET.SubElement(ET.SubElement(root, 'Plugins'), 'plugin', ID='ROS2 Topic Subscriber')
-    for name, value in (('use_header_stamp', 'false'), ('discard_large_arrays', 'true'),
-                        ('max_array_size', '10000')):
-        ET.SubElement(plugin, name, value=value)
-    ET.SubElement(root, 'previouslyLoaded_Datafiles')
-    ET.SubElement(root, 'previouslyLoaded_Streamer', name='ROS2 Topic Subscriber')
-    ET.indent(root)
-    return "<?xml version='1.0' encoding='UTF-8'?>\n" + ET.tostring(root, 'unicode') + '\n'
-
-
-def splitter(parent: ET.Element, orientation: str, count: int) -> ET.Element:
-    """Add a splitter with parts of equal size."""
-    return ET.SubElement(parent, 'DockSplitter', orientation=orientation, count=str(count),
-                         sizes=';'.join([f'{1 / count:.6f}'] * count))
-
-
-def foxglove() -> str:
-    """Return the layout of Foxglove: plots on the left, waveforms and diagnostics on the right."""
-    panels: dict[str, dict[str, object]] = {}
-
-    def plot(title: str, paths: list[tuple[str, str]], x_axis: str = 'timestamp') -> str:
-        name = f'Plot!{re.sub("[^a-z]+", "_", title.lower())}'
-        panels[name] = {
-            'foxglovePanelTitle': title, 'xAxisVal': x_axis, 'isSynced': x_axis == 'timestamp',
-            'showLegend': True, 'legendDisplay': 'floating', 'showXAxisLabels': True,
-            'showYAxisLabels': True, 'paths': [
-                {'value': value, 'label': text, 'enabled': True, 'timestampMethod': 'receiveTime'}
-                for value, text in paths]}
-        return name
-
-    left = [plot('Speed of the tach shaft', [(f'{SPEED}.data', 'Hz')])] + [
-        plot(title, [(f'{topic}.data[{element(topic, field, row)}]', label(field, row))
-                     for topic, field, row in items]) for title, items in PLOTS.items()]
-    start = len(fields(AverageHeader))
-    right = [plot('Waveform of one revolution', [
-        (f'{topic}.data[{start}:]', text)
-        for topic, text in zip(WAVEFORMS, ('raw', 'corrected'))], 'index')]
-    texts = []
-    for topic in TEXTS:
-        texts.append(f'RawMessages!{topic[1:]}')
-        panels[texts[-1]] = {'topicPath': f'{topic}.data'}
-    panels['DiagnosticSummary!all'] = {
-        'topicToRender': '/diagnostics', 'minLevel': 0, 'pinnedIds': [], 'hardwareIdFilter': '',
-        'sortByLevel': True}
-    right += [*texts, 'DiagnosticSummary!all']
-    return json.dumps({
-        'configById': panels, 'globalVariables': {}, 'userNodes': {},
-        'playbackConfig': {'speed': 1},
-        'layout': {'direction': 'row', 'first': column(left), 'second': column(right),
-                   'splitPercentage': 60}}, indent=2) + '\n'
-
-
-def column(names: list[str]) -> object:
-    """Return panels above each other, of equal height."""
-    if len(names) == 1:
-        return names[0]
-    return {'direction': 'column', 'first': names[0], 'second': column(names[1:]),
-            'splitPercentage': 100 / len(names)}
-
-
-@pytest.mark.parametrize(('path', 'make'), [(PLOTJUGGLER, plotjuggler), (FOXGLOVE, foxglove)])
-def test_layout_names_the_elements_that_the_messages_have(path, make):
-    assert path.read_text('utf-8') == make(), 'run: python test/test_layouts.py'
-
-
-@pytest.fixture(scope='module')
-def topics():
-    """Return the topics that the nodes publish with their defaults."""
+@pytest.fixture
+def topics(written, ros_graph):
+    """Return the topics that the nodes publish with this machine file."""
+    params, _, namespace = written
     found = set()
-    context = Context()
-    context.init(args=[])
-    try:
-        for name in ('synchronous_averager', 'jitter_predictor', 'residual_analyser',
-                     'change_monitor'):
-            node = node_class(name)(context=context)
-            found |= {publisher.topic_name for publisher in node.publishers}
-            assert name != 'synchronous_averager' or len(
-                node.get_parameter('shaft.orders').value) == ORDERS
-            node.destroy_node()
-    finally:
-        context.try_shutdown()
+    for name in NODES:
+        module = import_module(f'sa_jitter_ros.nodes.{name}')
+        node = ros_graph.add(
+            getattr(module, name.title().replace('_', '')), namespace=namespace or None,
+            cli_args=['--ros-args', '--params-file', str(params)])
+        found |= {publisher.topic_name for publisher in node.publishers}
     return found
 
 
-def node_class(name: str) -> type:
-    """Return the class of a node of this package."""
-    module = import_module(f'sa_jitter_ros.nodes.{name}')
-    return getattr(module, ''.join(word.capitalize() for word in name.split('_')))
-
-
-def test_plotjuggler_plots_published_topics(topics):
-    root = ET.parse(PLOTJUGGLER).getroot()
-    names = [curve.attrib['name'] for curve in root.iter('curve')]
-    assert {re.sub(r'/data(\[\d+\])?$', '', name) for name in names} == {SPEED, *TABLES} <= topics
+def curves_of(folder):
+    """Return the names of the curves of PlotJuggler by the titles of their plots."""
+    root = ET.parse(folder / layouts.PLOTJUGGLER).getroot()
     for item in root.iter('DockSplitter'):
         assert int(item.attrib['count']) == len(item) == len(item.attrib['sizes'].split(';'))
-
-
-def test_foxglove_shows_published_topics_in_every_panel(topics):
-    layout = json.loads(FOXGLOVE.read_text('utf-8'))
-    panels = layout['configById']
-    paths = [path['value'] for panel in panels.values() for path in panel.get('paths', ())]
-    shown = {path.partition('.')[0] for path in paths} | {
-        panel[key].partition('.')[0] for panel in panels.values()
-        for key in ('topicPath', 'topicToRender') if key in panel}
-    assert shown == {SPEED, '/diagnostics', *TEXTS, *WAVEFORMS, *TABLES} <= topics
-    assert sorted(leaves(layout['layout'])) == sorted(panels)
+    return {(tab.attrib['tab_name'], area.attrib['name']):
+            [curve.attrib['name'] for curve in area.iter('curve')]
+            for tab in root.iter('Tab') for area in tab.iter('DockArea')}
 
 
 def leaves(layout: dict[str, object] | str) -> Iterator[str]:
@@ -205,6 +94,49 @@ def leaves(layout: dict[str, object] | str) -> Iterator[str]:
     else:
         yield from leaves(layout['first'])
         yield from leaves(layout['second'])
+
+
+def test_shipped_files_are_those_of_the_shipped_machine(tmp_path):
+    assert layouts.main(['--params', str(SHIPPED), '--output', str(tmp_path)]) == 0
+    for name in (layouts.PLOTJUGGLER, layouts.FOXGLOVE, layouts.AGGREGATOR):
+        assert (CONFIG / name).read_text('utf-8') == (tmp_path / name).read_text('utf-8'), (
+            f'run: ros2 run sa_jitter_ros layouts --params {SHIPPED} --output {CONFIG}')
+
+
+def test_both_show_published_topics(written, topics):
+    _, folder, namespace = written
+    plotted = {re.sub(r'/data(\[\d+\])?$', '', name)
+               for names in curves_of(folder).values() for name in names}
+    assert plotted <= topics
+    layout = json.loads((folder / layouts.FOXGLOVE).read_text('utf-8'))
+    panels = layout['configById']
+    paths = [path['value'] for panel in panels.values() for path in panel.get('paths', ())]
+    shown = {path.partition('.')[0] for path in paths} | {
+        panel[key].partition('.')[0] for panel in panels.values()
+        for key in ('topicPath', 'topicToRender') if key in panel}
+    assert plotted | {f'{namespace}/change', '/diagnostics'} <= shown <= topics
+    assert sorted(leaves(layout['layout'])) == sorted(panels)
+    for kind in ('synchronous_average', 'summary', 'order_amplitude', 'prediction'):
+        assert any(topic.endswith(f'/{kind}') for topic in shown)
+
+
+def test_elements_are_those_of_the_named_channel_order_and_field(tmp_path):
+    (tmp_path / 'two.yaml').write_text(TWO_SHAFTS)
+    assert layouts.main(['--params', str(tmp_path / 'two.yaml'),
+                         '--output', str(tmp_path)]) == 0
+    curves = curves_of(tmp_path)
+    values = np.arange(2.0 * 2 * len(AMPLITUDE_FIELDS)).reshape(2, 2, -1)
+    message = encode_average('order_amplitude', AverageMessage(
+        AverageHeader(0.0, 1.0, 0, 10, 10, 25.0), values, AMPLITUDE_FIELDS))
+    for title, channel, field in (('Amplitude, raw, case [g]', 0, 'raw_amplitude'),
+                                  ('Amplitude, corrected, foot [g]', 1, 'corrected_amplitude'),
+                                  ('Attenuation, measured', 0, 'attenuation')):
+        places = [int(re.search(r'\[(\d+)\]', name)[1]) for name in curves['pinion', title]]
+        np.testing.assert_array_equal(
+            np.array(message.data)[places], values[channel, :, AMPLITUDE_FIELDS.index(field)])
+    panels = json.loads((tmp_path / layouts.FOXGLOVE).read_text('utf-8'))['configById']
+    paths = panels['Plot!pinion_amplitude_raw_case_g']['paths']
+    assert [path['label'] for path in paths] == ['order 19', 'order 38.5']
 
 
 def test_aggregator_takes_the_status_of_every_node_once():
@@ -219,6 +151,11 @@ def test_aggregator_takes_the_status_of_every_node_once():
     assert {part for item in groups for part in item['contains']} == set(names)
 
 
-if __name__ == '__main__':
-    PLOTJUGGLER.write_text(plotjuggler(), 'utf-8')
-    FOXGLOVE.write_text(foxglove(), 'utf-8')
+def test_unusable_input_is_one_line(tmp_path, capsys):
+    assert layouts.main(['--params', 'none.yaml', '--output', str(tmp_path)]) == 2
+    line, = capsys.readouterr().err.splitlines()
+    assert 'none.yaml: No such file or directory' in line
+    with pytest.raises(SystemExit):
+        layouts.main(['--params', str(SHIPPED), '--namespace', 'a b', '--output', str(tmp_path)])
+    line, = capsys.readouterr().err.splitlines()
+    assert "--namespace: 'a b': give letters" in line
