@@ -551,7 +551,7 @@ def diagnostic_keys():
 # Other words in backticks: ROS's own, and the dimensions of arrays.
 ORDINARY = {
     'ros2', 'foxglove_bridge', 'joint_states', 'nan', 'diagnostic_aggregator', 'diagnostics_agg',
-    *(f'config/{path.name}' for path in (ROOT / 'config').iterdir()),
+    *(folder + path.name for path in (ROOT / 'config').iterdir() for folder in ('', 'config/')),
     'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'mark', 'indicator', 'time_ref',
     'source', 'layout.data_offset', 'data_offset', 'std_msgs/Float64', 'effects.<name>.enabled',
     'sa_jitter_ros.nodes.messages', *vars(messages), 'diagnostic_msgs/DiagnosticArray',
