@@ -185,6 +185,9 @@ def test_renamed_node_reads_its_section(tmp_path, args, expected):
         '--ros-args', '--params-file', str(MACHINE), '--params-file', str(own), *args])}
     assert found.items() >= expected.items()
     assert bool(found) == bool(expected)
+    of_process = given_parameters('synchronous_averager', [
+        '--ros-args', '--params-file', str(MACHINE), '--params-file', str(own)], ('mine',))
+    assert [(item.name, item.value) for item in of_process] == [('b', 3)]  # wins over its own
     assert 'hardware_id' not in found  # of `/**`, which rcl gives to every node
 
 

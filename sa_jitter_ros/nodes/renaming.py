@@ -57,9 +57,8 @@ def given_parameters(node: str, args: Sequence[str], process: Sequence[str] = ()
     rules = [_RULE.fullmatch(rule) for option, rule in pairwise(args)
              if option in ('-r', '--remap')]
     name = next((rule[2] for rule in rules if rule and rule[1] in (None, node)), node)
-    sections = [names for names in ((node,) if name != node else (), process) if names]
     found: dict[str, Any] = {}
-    for names in (*sections, (name,)) if sections else ():
+    for names in (*([(node,), (name,)] if name != node else []), *([process] if process else [])):
         for path in files:
             found |= named_parameters(path, names)
     return ([Parameter(key, value=value) for key, value in found.items()]
