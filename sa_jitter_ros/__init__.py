@@ -18,6 +18,7 @@ Synchronous averaging of vibration, and what jitter of the keyphasor does to it.
 | `read` | open a recording |
 | `detect_pulses` | find the pulses of a keyphasor in its waveform |
 | `pulses_from_angle` | find when a sampled angle or a counter passes the marks of a target |
+| `Machine` | a machine by its gears, planetary stages and bearings: ratios, and names of orders |
 | `average`, `Averager` | average vibration synchronously with a shaft, at once or on line |
 | `predict` | predict what jitter does to the order amplitudes of an average |
 | `design` | find how fast the keyphasor must be sampled, and how many cycles averaged |
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
         DataWarning, MessageError, ModelError, ParameterError, RecordingError, SaJitterError,
         SignalError)
     from sa_jitter_ros.loop import close_loop, Loop
+    from sa_jitter_ros.machine.train import Machine
     from sa_jitter_ros.prediction.design import Design, design
     from sa_jitter_ros.prediction.prediction import Prediction
     from sa_jitter_ros.pulses.detection import detect_pulses
@@ -48,10 +50,10 @@ if TYPE_CHECKING:
     from sa_jitter_ros.recordings.recording import Recording
 
 __all__ = [
-    'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'MessageError',
-    'ModelError', 'ParameterError', 'Prediction', 'Recording', 'RecordingError', 'SaJitterError',
-    'SignalError', 'average', 'close_loop', 'design', 'detect_pulses', 'predict',
-    'pulses_from_angle', 'read']
+    'Average', 'Averager', 'Correction', 'DataWarning', 'Design', 'Loop', 'Machine',
+    'MessageError', 'ModelError', 'ParameterError', 'Prediction', 'Recording',
+    'RecordingError', 'SaJitterError', 'SignalError', 'average', 'close_loop', 'design',
+    'detect_pulses', 'predict', 'pulses_from_angle', 'read']
 
 # Modules are loaded when a name of theirs is first used: importing the package costs nothing.
 _HOMES = {
@@ -61,6 +63,7 @@ _HOMES = {
     'errors': ('DataWarning', 'MessageError', 'ModelError', 'ParameterError', 'RecordingError',
                'SaJitterError', 'SignalError'),
     'loop': ('Loop', 'close_loop'),
+    'machine.train': ('Machine',),
     'prediction.design': ('Design', 'design'),
     'prediction.prediction': ('Prediction',),
     'pulses.detection': ('detect_pulses',),

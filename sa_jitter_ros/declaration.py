@@ -25,6 +25,7 @@ from typing import Any
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
+from sa_jitter_ros.machine import following
 from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
@@ -146,13 +147,15 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     except ParameterError as error:
         raise ModelError(str(error)) from error
     try:
-        shafts = SHAFTS.convert(values.get(SHAFTS.name, SHAFTS.default))
+        found = following(values)
+        values = {name: value for name, value in values.items() if not name.startswith('machine.')}
+        shafts = SHAFTS.convert((found | values).get(SHAFTS.name, SHAFTS.default))
         known = {item.name: item for item in predictor_parameters(shafts, values)}
         if values and not known.keys() & values.keys():
             raise ModelError(f'none of {", ".join(values)} is a parameter of {NODE}: give the '
                              f'parameter file of {NODE}')
         converted = {name: known[name].convert(value)
-                     for name, value in values.items() if name in known}
+                     for name, value in (found | values).items() if name in known}
         if not converted.get('sample_rate'):
             converted['sample_rate'] = sample_rate
         declaration = declaration_of(converted)

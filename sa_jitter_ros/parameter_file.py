@@ -46,13 +46,13 @@ def read_parameters(path: Path, node: str) -> dict[str, Any]:
     if not sections:
         raise ParameterError(f'{path}: no ros__parameters of {node}: start the file with '
                              f'"{node}:" or "/**:" and "ros__parameters:"')
-    return {name: value for section in sections for name, value in _flattened(section, '')}
+    return {name: value for section in sections for name, value in flattened(section)}
 
 
 def named_parameters(path: Path, nodes: Collection[str]) -> dict[str, Any]:
     """Read the parameters in sections of named nodes alone, in any namespace, as above."""
     return {name: value for key, section in _sections(_content(path), '')
-            if key.rsplit('/', 1)[-1] in nodes for name, value in _flattened(section, '')}
+            if key.rsplit('/', 1)[-1] in nodes for name, value in flattened(section)}
 
 
 def _content(path: Path) -> Any:
@@ -171,11 +171,12 @@ def _sections(content: Any, name: str) -> Iterator[tuple[str, Mapping[Any, Any]]
             yield from _sections(value, f'{name}/{str(key).strip("/")}')
 
 
-def _flattened(section: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+def flattened(section: Mapping[Any, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    """Iterate over the values of nested mappings, with their names joined by dots."""
     for key, value in section.items():
         name = f'{prefix}{" ".join(str(key).split())}'
         if isinstance(value, Mapping):
-            yield from _flattened(value, f'{name}.')
+            yield from flattened(value, f'{name}.')
         else:
             yield name, value
 

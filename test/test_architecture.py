@@ -30,6 +30,7 @@ CORE = {
     'number_text': set(),
     'parameters': {'errors'},
     'parameter_file': {'errors', 'yaml'},
+    'machine': {'errors', 'parameter_file', 'parameters'},
     'samples': {'numpy'},
     'version': set(),
     'pulses': SCIENCE | {'errors', 'inner_loops', 'parameters', 'samples'},
@@ -37,7 +38,7 @@ CORE = {
     'prediction': SCIENCE | {'errors', 'parameters', 'pulses'},
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {
-        'effects', 'errors', 'parameter_file', 'parameters', 'prediction', 'pulses'},
+        'effects', 'errors', 'machine', 'parameter_file', 'parameters', 'prediction', 'pulses'},
     'recordings': SCIENCE | {
         'asammdf', 'errors', 'h5py', 'nptdms', 'parameters', 'pulses', 'pyuff', 'rosbags',
         'samples'},
@@ -50,7 +51,7 @@ CORE = {
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {
-        'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop',
+        'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop', 'machine',
         'matplotlib', 'monitoring', 'parameter_file', 'parameters', 'pulses', 'recordings',
         'samples'},
     'report': SCIENCE | {

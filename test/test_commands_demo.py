@@ -249,7 +249,7 @@ def test_simulated_gearbox_is_that_of_the_machine_file(live):
     path = shipped('machine.yaml')
     plan = plan_simulation(path)
     assert (plan.shaft, plan.speed, plan.ratio, plan.keyphasor_rate, plan.trigger_cycles) == (
-        'input', 16.6, 2.40789, 3000.0, 30)
+        'input', 16.6, 183.0 / 76.0, 3000.0, 30)
     assert plan.channels == ('input bearing', 'output bearing')
     nodes = demo.processes(plan, live=live)
     assert nodes['machine_simulator'] == {

@@ -22,6 +22,7 @@ import pytest
 from rclpy.parameter import Parameter
 from sa_jitter_ros.commands import chain, close_loop, design
 from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.change_monitor import ChangeMonitor
 from sa_jitter_ros.nodes.jitter_predictor import JitterPredictor
@@ -44,7 +45,8 @@ NODES = {'jitter_predictor': JitterPredictor, 'live_view': LiveView,
          'residual_analyser': ResidualAnalyser, 'synchronous_averager': SynchronousAverager,
          'tach_detector': TachDetector, 'change_monitor': ChangeMonitor}
 #: The truth of the simulated machine: amplitudes of its orders on channel 0.
-TRUE = {18.0: 0.1, 19.0: 1.0, 20.0: 0.1, 37.0: 0.05, 38.0: 0.5, 39.0: 0.05, 57.0: 0.25}
+TRUE = {18.0: 0.1, 19.0: 1.0, 20.0: 0.1, 37.0: 0.05, 38.0: 0.5, 39.0: 0.05,
+        56.0: 0.025, 57.0: 0.25, 58.0: 0.025}
 SECONDS, RATE = 24.0, 12.0  # of machine time; times real time
 
 
@@ -63,7 +65,8 @@ def test_machine_file_has_a_section_for_every_node():
 
 @pytest.mark.parametrize('name', NODES)
 def test_every_entry_of_its_section_counts_in_a_node_and_no_other(name, ros_graph, tmp_path):
-    given = read_parameters(MACHINE, name)
+    given = {key: value for key, value in read_parameters(MACHINE, name).items()
+             if not key.startswith('machine.')}
     assert given['hardware_id'] == 'simulated_gearbox'
     extra = {'live_view': {'port': 0}, 'recording_player': {'recording': str(tmp_path / 'a.npz')}}
     np.savez(tmp_path / 'a.npz', vibration=np.zeros(100), sample_rate=1e3, pulse_times=[0.0, 0.1])
@@ -72,9 +75,28 @@ def test_every_entry_of_its_section_counts_in_a_node_and_no_other(name, ros_grap
         if key not in extra.get(name, {}) and (
                 not key.startswith('machine.') or node.has_parameter(key)):
             assert node.get_parameter(key).value == value
-    assert node._parameter_overrides.keys() <= given.keys() | extra.get(name, {}).keys()
-    assert all(node.has_parameter(key) or key.startswith('machine.')
-               for key in node._parameter_overrides)
+    own = {key for key in node._parameter_overrides if not key.startswith('machine.')}
+    assert own <= given.keys() | extra.get(name, {}).keys()
+    assert all(node.has_parameter(key) for key in own)
+
+
+def test_ratios_and_orders_follow_from_the_parts_in_the_nodes_that_have_them(ros_graph):
+    averager, predictor, simulator = (add(ros_graph, name) for name in (
+        'synchronous_averager', 'jitter_predictor', 'machine_simulator'))
+    for node, name, expected in (
+            (averager, 'input.ratio', 183 / 76), (averager, 'input.orders', [*TRUE]),
+            (averager, 'input.mesh_orders', [19.0]), (predictor, 'ratio', 183 / 76),
+            (predictor, 'orders', [*TRUE]), (simulator, 'input.teeth', 19)):
+        assert node.get_parameter(name).value == pytest.approx(expected)
+    given = ros_graph.add(JitterPredictor, {'ratio': 2.0}, cli_args=[
+        '--ros-args', '--params-file', str(MACHINE)])
+    assert given.get_parameter('ratio').value == 2.0  # a plain number wins
+
+
+def test_a_wrong_machine_is_one_line(ros_graph):
+    with pytest.raises(ParameterError, match='tach_shaft is fan, which no gear or stage turns'):
+        ros_graph.add(ChangeMonitor, {'machine.tach_shaft': 'fan'}, cli_args=[
+            '--ros-args', '--params-file', str(MACHINE)])
 
 
 def test_sections_describe_the_same_machine():
@@ -84,7 +106,7 @@ def test_sections_describe_the_same_machine():
         values = [section[key] for section in sections if key in section]
         assert all(value == values[0] for value in values), key
     simulated, averaged = sections[2], sections[5]
-    assert averaged['input.mesh_orders'] == [simulated['input.teeth']]
+    assert averaged['shafts'] == simulated['shafts']
     assert sections[0]['trigger_speed'] == simulated['speed']
     assert len(channels_of(averaged)) == len(simulated['channel_gains'])
     assert {section['keyphasor'] for section in sections if 'keyphasor' in section} == {

@@ -13,8 +13,9 @@ The parameters of a node: declared to ROS, read, and checked when they change.
 
 A node lists its parameters as `Parameter`. `ParameterSet` declares them (a float accepts an
 integer, a list of floats a list of integers, from `-p`, YAML and services) and warns of overrides
-that match none. Before a change it calls `check` with all new values, which raises a
-`SaJitterError` to refuse the change; after the change it calls `apply`.
+that match none. What is not given follows from the machine where it can (`following`). Before a
+change it calls `check` with all new values, which raises a `SaJitterError` to refuse the change;
+after the change it calls `apply`.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -29,6 +30,7 @@ from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescr
 from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
+from sa_jitter_ros.machine import following
 from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
@@ -109,13 +111,15 @@ class ParameterSet:
         self._specifications: dict[str, Parameter] = {}
         self._check: Callable[[Values], object] = lambda values: None
         self._apply: Callable[[Values], None] = lambda values: None
+        self._following = following(self.given_values)
         self.declare(specifications)
 
     def declare(self, specifications: Sequence[Parameter]) -> None:
         """Declare parameters; raises `ParameterError` for a value of wrong type or range."""
         for item in specifications:
             value = item.convert(self._node._parameter_overrides[item.name].value
-                                 if item.name in self.given else item.default)
+                                 if item.name in self.given
+                                 else self._following.get(item.name, item.default))
             self._node.declare_parameter(
                 item.name, value, descriptor_of(item), ignore_override=True)
             if value == [] and not item.read_only:  # rclpy declares an empty list as bytes
@@ -132,8 +136,13 @@ class ParameterSet:
     @property
     def given(self) -> frozenset[str]:
         """Names that the user gave at the start, also those that match no parameter."""
-        return frozenset(name for name, override in self._node._parameter_overrides.items()
-                         if override.value is not None)
+        return frozenset(self.given_values)
+
+    @property
+    def given_values(self) -> Values:
+        """Values that the user gave at the start, also those that match no parameter."""
+        return {name: override.value for name, override in self._node._parameter_overrides.items()
+                if override.value is not None}
 
     def values(self) -> Values:
         """Return the converted values of all parameters by name."""

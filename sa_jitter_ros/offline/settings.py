@@ -11,7 +11,7 @@
 """Parameters of the averager for a recording: of a machine file, and of the recording itself."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
 from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.machine import following, Machine, machine_of, PREFIX
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
@@ -48,7 +49,7 @@ class MachineFile:
     """
     Parameters of `synchronous_averager` and `tach_detector` that a user gives, by their names.
 
-    `source` is the path of the machine file, '' without one; `unknown` are names in it that the
+    Among those of the averager is what follows from the machine, whose own are `parts`. `source` is the path of the machine file, '' without one; `unknown` are names in it that the
     averager does not have.
     """
 
@@ -56,6 +57,12 @@ class MachineFile:
     detector: Mapping[str, Any]
     source: str = ''
     unknown: tuple[str, ...] = ()
+    parts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def machine(self) -> Machine:
+        """Return the machine by its parts, one without parts where none are given."""
+        return machine_of(self.parts)
 
     @classmethod
     def read(cls, params: Path | None, given: Collection[str] = ()) -> 'MachineFile':
@@ -78,8 +85,11 @@ class MachineFile:
                                      'trigger_cycles:=60')
             overrides[name] = value_of(value)
         values |= overrides
-        known = _specifications(values)
-        wrong = sorted(overrides.keys() - known.keys())
+        found = following(values)
+        parts = {name: values.pop(name) for name in [*values] if name.startswith(PREFIX)}
+        known = _specifications(found | values)
+        values = {name: value for name, value in found.items() if name in known} | values
+        wrong = sorted(overrides.keys() - known.keys() - parts.keys())
         if wrong:
             raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}: give some of '
                                  f'{", ".join(sorted(known))}')
@@ -92,7 +102,7 @@ class MachineFile:
                     for name, value in values.items() if name in known},
                    {item.name: item.convert(detector[item.name])
                     for item in DETECTOR_PARAMETERS if item.name in detector},
-                   '' if params is None else str(params), tuple(unknown))
+                   '' if params is None else str(params), tuple(unknown), parts)
 
 
 def section(params: Path | None, node: str) -> dict[str, Any]:
