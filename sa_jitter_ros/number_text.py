@@ -21,6 +21,7 @@ _PREFIXED = ('s', 'rad')
 _LARGE = (('T', 1e12), ('G', 1e9), ('M', 1e6))  # prefixes of a frequency
 _EXACT = 1e-9  # relative error of a number that only rounding makes uncertain
 _DIGITS = 3  # of a number without error
+_SMALL = -3  # exponent of a number, below which it is written with it
 
 
 def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
@@ -40,6 +41,8 @@ def measured_text(value: Json, error: Json = None, unit: str = '') -> str:
     ('0.0193 ± 0.0013', '–')
     >>> measured_text(280835514.3, None, 'Hz'), measured_text(5.41e12, None, 'Hz')
     ('281 MHz', '5.41 THz')
+    >>> measured_text(163.0596441, 1.2e-6, 'Hz')
+    '163.0596441 ± 0.0000012 Hz'
     """
     values = value if isinstance(value, list) else [value]
     errors = error if isinstance(error, list) else [error] * len(values)
@@ -108,7 +111,8 @@ def _one(value: Json, error: Json) -> str:
             return str(whole)
         return _fixed(value, _DIGITS - 1 - _exponent(value))
     places = 1 - _exponent(error)
-    return f'{_fixed(value, places)} ± {_fixed(error, places)}'
+    small = not value or _exponent(value) < _SMALL
+    return f'{_fixed(value, places, small)} ± {_fixed(error, places, small)}'
 
 
 def _exponent(value: float) -> int:
@@ -116,11 +120,11 @@ def _exponent(value: float) -> int:
     return int(f'{value:.1e}'.partition('e')[2])
 
 
-def _fixed(value: float, places: int) -> str:
-    """Return a number rounded at a decimal place, with an exponent where it has many zeros."""
+def _fixed(value: float, places: int, small: bool = True) -> str:
+    """Return a number rounded at a decimal place; a small one with an exponent for its zeros."""
     if not value:
         return '0'
-    if places > 6:
+    if places > 6 and small:
         return f'{value:.{max(places + _exponent(value), 0)}e}'
     rounded = round(value, places)
     return f'{rounded:.{max(places, 0)}f}' if math.isfinite(rounded) else '–'

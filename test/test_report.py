@@ -236,7 +236,7 @@ def test_sentence_contains_effect_and_errors(traces):
     content = report(traces['traced'])
     before, after = content['error_before'], content['error_after']
     assert verdict_sentence(content) == (
-        'The declared model lacks excess_jitter. With it the prediction misses the measured '
+        'The declared model lacks excess jitter. With it the prediction misses the measured '
         f'amplitudes by {percent_text(after["rms"], after["rms_standard_error"])} instead of '
         f'{percent_text(before["rms"], before["rms_standard_error"])}.')
     (effect,) = content['missing_effects']
@@ -260,7 +260,7 @@ def test_sentence_of_other_verdicts(traces, verdict, says):
 
 def test_sentence_names_effects_that_do_not_suffice(traces):
     content = report(replace(traces['traced'], verdict='unexplained'))
-    assert 'even with excess_jitter the prediction' in verdict_sentence(content)
+    assert 'even with excess jitter the prediction' in verdict_sentence(content)
 
 
 def test_what_remains_is_a_sentence_of_its_own(traces):

@@ -24,14 +24,14 @@ _NAMED = 12
 
 def check_figure(check: KeyphasorCheck, title: str) -> Figure:
     """Return the figure of a check."""
-    rows = 2 if check.lines is None else 3
-    figure = Figure(figsize=(9.0, 2.7 * rows + 0.4), layout='constrained')
-    panels = figure.subplots(rows, 1)
-    _draw_speed(panels[0], check)
+    drawn = [_draw_speed]
+    drawn += [_draw_marks] * (check.fitted.pattern.teeth > 1)  # one mark has no pattern
+    drawn += [_draw_lines] * (check.lines is not None)
+    figure = Figure(figsize=(9.0, 2.7 * len(drawn) + 0.4), layout='constrained')
+    panels = figure.subplots(len(drawn), 1, squeeze=False)[:, 0]
+    for axes, draw in zip(panels, drawn):
+        draw(axes, check)
     panels[0].set_title(title, fontsize='medium')
-    _draw_marks(panels[1], check)
-    if check.lines is not None:
-        _draw_lines(panels[2], check)
     return figure
 
 

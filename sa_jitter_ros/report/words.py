@@ -57,7 +57,8 @@ def verdict_sentence(content: Mapping[str, Json]) -> str:
     others = dict.fromkeys(item['name'] for item in other_numbers(content))
     remains = f' What remains: {content["remains"]}.' if content['remains'] else ''
     names = _listed([*(item['name'] for item in content['missing_effects']),
-                     *(f'the right numbers of {name}' for name in others)], 'and')
+                     *(f'the right numbers of {name}' for name in others)], 'and').replace(
+                         '_', ' ')
     if not content['lines'] and content['candidates']:  # the vibration holds lines
         found = f'Lines and pulse times show {names or "nothing"}'
         return (f'{found}; no attenuation can be compared with its prediction, since the errors '
