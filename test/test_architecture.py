@@ -47,7 +47,7 @@ CORE = {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
         'samples'},
     'monitoring': SCIENCE | {
-        'averaging', 'errors', 'json_values', 'parameter_file', 'parameters'},
+        'averaging', 'errors', 'json_values', 'machine', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {

@@ -123,7 +123,8 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
     if settings is not None:
         averaged = {row.recording for row in rows if row.averages}
         found = find_changes(
-            options.output, [job.name for job in jobs if job.name in averaged], settings)
+            options.output, [job.name for job in jobs if job.name in averaged], settings,
+            jobs[0].machine.machine)
         write_changes(options.output, found, figure=not options.no_figures)
         changes.append(found)
         for line in found.warnings():

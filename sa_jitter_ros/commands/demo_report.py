@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.commands.demo_plan import Plan
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.nodes.messages import AverageMessage, PredictionMessage
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.figures import write_figures
@@ -31,18 +32,18 @@ _FIELDS = ('raw_amplitude', 'corrected_amplitude', 'noise_standard_deviation', '
 _PREDICTED = [1, 4, 6]  # mean, 5 % and 95 % quantile
 
 
-def signals_of(plan: Plan) -> Signals:
-    """Return what the demo averages."""
+def signals_of(plan: Plan, machine: Machine) -> Signals:
+    """Return what the demo averages, of a machine whose parts name the orders."""
     unit = '' if plan.unit == 'unknown' else plan.unit
     return Signals(plan.title, tuple(range(len(plan.channels))), plan.channels,
-                   (unit,) * len(plan.channels))
+                   (unit,) * len(plan.channels), machine)
 
 
 def write_results(plan: Plan, results: Mapping[str, Results],
                   predictions: Mapping[str, PredictionMessage], output: Path) -> str:
     """Write arrays, table and figures of all shafts, and return a table; raises OSError."""
-    signals = signals_of(plan)
-    machine = MachineFile.read(plan.params).averager if plan.params else {}
+    file = MachineFile.read(plan.params)
+    signals, machine = signals_of(plan, file.machine), file.averager
     with finished_together(output) as folder:
         series = []
         for shaft, averages in results.items():

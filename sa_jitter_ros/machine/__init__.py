@@ -15,6 +15,6 @@ The machine by its parts: ratios and orders from numbers of teeth and geometry o
 """
 
 from sa_jitter_ros.machine.following import following, machine_of, PREFIX
-from sa_jitter_ros.machine.train import Machine
+from sa_jitter_ros.machine.train import Machine, UNKNOWN
 
-__all__ = ['PREFIX', 'Machine', 'following', 'machine_of']
+__all__ = ['PREFIX', 'UNKNOWN', 'Machine', 'following', 'machine_of']

@@ -206,3 +206,7 @@ def _made(kind: str, name: str, given: Any) -> Any:
         given = part(**given)
     given.check(place)
     return given
+
+
+#: A machine of which nothing is known.
+UNKNOWN = Machine()

@@ -12,7 +12,6 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.averaging.shortfall import Shortfall
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.baseline_file import (
     lock_baseline, read_baseline, set_aside, write_baseline)
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
@@ -96,12 +96,13 @@ class MachineMonitor:
     The monitors of the shafts of a machine, whose baseline is kept in a file.
 
     `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
-    the process. With `anew` an older file is kept under another name, and not used.
-    Raises RecordingError for a file that cannot be used.
+    the process. With `anew` an older file is kept under another name, and not used. `parts` name
+    the orders. Raises RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
-                 path: Path | None = None, *, anew: bool = False) -> None:
+                 path: Path | None = None, *, parts: Machine = UNKNOWN, anew: bool = False) -> None:
+        self._parts = parts
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
         self._others: dict[str, ShaftMonitor] = {}
@@ -116,6 +117,8 @@ class MachineMonitor:
                 self.close()
                 raise
             self.monitors = {shaft: found[shaft] for shaft in shafts if shaft in found}
+            for item in self.monitors.values():
+                item.machine = parts
             self._others = {name: item for name, item in found.items() if name not in shafts}
         self._pairings = {
             shaft: Pairing(self.monitors[shaft].layout if shaft in self.monitors else None)
@@ -175,7 +178,8 @@ class MachineMonitor:
         if not (known and (average.layout.indicators or self._without[shaft] >= _WITHOUT)):
             return None
         self.monitors[shaft] = ShaftMonitor(
-            shaft, average.layout, self._settings, share=1.0 / len(self.shafts))
+            shaft, average.layout, self._settings, share=1.0 / len(self.shafts),
+            machine=self._parts)
         return self.monitors[shaft]
 
     @property
@@ -198,7 +202,7 @@ class MachineMonitor:
         """Return the object of the topic `change`, without NaN and infinities."""
         found: dict[str, Any] = json_values({
             'baseline': {'averages': self.averages, 'complete': self.is_complete},
-            'changes': [asdict(item) for item in self.changes()]})
+            'changes': [item.content() for item in self.changes()]})
         return found
 
     def save(self) -> None:

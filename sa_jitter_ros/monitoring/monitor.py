@@ -15,7 +15,7 @@ Means of `group` consecutive averages at about the same speed are tested, becaus
 to a normal distribution and depend less on each other than single averages.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 import math
 from typing import Any
 
@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
@@ -95,7 +96,8 @@ class Change:
     `change` is the relative change against the baseline of what came `since`, with its
     `standard_error`; `keyphasor_share` is how much of it the keyphasor may explain. `p_value` is
     that of the change at its time, for all independent quantities of the shaft; the search over
-    time is in the rate of false alarms.
+    time is in the rate of false alarms. `part` is the part of the machine that makes the order,
+    '' where none is known to.
     """
 
     shaft: str
@@ -108,6 +110,13 @@ class Change:
     since_time: float
     keyphasor_share: float
     p_value: float
+    part: str = ''
+
+    def content(self) -> dict[str, Any]:
+        """Return the object of the topic `change`: of a known part with its name, and `order`."""
+        found = asdict(self)
+        part = found.pop('part')
+        return {**found, 'name': part, 'order': float(self.name)} if part else found
 
     def __str__(self) -> str:
         """
@@ -126,7 +135,8 @@ class Change:
         error = 100.0 * self.standard_error
         known = math.isfinite(error) and error > 0.0
         digits = min(max(-math.floor(math.log10(error)), 0), 6) if known else 1
-        return (f'{in_words(self.kind, self.name)} of {self.shaft}, channel {self.channel}: '
+        what = self.part or in_words(self.kind, self.name)
+        return (f'{what} of {self.shaft}, channel {self.channel}: '
                 f'{100.0 * self.change:+.{digits}f} +- {error:.{digits}f} %, since {since}; '
                 f'the keyphasor explains {100.0 * self.keyphasor_share:.1f} %')
 
@@ -200,12 +210,14 @@ class ShaftMonitor:
     """
     Learns the baseline of a shaft and tests new averages against it.
 
-    `share` is the part of the false alarms that this shaft may cause, `memory` as in `ChangeTest`.
+    `share` is the part of the false alarms that this shaft may cause, `memory` as in `ChangeTest`;
+    `machine` names the orders.
     Averages with other channels or orders raise ParameterError; indicators may be missing.
     """
 
     def __init__(self, shaft: str, layout: Layout, settings: Settings, *, share: float = 1.0,
-                 memory: float = 0.0) -> None:
+                 memory: float = 0.0, machine: Machine = UNKNOWN) -> None:
+        self.machine = machine
         self.shaft, self.layout, self.settings, self._share = shaft, layout, settings, share
         channels, count = layout.shape
         self._test = ChangeTest((1, channels * count), learning=settings.learning_groups,
@@ -309,7 +321,16 @@ class ShaftMonitor:
 
     def _words(self, place: int) -> str:
         channel, quantity = divmod(place, self.layout.shape[1])
-        return f'{in_words(*self.layout.quantities[quantity])} of {self.shaft}, channel {channel}'
+        words = self.words(*self.layout.quantities[quantity])
+        return f'{words} of {self.shaft}, channel {channel}'
+
+    def words(self, kind: str, name: str) -> str:
+        """Return a quantity in words: the part of the machine, if one is known."""
+        return self._part(kind, name) or in_words(kind, name)
+
+    def _part(self, kind: str, name: str) -> str:
+        return '' if kind == 'indicator' else self.machine.name_of(
+            self.shaft, float(name), bearing=kind == 'bearing')
 
     # --- the baseline ---
 
@@ -394,7 +415,8 @@ class ShaftMonitor:
                 continue
             found.append(Change(
                 self.shaft, channel, *self.layout.quantities[quantity], change, error,
-                int(sequence), time, doubt, min(chance * independent, 1.0)))
+                int(sequence), time, doubt, min(chance * independent, 1.0),
+                self._part(*self.layout.quantities[quantity])))
         return sorted(found, key=lambda item: item.p_value)
 
     def _independent(self) -> float:

@@ -21,6 +21,7 @@ from urllib.parse import quote
 
 from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.machine import machine_of
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -85,8 +86,9 @@ class ChangeMonitor(MonitoringNode):
         self._saved, self._was_complete = time.monotonic(), False
         reason = ''
         try:
-            self._monitor = MachineMonitor(values[HARDWARE_ID.name], values['shafts'],
-                                           Settings.of(values), self._path, anew=anew)
+            self._monitor = MachineMonitor(
+                values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
+                parts=machine_of(self.parameters.given_values), anew=anew)
             self._was_complete = self._monitor.is_complete
         except RecordingError as error:
             reason = str(error)

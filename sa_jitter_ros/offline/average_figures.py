@@ -18,6 +18,8 @@ from sa_jitter_ros.offline.plotting import (
     Array, CORRECTED, heading, legend_under, MEASURED, RAW, rows_of_channels, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
+_UNKNOWN = 0.3  # standard error of an attenuation that says nothing
+
 
 def waveform_figure(signals: Signals, series: ShaftSeries) -> Figure:
     """Draw the latest synchronous average of the strongest channels over the angle."""
@@ -62,9 +64,13 @@ def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | Non
 
     `prediction` (order, 3) is mean attenuation and its 5 % and 95 % quantile, if it is known.
     """
-    figure = Figure(figsize=(9.0, 6.2), layout='constrained')
-    top, bottom = figure.subplots(2, 1, sharex=True)
     position = np.arange(series.orders.size)
+    names = [signals.order(series.shaft, order).removeprefix('order ')
+             for order in series.orders.tolist()]
+    upright = position.size > 20 or max(map(len, names)) > 8
+    figure = Figure(figsize=(9.0, 6.2 + 0.05 * upright * max(map(len, names))),
+                    layout='constrained')
+    top, bottom = figure.subplots(2, 1, sharex=True)
     for shift, name, colour, label in ((-0.08, 'raw_amplitude', RAW, 'raw'),
                                        (0.08, 'corrected_amplitude', CORRECTED, 'corrected')):
         values = on_strongest(series, name)
@@ -83,19 +89,19 @@ def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | Non
                    label='predicted, 5 % to 95 %')
         bottom.hlines(mean, position - 0.3, position + 0.3, color='tab:gray',
                       label='predicted mean')
-    measured = on_strongest(series, 'attenuation')
+    measured = np.where(on_strongest(series, 'attenuation_standard_error') < _UNKNOWN,
+                        on_strongest(series, 'attenuation'), np.nan)
     if np.isfinite(measured).any():
         bottom.plot(np.broadcast_to(position, measured.shape).ravel(), measured.ravel(), 'o',
                     color=MEASURED, markersize=3.0, alpha=0.6,
                     label='measured, single averages')
     else:
-        bottom.text(0.5, 0.5, 'no average was corrected', ha='center', va='center',
-                    transform=bottom.transAxes)
+        bottom.text(0.5, 0.5, 'no average was corrected, or no order is clear', ha='center',
+                    va='center', transform=bottom.transAxes)
     bottom.use_sticky_edges = False
     bottom.margins(y=0.08)
     bottom.set_ylabel('attenuation\n(1: no loss)')
-    bottom.set_xticks(position, [f'{order:g}' for order in series.orders],
-                      rotation=0 if position.size <= 20 else 90)
+    bottom.set_xticks(position, names, rotation=90 if upright else 0)
     bottom.set_xlabel('order (multiple of the shaft speed)')
     if bottom.get_legend_handles_labels()[0]:
         bottom.legend(fontsize='small', loc='lower left')

@@ -202,7 +202,8 @@ def _settings(job: AverageJob) -> dict[str, Any]:
     """Return all that decides the files, as values of JSON; raises RecordingError."""
     return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
             'figures': job.figures, 'options': json_values(job.options),
-            'averager': dict(job.machine.averager), 'detector': dict(job.machine.detector)}
+            'averager': dict(job.machine.averager),
+            'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector)}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
@@ -219,7 +220,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
            ': lower its gain, or choose a larger range')
         for channel, reason in faults.items())]
     recording = without_channels(recording, lost)
-    signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units)
+    signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
+                      job.machine.machine)
     values = averager_values(job.machine, recording, fields=job.fields)
     averager = RecordingAverager(recording, values, detector_values(job.machine))
     with finished_together(Path(job.folder)) as folder:

@@ -13,7 +13,6 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
-from sa_jitter_ros.monitoring.quantities import in_words
 from sa_jitter_ros.offline.changes import Changes, Key, key_of
 from sa_jitter_ros.offline.plotting import Array, legend_under, MARK, MEASURED
 
@@ -80,7 +79,7 @@ def _draw(axes: Axes, changes: Changes, key: Key) -> None:
     axes.axhline(middle, color='tab:blue', linewidth=0.8)
     axes.plot(np.arange(values.size), unit(values), '.-', color=MEASURED, linewidth=0.6,
               markersize=4.0)
-    title = f'{in_words(kind, name)} of {shaft}, channel {channel}'
+    title = f'{changes.monitors[shaft].words(kind, name)} of {shaft}, channel {channel}'
     change = next((item for item in changes.changes if key_of(item) == key), None)
     if change is not None:
         names = [item.name for item in changes.recordings]
@@ -89,6 +88,9 @@ def _draw(axes: Axes, changes: Changes, key: Key) -> None:
         axes.axvline(names.index(changes.found[key]), color=MARK, linewidth=1.2, label='found')
         title = change.words(changes.since(change)).partition(';')[0]
     axes.set_title(title, fontsize='small', loc='left')
-    axes.set_ylabel({'order': 'amplitude', 'bearing': 'depth'}.get(kind, 'value'),
-                    fontsize='small')
+    units = changes.recordings[0].units
+    known = f' [{units[channel] or "unit unknown"}]' if channel < len(units) else ''
+    quantity = {'order': f'amplitude{known}', 'bearing': 'depth of\nmodulation'}.get(
+        kind, f'{name}{known}' if name in ('rms', 'peak') else name.replace('_', ' '))
+    axes.set_ylabel(quantity, fontsize='small')
     axes.margins(x=0.01)

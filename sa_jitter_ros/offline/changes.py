@@ -17,7 +17,7 @@ temperature, and show nothing of how the machine scatters from recording to reco
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 import math
 from pathlib import Path
@@ -28,11 +28,12 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.results import AverageHeader, AverageMessage
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import (
-    in_words, mean_of, monitored, MonitoredAverage)
+    mean_of, monitored, MonitoredAverage)
 from sa_jitter_ros.offline.files import ARRAYS
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
@@ -56,7 +57,7 @@ class Recorded:
     """
     A recording: its `name`, `start` and `end` (s), `speed` (Hz), and numbers of its channels.
 
-    `means` are those of the averages of each shaft.
+    `means` are those of the averages of each shaft, `units` those of the channels.
     """
 
     name: str
@@ -65,6 +66,7 @@ class Recorded:
     speed: float
     channels: tuple[int, ...]
     means: Mapping[str, MonitoredAverage]
+    units: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ class Changes:
         found: dict[str, Any] = json_values({
             'baseline': {'averages': self.learning, 'complete': all(
                 monitor.is_complete for monitor in self.monitors.values())},
-            'changes': [{**asdict(item), 'channel': self.recordings[0].channels[item.channel],
+            'changes': [{**item.content(), 'channel': self.recordings[0].channels[item.channel],
                          'since_recording': self.since(item),
                          'found_recording': self.found[key_of(item)]} for item in self.changes],
             'events': [{'recording': item.found, 'text': item.text} for item in self.events],
@@ -161,10 +163,12 @@ def settings_of(params: Path | None, given: Sequence[str], learning: int) -> Set
         name: SETTINGS[name].convert(value) for name, value in values.items()})
 
 
-def find_changes(output: Path, names: Sequence[str], settings: Settings) -> Changes:
+def find_changes(output: Path, names: Sequence[str], settings: Settings,
+                 machine: Machine = UNKNOWN) -> Changes:
     """
     Return what has changed in recordings that are averaged in the folders `names` of `output`.
 
+    The `machine` names the orders.
     Raises RecordingError if too few of them can be compared.
     """
     if not names:
@@ -192,7 +196,7 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings) -> Chan
     recorded = [item for item in recorded if item.name not in left_out]
     if len(recorded) <= learning:
         raise _too_few(recorded, learning)
-    return _watched(recorded, left_out, settings, clock=bool(apart))
+    return _watched(recorded, left_out, settings, machine, clock=bool(apart))
 
 
 def _too_few(recorded: Sequence[Any], learning: int) -> RecordingError:
@@ -204,7 +208,7 @@ def _tables(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a recording, without those over the angle."""
     with np.load(path) as arrays:
         return {name: arrays[name] for name in arrays.files if name.endswith(
-            (*KINDS, *_HEADER, *_NAMES)) or name in ('shafts', 'channels')}
+            (*KINDS, *_HEADER, *_NAMES)) or name in ('shafts', 'channels', 'units')}
 
 
 def _common_orders(tables: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, list[float]]:
@@ -235,7 +239,7 @@ def _recorded(name: str, arrays: Mapping[str, NDArray[Any]], orders: Mapping[str
                       allow_uncorrected=settings.allow_uncorrected) for part in parts])
     return Recorded(name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
                     float(arrays['trigger_speed'].mean()), tuple(arrays['channels'].tolist()),
-                    means)
+                    means, tuple(arrays['units'].tolist()))
 
 
 def _listed(channels: Sequence[int]) -> str:
@@ -248,8 +252,8 @@ def _in_time(recorded: Sequence[Recorded]) -> list[Recorded]:
     return [] if any(later.start < before.end for before, later in pairwise(ordered)) else ordered
 
 
-def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings: Settings, *,
-             clock: bool) -> Changes:
+def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings: Settings,
+             machine: Machine, *, clock: bool) -> Changes:
     """Return what the monitors of all shafts find."""
     shafts = dict.fromkeys(shaft for item in recorded for shaft in item.means)
     monitors = {}
@@ -259,7 +263,7 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
         baseline = [fitted.values.ravel() for item in recorded[:settings.learning_averages]
                     if shaft in item.means and (fitted := item.means[shaft].fitted(layout))]
         monitors[shaft] = ShaftMonitor(shaft, layout, settings, share=1.0 / len(shafts),
-                                       memory=memory_of(np.array(baseline)))
+                                       memory=memory_of(np.array(baseline)), machine=machine)
     events: list[Event] = []
     found: dict[Key, str] = {}
     for number, item in enumerate(recorded):
@@ -279,7 +283,7 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 events.append(Event(item.name, now[key].words(since)))
             for key in [key for key in found if key[0] == shaft and key not in now]:
                 del found[key]
-                events.append(Event(item.name, f'{in_words(*key[2:])} of {shaft}, channel '
+                events.append(Event(item.name, f'{monitor.words(*key[2:])} of {shaft}, channel '
                                                f'{key[1]} is back at its baseline'))
     return Changes(settings.learning_averages, tuple(recorded), left_out, monitors, tuple(events),
                    found)

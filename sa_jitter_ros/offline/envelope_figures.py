@@ -15,7 +15,7 @@ import numpy as np
 from sa_jitter_ros.averaging.envelope import SLIP
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import (
-    heading, legend_under, MARK, MEASURED, rows_of_channels, strongest_channels)
+    heading, legend_under, MARK, MEASURED, rows_of_channels, squared, strongest_channels)
 from sa_jitter_ros.offline.series import ShaftSeries
 
 
@@ -35,13 +35,17 @@ def envelope_figure(signals: Signals, series: ShaftSeries) -> Figure | None:
         for number, order in enumerate(found[known][0, channel, :, 0].tolist()):
             axes.axvspan((1.0 - SLIP) * order, (1.0 + SLIP) * order, color=MARK, alpha=0.3,
                          linewidth=0.0, label=None if number else 'bearing orders, ± 2 %')
+            name = signals.machine.name_of(series.shaft, order, bearing=True)
+            axes.annotate(name.removeprefix('bearing '), (order, 1.0), rotation=90,
+                          xycoords=('data', 'axes fraction'), textcoords='offset points',
+                          xytext=(2, -3), va='top', fontsize='x-small')
         axes.plot(orders[0, channel], rms[channel], color=MEASURED, linewidth=0.7,
                   label='squared envelope')
         lines = found[known][:, channel]
         axes.plot(lines[..., 1].mean(axis=0), np.sqrt(np.mean(lines[..., 2] ** 2, axis=0)), 'v',
                   color='tab:blue', markersize=4.0, label='largest line, RMS')
-        unit = signals.units[channel] or 'unit'
-        axes.set_ylabel(f'{signals.channel_names[channel]}\n[({unit})²]')
+        unit = squared(signals.units[channel])
+        axes.set_ylabel(f'{signals.channel_names[channel]}\nsquared envelope [{unit}]')
         axes.set_ylim(bottom=0.0)
         axes.margins(x=0.0)
     figure.suptitle(heading(signals, series, (

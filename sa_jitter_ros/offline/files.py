@@ -13,13 +13,14 @@ The files of averages: `averages.npz` and `averages.csv` of a recording, and tab
 
 `averages.npz` has the arrays of each shaft under `<shaft>_<name>`, and those of the header also
 without a shaft: of the first one. `averages.csv` has a row for each average, channel and order;
-its last column, `note`, says why an order has no amplitude.
+with a machine by its parts, `part` is the one that makes the order; the last column, `note`, says why an
+order has no amplitude.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 import csv
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 import json
 import os
 from pathlib import Path
@@ -30,6 +31,7 @@ from typing import Any, TextIO
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.offline.series import ShaftSeries
 
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
@@ -44,12 +46,22 @@ _WHOLE = ('sequence', 'trigger_cycles', 'fundamental_cycles', 'discarded_cycles'
 
 @dataclass(frozen=True)
 class Signals:
-    """What was averaged: name of the recording, and number, name and unit of its channels."""
+    """
+    What was averaged: name of the recording, and number, name and unit of its channels.
+
+    The `machine` names the orders.
+    """
 
     recording: str
     channels: tuple[int, ...]
     channel_names: tuple[str, ...]
     units: tuple[str, ...]
+    machine: Machine = field(default_factory=Machine)
+
+    def order(self, shaft: str, order: float) -> str:
+        """Return an order in words: with the part of the machine that makes it, if one does."""
+        part = self.machine.name_of(shaft, order)
+        return f'{part} ({order:.6g})' if part else f'order {order:.6g}'
 
     def label(self, channel: int) -> str:
         """Return name and unit of the channel in this place, for an axis."""
@@ -116,16 +128,19 @@ def _typed(name: str, array: Any) -> Any:
 def _write_table(file: TextIO, signals: Signals, series: Sequence[ShaftSeries]) -> None:
     writer = csv.writer(file, lineterminator='\n')
     of_order = series[0]['order_amplitude_fields'].tolist()
-    writer.writerow([*_COLUMNS, *of_order, 'channel_name', 'unit', 'note'])
+    named = ['part'] if signals.machine.shafts else []
+    writer.writerow([*_COLUMNS, *of_order, 'channel_name', 'unit', *named, 'note'])
     for item in series:
+        parts = [[signals.machine.name_of(item.shaft, order)] * len(named)
+                 for order in item.orders.tolist()]
         header = {name: _typed(name, item[name]).tolist() for name in _HEADER}
         for row, (table, notes) in enumerate(zip(item['order_amplitude'], item['note'].tolist())):
             start = [signals.recording, item.shaft, *(
                 header[name][row] for name in _COLUMNS[2:-1])]
             for channel, name, unit, orders in zip(signals.channels, signals.channel_names,
                                                    signals.units, table.tolist()):
-                writer.writerows([*start, channel, *values, name, unit, note]
-                                 for values, note in zip(orders, notes))
+                writer.writerows([*start, channel, *values, name, unit, *part, note]
+                                 for values, part, note in zip(orders, parts, notes))
 
 
 def write_lines(path: Path, lines: Callable[[TextIO], None]) -> None:

@@ -105,7 +105,8 @@ def gear_figure(signals: Signals, series: ShaftSeries, gear: GearSettings) -> Fi
             beside = row[1].twinx()
             beside.plot(angle, np.degrees(modulation.phase), color='tab:purple', linewidth=0.9)
             row[1].plot([], [], color='tab:purple', linewidth=0.9, label='phase')
-            row[1].set_title(f'modulation of order {order}, ± {reach} orders', fontsize='medium')
+            name = signals.order(series.shaft, order)
+            row[1].set_title(f'modulation of {name}, ± {reach} orders', fontsize='medium')
             row[1].set_ylabel('amplitude [%]', color=CORRECTED)
             beside.set_ylabel('phase [degrees]', color='tab:purple')
         for axes in row:

@@ -43,6 +43,16 @@ def heading(signals: Signals, series: ShaftSeries, text: str) -> str:
     return f'{signals.recording}, {series.shaft}: {text}'
 
 
+def squared(unit: str) -> str:
+    """
+    Return the square of a unit.
+
+    >>> squared('g'), squared('m/s^2'), squared('')
+    ('g²', '(m/s^2)²', 'unit²')
+    """
+    return f'{unit or "unit"}²' if unit.isalpha() or not unit else f'({unit})²'
+
+
 def rows_of_channels(signals: Signals, channels: list[int], *, height: float = 2.4,
                      columns: int = 1) -> tuple[Figure, Any]:
     """Return a figure with a row of panels for each channel, (channel, column)."""

@@ -49,7 +49,8 @@ class MachineFile:
     """
     Parameters of `synchronous_averager` and `tach_detector` that a user gives, by their names.
 
-    Among those of the averager is what follows from the machine, whose own are `parts`. `source` is the path of the machine file, '' without one; `unknown` are names in it that the
+    Among those of the averager is what follows from the machine, whose own are `parts`.
+    `source` is the path of the machine file, '' without one; `unknown` are names in it that the
     averager does not have.
     """
 

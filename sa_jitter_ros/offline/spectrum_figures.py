@@ -25,6 +25,7 @@ from sa_jitter_ros.offline.series import ShaftSeries
 
 _MOST_COLUMNS = 500  # of a map; more averages share one
 _SPEEDS = 40  # bins of a map over speed
+_APART = 4.0  # distances between the speeds of averages, above which a map over speed has a gap
 _FEWEST = 3  # averages of a map
 _DECIBELS = 60.0
 _HARMONICS = 4  # mesh harmonics with a label
@@ -84,7 +85,7 @@ def spectrum_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear:
     figure, panels = rows_of_channels(signals, found.channels, height=2.7)
     corrected = 'corrected' if 'corrected_average' in series else 'raw'
     for axes, amplitude, noise in zip(panels[:, 0], found.rms, found.noise):
-        _draw_spectrum(axes, series, amplitude, noise, gear, corrected)
+        _draw_spectrum(axes, signals, series, amplitude, noise, gear, corrected)
     figure.suptitle(heading(signals, series, (
         f'full order spectrum, RMS of {len(series)} averages')), fontsize='medium')
     panels[-1, 0].set_xlabel('order (multiple of the shaft speed)')
@@ -92,8 +93,8 @@ def spectrum_figure(signals: Signals, series: ShaftSeries, found: Spectra, gear:
     return figure
 
 
-def _draw_spectrum(axes: Axes, series: ShaftSeries, amplitude: Array, noise: float,
-                   gear: GearSettings, corrected: str) -> None:
+def _draw_spectrum(axes: Axes, signals: Signals, series: ShaftSeries, amplitude: Array,
+                   noise: float, gear: GearSettings, corrected: str) -> None:
     orders = np.arange(amplitude.size)
     floor = max(0.3 * noise, 1e-6 * float(amplitude[1:].max(initial=0.0)), 1e-300)
     axes.vlines(orders[1:], floor, np.maximum(amplitude[1:], floor), color='0.55', linewidth=0.7)
@@ -108,14 +109,16 @@ def _draw_spectrum(axes: Axes, series: ShaftSeries, amplitude: Array, noise: flo
                         linewidth=1.2, label=label)
         mesh = orders[lines.mesh][:_HARMONICS]
         for order in mesh.tolist():
-            axes.annotate(f'{order}', (order, amplitude[order]), textcoords='offset points',
-                          xytext=(0, 3), ha='center', fontsize='x-small')
+            name = signals.order(series.shaft, order).removeprefix('order ')
+            axes.annotate(name, (order, amplitude[order]), textcoords='offset points',
+                          xytext=(0, 3), ha='left' if len(name) > 8 else 'center',
+                          rotation=20 if len(name) > 8 else 0, fontsize='x-small')
     tracked = series.orders
     whole = tracked[(tracked == np.round(tracked)) & (tracked < amplitude.size)].astype(int)
     axes.plot(whole, np.maximum(amplitude[whole], floor), 'v', color='tab:green', markersize=4.0,
               label=f'tracked orders, {corrected}', linestyle='none')
     axes.set_yscale('log')
-    axes.margins(x=0.01, y=0.15)
+    axes.margins(x=0.01, y=0.25)
     axes.set_ylim(bottom=floor)
 
 
@@ -169,6 +172,13 @@ def _over_speed(axes: Axes, found: Spectra, decibels: Array, top: float) -> Any:
     rows = np.full((edges.size - 1, decibels.shape[1]), np.nan)
     for number in np.unique(place):
         rows[number] = 10.0 * np.log10(np.mean(10.0 ** (0.1 * decibels[place == number]), axis=0))
+    # A bin between the speeds of two averages of a run-up shows the nearest.
+    middle, speeds = 0.5 * (edges[1:] + edges[:-1]), np.sort(found.speed)
+    reach = 0.5 * _APART * float(np.median(np.diff(speeds)))
+    filled = np.unique(place)
+    nearest = filled[np.argmin(np.abs(middle[:, None] - middle[filled]), axis=1)]
+    distance = np.abs(middle[:, None] - speeds).min(axis=1)
+    rows = np.where((distance <= reach)[:, None], rows[nearest], rows)
     return _mesh(axes, edges, rows, top)
 
 

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.files import Signals
-from sa_jitter_ros.offline.plotting import Array, heading, legend_under, speed_varies
+from sa_jitter_ros.offline.plotting import Array, heading, speed_varies
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _FEWEST = 2  # averages
@@ -43,11 +43,12 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
     figure = Figure(figsize=(9.0, 6.4), layout='constrained')
     panels = figure.subplots(2, len(columns), sharex='col', sharey='row', squeeze=False)
     channels = strongest_lines(series)
+    names = [signals.order(series.shaft, order) for order in series.orders.tolist()]
     for number, (label, place) in enumerate(columns):
         for colour, order in enumerate(chosen.tolist()):
             _draw(panels[0, number], panels[1, number], place, amplitude[:, order],
                   error[:, order], _phase(phase[:, order], amplitude[:, order], noise[:, order]),
-                  color=f'C{colour}', label=f'order {series.orders[order]:g}, '
+                  color=f'C{colour}', label=f'{names[order]}, '
                   f'{signals.channel_names[channels[order]]}')
         panels[1, number].set_xlabel(label)
     units = {signals.units[channels[order]] for order in chosen.tolist()}
@@ -56,7 +57,8 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
     panels[0, 0].set_ylim(bottom=0.0)
     figure.suptitle(heading(signals, series, 'tracked orders, ± 1 standard error'),
                     fontsize='medium')
-    legend_under(panels[-1, 0], columns=2 if len(columns) == 2 else 3)
+    figure.legend(*panels[-1, 0].get_legend_handles_labels(), loc='outside lower center', ncols=2,
+                  fontsize='small', frameon=False)
     return figure
 
 

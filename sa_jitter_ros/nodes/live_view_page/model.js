@@ -35,7 +35,7 @@ export function analysed(kind) {
 export const changes = () => part('change')?.changes ?? [];
 export const changeOf = (kind, name) => changes().find(item => item.shaft === find('shaft').value
   && item.channel === channel() && item.kind === kind && (kind === 'order'
-    ? Number(item.name) === Number(name) : item.name === name));
+    ? Number(item.order ?? item.name) === Number(name) : item.name === name));
 export const changeText = ({change, standard_error: error}) => (change > 0 ? '+' : '')
   + `${withError(100 * change, known(error) ? 100 * error : null)} %`;
 
