@@ -151,7 +151,7 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         values = {name: value for name, value in values.items() if not name.startswith('machine.')}
         shafts = SHAFTS.convert((found | values).get(SHAFTS.name, SHAFTS.default))
         known = {item.name: item for item in predictor_parameters(shafts, values)}
-        if values and not known.keys() & values.keys():
+        if values and not known.keys() & (found | values).keys():
             raise ModelError(f'none of {", ".join(values)} is a parameter of {NODE}: give the '
                              f'parameter file of {NODE}')
         converted = {name: known[name].convert(value)

@@ -49,7 +49,7 @@ CORE = {
     'monitoring': SCIENCE | {
         'averaging', 'errors', 'json_values', 'machine', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
-        'averaging', 'effects', 'errors', 'parameter_file', 'pulses', 'recordings'},
+        'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop', 'machine',
         'matplotlib', 'monitoring', 'parameter_file', 'parameters', 'pulses', 'recordings',

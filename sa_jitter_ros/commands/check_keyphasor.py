@@ -27,14 +27,16 @@ import numpy as np
 from sa_jitter_ros.commands.check_keyphasor_figure import check_figure
 from sa_jitter_ros.commands.command_line import (
     add_recording_options, Parser, read_options, require_writable, show)
-from sa_jitter_ros.declaration import read_declaration
+from sa_jitter_ros.declaration import NODE, read_declaration
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
+from sa_jitter_ros.machine import machine_of, UNKNOWN
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.repairs_figure import write_repairs
+from sa_jitter_ros.parameter_file import read_parameters
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -52,7 +54,7 @@ def make_parser() -> Parser:
                         help='numbers of teeth of gears in the machine, to find the ratio')
     parser.add_argument('--params', type=Path, metavar='MACHINE.yaml',
                         help='parameter file of the machine: ratio, orders and pulses per '
-                        'revolution of its first shaft')
+                        'revolution of its first shaft, and its parts, which are checked')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_recording_options(parser)
     return parser
@@ -79,7 +81,10 @@ def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
                      **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
-    return check_keyphasor(recording, teeth=options.teeth, progress=progress), recording
+    machine = UNKNOWN if options.params is None else machine_of(
+        read_parameters(options.params, NODE))
+    return check_keyphasor(recording, teeth=options.teeth, machine=machine,
+                           progress=progress), recording
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -26,6 +26,7 @@ from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
+from sa_jitter_ros.keyphasor_check.declared_parts import contradictions
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
@@ -35,6 +36,7 @@ from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
 from sa_jitter_ros.keyphasor_check.wheel import Pattern, patterns
+from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
 from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_factor
 from sa_jitter_ros.recordings.channel_check import bad_channels
@@ -62,11 +64,13 @@ _AT_RANDOM, _OFF_PLACE = 0.4, 0.065
 
 
 def check_keyphasor(recording: Recording, *, teeth: Sequence[int] = (),
+                    machine: Machine = UNKNOWN,
                     progress: Callable[[str], None] | None = None) -> KeyphasorCheck:
     """
     Examine the keyphasor of a recording of which hardly anything is declared.
 
-    `teeth` are numbers of teeth of gears in the machine, which help to find `ratio`. `progress` is
+    `teeth` are numbers of teeth of gears in the machine, which help to find `ratio`; those of a
+    `machine` do, too, and a warning says which of them the vibration contradicts. `progress` is
     called with a line of text for every step. Raises SignalError for a keyphasor without pulses
     that could be examined, RecordingError for a recording without a keyphasor.
 
@@ -84,14 +88,17 @@ def check_keyphasor(recording: Recording, *, teeth: Sequence[int] = (),
     >>> check.findings['missing'].value['count'], check.findings['jitter_std'].unit
     (1, 's')
     """
-    return _Check(recording, teeth, progress or (lambda text: None)).run()
+    teeth = teeth or sorted({count for pair in machine.gears.values()
+                             for count in (pair.teeth, pair.mate_teeth)})
+    return _Check(recording, teeth, machine, progress or (lambda text: None)).run()
 
 
 class _Check:
     """The steps of a check, which share what was found."""
 
-    def __init__(self, recording: Recording, teeth: Sequence[int],
+    def __init__(self, recording: Recording, teeth: Sequence[int], machine: Machine,
                  progress: Callable[[str], None]) -> None:
+        self._machine = machine
         self._recording, self._teeth, self._progress = recording, teeth, progress
         self._rate, self._start = recording.sample_rate, recording.start_time
         self._warnings: list[Warn] = []
@@ -157,7 +164,8 @@ class _Check:
             'path_delay': self._delay(averages.get(False, ()), ratio)}
         concerned = self._orders or NO_ORDERS
         from_marks = by_marks(fitted, float(ratio.value or 1.0), concerned)
-        warnings = (*self._warnings, *costs(findings, fitted, times, concerned, from_marks))
+        warnings = (*self._warnings, *contradictions(per_revolution, self._machine),
+                    *costs(findings, fitted, times, concerned, from_marks))
         return KeyphasorCheck(findings, warnings, fitted, per_revolution, self._rate,
                               self._from_waveform, from_marks is not None)
 

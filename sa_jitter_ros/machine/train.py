@@ -150,6 +150,11 @@ class Machine:
         """Return the orders of a shaft by the names of what makes them; raises ParameterError."""
         return {**self.gear_orders(shaft), **self.bearing_orders(shaft)}
 
+    def places(self) -> dict[str, float]:
+        """Return all orders of gears and planetary stages as multiples of the tach shaft's."""
+        return {name: self.ratio(shaft) * order for shaft in self.shafts
+                for name, order in self.gear_orders(shaft).items()}
+
     def gear_orders(self, shaft: str) -> dict[str, float]:
         """Return the orders of gears and planetary stages by name; raises ParameterError."""
         self.ratio(shaft)

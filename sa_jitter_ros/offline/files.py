@@ -13,8 +13,8 @@ The files of averages: `averages.npz` and `averages.csv` of a recording, and tab
 
 `averages.npz` has the arrays of each shaft under `<shaft>_<name>`, and those of the header also
 without a shaft: of the first one. `averages.csv` has a row for each average, channel and order;
-with a machine by its parts, `part` is the one that makes the order; the last column, `note`, says why an
-order has no amplitude.
+with a machine by its parts, `part` is the one that makes the order; the last column, `note`, says
+why an order has no amplitude.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
