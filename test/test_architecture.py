@@ -34,7 +34,8 @@ CORE = {
     'samples': {'numpy'},
     'version': set(),
     'pulses': SCIENCE | {'errors', 'inner_loops', 'parameters', 'samples'},
-    'averaging': SCIENCE | {'errors', 'inner_loops', 'parameters', 'pulses', 'samples'},
+    'averaging': SCIENCE | {
+        'errors', 'inner_loops', 'machine', 'parameters', 'pulses', 'samples'},
     'prediction': SCIENCE | {'errors', 'parameters', 'pulses'},
     'effects': SCIENCE | {'errors', 'parameters', 'prediction', 'pulses'},
     'declaration': {

@@ -148,6 +148,9 @@ class KeyphasorParameters:
                      'maximum_missing'):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, whole_number(name, getattr(self, name)))
+        if self.pulses_per_revolution < 1:
+            raise ParameterError(f'pulses_per_revolution is {self.pulses_per_revolution}: give at '
+                                 'least 1')
         if (self.pulses_per_trigger or 0) > self.pulses_per_revolution:
             raise ParameterError(
                 f'pulses_per_trigger is {self.pulses_per_trigger}, more than the '
@@ -268,8 +271,13 @@ class Average:
     are the amplitudes of the single trigger cycles, read-only, with phases that refer to the same
     angle as those of their mean. `amplitude_errors` say how well another average would repeat
     `amplitudes`. `parts` are the waveforms of parts of the cycles, None unless `keep_parts` was
-    set. `envelope` is that of the residual signal, None without bearing orders, and where the
-    correction has one. `correction` is None unless `correct_jitter` was set.
+    set. `correction` is None unless `correct_jitter` was set.
+
+    `indicators` are the condition indicators by name, each with its standard error, (channel,)
+    both; `residual` and `difference` (channel, angle) are the gear signals
+    (`sa_jitter_ros.averaging.indicators`), `envelope` is that of what the average leaves of the
+    vibration, None without bearing orders. All of them are of the corrected average where there is
+    one.
 
     A shaft at 25 Hz with an order 3 of amplitude 2 and phase 1 rad, in a single channel:
 
@@ -308,6 +316,9 @@ class Average:
     parts: WaveformParts | None = None
     correction: Correction | None = None
     envelope: Envelope | None = None
+    indicators: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
+    residual: FloatArray | None = None
+    difference: FloatArray | None = None
     gains: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     refused: Mapping[float, str] = field(default_factory=dict)
 

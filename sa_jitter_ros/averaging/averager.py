@@ -24,9 +24,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sa_jitter_ros.averaging.average import Average, KeyphasorParameters
 from sa_jitter_ros.averaging.envelope import EnvelopeSettings
+from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
 from sa_jitter_ros.averaging.options import (
     AverageOptions, AveragerOptions, completed, with_keywords)
+from sa_jitter_ros.averaging.shaft_indicators import ShaftIndicators
 from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
@@ -53,7 +55,9 @@ class Averager:
     `sample_rate` (Hz) and `start_time` (s) of the first sample put the vibration on the clock of
     the pulses; `ratio` is the speed of the shaft over that of the tach shaft, `trigger_cycles` N_t
     (None: all of an uninterrupted run, returned where it ends), `orders` are multiples of the
-    shaft speed (None: 1, 2, 3). The other keywords are the parameters of the node
+    shaft speed (None: 1, 2, 3). With a `machine` (`sa.Machine`) ratio, orders, mesh and bearing
+    orders of its `shaft`, by default the one that turns with `ratio`, follow where they are not
+    given. The other keywords are the parameters of the node
     `synchronous_averager`.
 
     The averages depend on the data only: not on the sizes of the blocks, and not on whether pulses
@@ -104,10 +108,12 @@ class Averager:
         values['keyphasor_rate'] = values['keyphasor_rate'] or 0.0
         keyphasor = KeyphasorParameters(**{
             item.name: values.pop(item.name) for item in fields(KeyphasorParameters)})
+        self._indicators = ShaftIndicators(GearSettings(
+            numbers('mesh_orders', values.pop('mesh_orders')), values.pop('sidebands')))
         envelope = EnvelopeSettings(numbers('bearing_orders', values.pop('bearing_orders')),
                                     numbers('envelope_band', values.pop('envelope_band')))
         self._stream = StreamingAverager(
-            {_SHAFT: keyphasor.average(envelope=envelope, **values)},
+            {_SHAFT: keyphasor.average(envelope=envelope, keep_parts=True, **values)},
             validator=keyphasor.validator(), timeline=VibrationTimeline(
                 time_tolerance=keyphasor.time_tolerance, buffer_seconds=buffer_seconds),
             keep_unfinished=endless)
@@ -130,6 +136,11 @@ class Averager:
             'trigger_cycles': stream.counts.cycles, **stream.totals,
             'samples_non_finite': stream.timeline.counts.non_finite,
             **{f'pulses_{name}': count for name, count in vars(stream.pulse_counts).items()}}
+
+    @property
+    def problem(self) -> str:
+        """Return why the latest average has no condition indicators, '' if it has."""
+        return self._indicators.problem
 
     @property
     def geometry(self) -> TargetGeometry | None:
@@ -184,7 +195,7 @@ class Averager:
 
     def _taken(self, found: list[tuple[str, Average]]) -> tuple[Average, ...]:
         self.messages += self._stream.take_messages()
-        return tuple(average for _, average in found)
+        return tuple(self._indicators.added(average) for _, average in found)
 
 
 @with_keywords(AverageOptions)
@@ -246,6 +257,8 @@ def average(vibration: ArrayLike, sample_rate: float, pulse_times: ArrayLike,
         warnings.warn(f'{doubt}; {discarded}' if doubt else discarded, DataWarning, stacklevel=2)
     elif doubt:
         warnings.warn(doubt, DataWarning, stacklevel=2)
+    if problem := averager.problem:
+        warnings.warn(f'no condition indicators: {problem}', DataWarning, stacklevel=2)
     refused = without_amplitude(max(found, key=lambda item: len(item.refused)).refused)
     if refused:
         warnings.warn(refused, DataWarning, stacklevel=2)

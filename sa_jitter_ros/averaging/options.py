@@ -23,12 +23,15 @@ import math
 from typing import Any, Literal, TypedDict, TypeVar
 
 from sa_jitter_ros.averaging.average import AverageSettings, KeyphasorParameters
-from sa_jitter_ros.parameters import RATIO
+from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.parameters import number, RATIO
 from sa_jitter_ros.pulses.validation import GeometryMode, MissingPulses
 
 Averaging = Literal['block', 'sliding', 'exponential']
 AngleLawName = Literal['linear', 'quadratic', 'spline']
 Interpolation = Literal['band_limited', 'linear', 'cubic', 'spline']
+_SAME_RATIO = 1e-4  # relative, by which a ratio that was typed may differ
 FunctionT = TypeVar('FunctionT', bound=Callable[..., object])
 
 
@@ -57,8 +60,12 @@ class AverageOptions(TypedDict, total=False):
     path_delay: float
     target_geometry: GeometryMode
     target_angles: Sequence[float]
+    mesh_orders: Sequence[float]
+    sidebands: int
     bearing_orders: Sequence[float]
     envelope_band: Sequence[float]
+    machine: Machine | None
+    shaft: str | None
 
 
 class AveragerOptions(AverageOptions, total=False):
@@ -71,7 +78,8 @@ _DEFAULTS: dict[str, Any] = {
     item.name: item.default for item in (*fields(KeyphasorParameters), *fields(AverageSettings))
 } | {
     'start_time': 0.0, 'ratio': RATIO.default, 'trigger_cycles': None, 'orders': None,
-    'keyphasor_rate': None, 'bearing_orders': (), 'envelope_band': (), 'buffer_seconds': math.inf}
+    'keyphasor_rate': None, 'mesh_orders': (), 'sidebands': 1, 'machine': None, 'shaft': None,
+    'bearing_orders': (), 'envelope_band': (), 'buffer_seconds': math.inf}
 
 
 def with_keywords(options: type) -> Callable[[FunctionT], FunctionT]:
@@ -87,12 +95,39 @@ def with_keywords(options: type) -> Callable[[FunctionT], FunctionT]:
     return decorate
 
 
-def completed(given: Mapping[str, object], options: type) -> dict[str, Any]:
-    """Return all `options` with the values that are given; raises TypeError for others."""
+def completed(given: Mapping[str, Any], options: type) -> dict[str, Any]:
+    """
+    Return all `options` with the values that are given, or follow from the machine.
+
+    Raises TypeError for other names, ParameterError for a shaft that the machine does not have.
+    """
     known = list(options.__annotations__)
     for name in given:
         if name not in known:
             near = ' or '.join(get_close_matches(name, known, 2))
             raise TypeError(f'unknown keyword {name!r}'
                             + (f': did you mean {near}?' if near else ''))
-    return {name: given.get(name, _DEFAULTS[name]) for name in known}
+    found = {name: given.get(name, _DEFAULTS[name]) for name in known}
+    machine, shaft = found.pop('machine'), found.pop('shaft')
+    return found if machine is None else found | {
+        name: value for name, value in _of_machine(machine, shaft, found).items()
+        if name not in given}
+
+
+def _of_machine(machine: Machine, shaft: str | None, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a shaft, by default that of the given ratio."""
+    if not isinstance(machine, Machine):
+        raise ParameterError(f'machine is of type {type(machine).__name__}: give a Machine, '
+                             'Machine.read(path)')
+    if shaft is None:
+        ratio = number('ratio', given['ratio'])
+        shaft = next((name for name in machine.shafts
+                      if abs(machine.ratio(name) - ratio) < _SAME_RATIO * ratio), '')
+        if not shaft:
+            turning = ', '.join(f'{name} {machine.ratio(name):.6g}' for name in machine.shafts)
+            raise ParameterError(f'ratio is {ratio:.6g}, with which no shaft of the machine turns '
+                                 f'({turning or "it has none"}): give shaft')
+    orders = machine.average_orders(shaft)
+    return {'ratio': machine.ratio(shaft), 'mesh_orders': machine.mesh_orders(shaft),
+            'bearing_orders': machine.strikes(shaft) if given['averaging'] == 'block' else (),
+            **({'orders': orders} if orders else {})}

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.envelope import Envelope
-from sa_jitter_ros.averaging.indicators import GearSettings, RunningIndicators
-from sa_jitter_ros.averaging.jackknife import WaveformParts
-from sa_jitter_ros.errors import ParameterError, SignalError
+from sa_jitter_ros.averaging.indicators import GearSettings
+from sa_jitter_ros.averaging.shaft_indicators import best_of, ShaftIndicators
 
 FloatArray = NDArray[np.float64]
 
@@ -78,14 +77,16 @@ class ShaftResults:
     """
 
     def __init__(self, gear: GearSettings | None = None) -> None:
-        self._gear = gear or GearSettings()
-        self._indicators: dict[bool, RunningIndicators] = {}  # by whether they are of corrected
-        self.problem = ''  # why the latest average has no condition indicators
+        self._indicators = ShaftIndicators(gear)
+
+    @property
+    def problem(self) -> str:
+        """Return why the latest average has no condition indicators."""
+        return self._indicators.problem
 
     def use(self, gear: GearSettings) -> None:
         """Use other mesh orders; the indicators forget earlier averages."""
-        if gear != self._gear:
-            self._gear, self._indicators = gear, {}
+        self._indicators.use(gear)
 
     def of(self, average: Average) -> dict[str, AverageMessage]:
         """
@@ -109,33 +110,17 @@ class ShaftResults:
             found['pulse_error'] = AverageMessage(header, np.stack(
                 (average.pulses, correction.pulse_errors, correction.standard_errors,
                  average.used), axis=1), PULSE_ERROR_FIELDS)
-        source = average if correction is None else correction
-        envelope = average.envelope or (correction.envelope if correction else None)
+        envelope = average.envelope or best_of(average).envelope
         if envelope is not None:
             found |= {name: AverageMessage(header, *content)
                       for name, content in envelope_tables(envelope).items()}
-        self.problem = ''
-        if np.isfinite(source.waveform).all(axis=1).any():
-            found |= self._indicate(header, source.waveform, source.parts,
-                                    correction is not None and correction.accepted)
+        indicators = self._indicators.of(average)
+        if indicators is not None:
+            found['condition_indicator'] = AverageMessage(
+                header, indicators.values, indicators.names)
+            found['condition_indicator_error'] = AverageMessage(
+                header, indicators.standard_errors, indicators.names)
         return found
-
-    def _indicate(self, header: AverageHeader, waveform: FloatArray, parts: WaveformParts | None,
-                  corrected: bool) -> dict[str, AverageMessage]:
-        """Return the condition indicators of a waveform, none where it lacks a mesh order."""
-        running = self._indicators.setdefault(corrected, RunningIndicators(self._gear))
-        try:
-            running.update(waveform, parts)
-        except SignalError:  # the number of channels has changed
-            self._indicators = {corrected: (running := RunningIndicators(self._gear))}
-            running.update(waveform, parts)
-        except ParameterError as error:
-            self.problem = str(error)
-            return {}
-        found = running.get()
-        return {'condition_indicator': AverageMessage(header, found.values, found.names),
-                'condition_indicator_error': AverageMessage(
-                    header, found.standard_errors, found.names)}
 
 
 def envelope_tables(envelope: Envelope) -> dict[str, tuple[FloatArray, tuple[str, ...]]]:

@@ -57,7 +57,8 @@ def following(given: Mapping[str, Any]) -> dict[str, Any]:
         values: dict[str, Any] = {} if has_ratio else {'ratio': machine.ratio(shaft)}
         values |= {'orders': list(orders)} if orders else {}
         values |= {'mesh_orders': list(meshes), 'teeth': int(meshes[0])} if meshes else {}
-        values['bearing_orders'] = sorted(set(machine.bearing_orders(shaft).values()))
+        if given.get('averaging', 'block') == 'block':
+            values['bearing_orders'] = list(machine.strikes(shaft))
         found |= {f'{shaft}.{name}': value for name, value in values.items()}
         if len(shafts) == 1:
             found |= {name: values[name] for name in ('ratio', 'orders') if name in values}

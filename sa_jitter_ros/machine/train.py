@@ -189,6 +189,10 @@ class Machine:
         return {key: order for name, part in self.bearings.items() if part.shaft == shaft
                 for key, order in part.orders(name).items()}
 
+    def strikes(self, shaft: str) -> tuple[float, ...]:
+        """Return the bearing orders of a shaft, each once, in ascending order."""
+        return tuple(sorted(set(self.bearing_orders(shaft).values())))
+
     def name_of(self, shaft: str, order: float, *, bearing: bool = False) -> str:
         """Return the name of what makes an order of a shaft, '' where nothing known does."""
         if shaft not in self._ratios:
