@@ -274,9 +274,9 @@ def node(name, *arguments, document=ROOT / 'README.md'):
 
 
 def undeclared(made):
-    """Return overrides that match no parameter of a node."""
+    """Return overrides that match no parameter of a node; its constructor checks the machine."""
     return [name for name in made._parameter_overrides
-            if not (made.has_parameter(name) or name.startswith('machine.'))]  # of all nodes
+            if not (made.has_parameter(name) or name.startswith('machine.'))]
 
 
 def topics_of(made):

@@ -101,7 +101,8 @@ class MachineMonitor:
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
-                 path: Path | None = None, *, parts: Machine = UNKNOWN, anew: bool = False) -> None:
+                 path: Path | None = None, *, parts: Machine = UNKNOWN, anew: bool = False
+                 ) -> None:
         self._parts = parts
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
