@@ -10,16 +10,16 @@
 
 """Pulses of which nobody doubts any: all but doubles are true, whatever their intervals."""
 
-from collections import deque
 import math
 
-from sa_jitter_ros.pulses.interval_judge import JudgeOptions, REMEMBERED
+from sa_jitter_ros.pulses.pulse_follower import JudgeOptions
 from sa_jitter_ros.pulses.trigger_counter import PulseSink
+from sa_jitter_ros.pulses.verdicts import Verdicts
 
 
 class EveryPulse:
     """
-    Pass all pulses on to a trigger counter, in the place of an `IntervalJudge`.
+    Pass all pulses on to a trigger counter, in the place of a `PulseJudge`.
 
     It is for a clean encoder on a shaft whose speed changes from one pulse to the next by more
     than a shaft is expected to. A pulse within the smallest interval of the last one is a double.
@@ -27,9 +27,7 @@ class EveryPulse:
 
     def __init__(self, counter: PulseSink, options: JudgeOptions) -> None:
         self._counter, self._least = counter, options.minimum_interval
-        self.counts = dict.fromkeys(('accepted', 'doubles'), 0)
-        self.messages: list[str] = []
-        self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
+        self.verdicts = Verdicts()
         self.waiting = 0
         self.forget()
 
@@ -44,14 +42,13 @@ class EveryPulse:
         kept = []
         for pulse in pulses:
             if pulse - self.last < self._least or pulse == self.last:
-                self.counts['doubles'] += 1
-                self.rejected.append((pulse, 'doubles'))
+                self.verdicts.reject(pulse, 'doubles')
             else:
                 kept.append(pulse)
                 self.last = pulse
         if not kept:
             return
-        self.counts['accepted'] += len(kept)
+        self.verdicts.counts['accepted'] += len(kept)
         self.confirmed = self.last
         if not self._running:
             self._counter.begin(kept.pop(0), 0)

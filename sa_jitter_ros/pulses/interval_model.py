@@ -28,26 +28,27 @@ from operator import mul
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
-from sa_jitter_ros.pulses.pulse_paths import CERTAIN
+from sa_jitter_ros.pulses.pulse_chain import robust_square
+from sa_jitter_ros.pulses.pulse_paths import CERTAIN, OTHER, Prediction, REACH
 
 FloatArray = NDArray[np.float64]
 
-_REACH = 8  # intervals that predict the next one
-_PLACE = np.arange(1, _REACH + 1) - 0.5 * (_REACH + 1)  # of the latest interval last
-_LINE = 1.0 / _REACH + _PLACE * 0.5 * (_REACH + 1) / float(np.sum(_PLACE**2))
-_WEIGHTS = ((1.0,), (-1.0, 2.0), (1.0 / _REACH,) * _REACH, tuple(_LINE.tolist()))
-_ALL_WEIGHTS = np.array([(0.0,) * (_REACH - len(item)) + item for item in _WEIGHTS])
+_PLACE = np.arange(1, REACH + 1) - 0.5 * (REACH + 1)  # of the latest interval last
+_LINE = 1.0 / REACH + _PLACE * 0.5 * (REACH + 1) / float(np.sum(_PLACE**2))
+_WEIGHTS = ((1.0,), (-1.0, 2.0), (1.0 / REACH,) * REACH, tuple(_LINE.tolist()))
+_LINES = _WEIGHTS[1::2]
+_ALL_WEIGHTS = np.array([(0.0,) * (REACH - len(item)) + item for item in _WEIGHTS])
 _LARGEST = 700.0  # whose exponential is finite
 # Standard deviations within which an interval is regular: one of 1e9 normal ones is not.
 _WIDTH = 6.0
 _BELIEVED = 3.0  # standard deviations that a given tolerance stands for at least
 _WIDEST = 0.45  # of an interval: from a half on a missing pulse looks like a late one
+_UNSTEADY, _HIDING = 0.6, 0.15  # of a speed that scatters; and that hides a missing pulse
 _NO_SHAFT = 0.2  # scatter of pulses that come at random: 0.3 and more
 # What is assumed about the scatter before it is known, and how many intervals that counts for.
 _PRIOR, _PRIOR_COUNT = 0.01, 0.05
 _UNCERTAIN = 2.0  # of n intervals the scatter may be too small by a factor 1 + this / n
 _MEMORY = 64.0  # intervals after which the scatter is forgotten
-_KEPT_SQUARE = 0.3685  # mean square of the smallest three quarters of normal variables
 _WINDOW = 64  # intervals that show the tick of a clock
 # Ticks by which an interval may differ from each prediction: a pulse is up to half a tick off, and
 # as much again by half for the jitter of the shaft. Widths of marks are known to a tick.
@@ -93,23 +94,24 @@ class IntervalModel:
         self._harmless, self._same = (
             min(share * pulses_per_trigger, 0.1) for share in (_HARMLESS, _SAME))
         self._cycle = pulses_per_trigger
-        self._before = np.arange(block) + np.arange(_REACH)[:, None]  # levels that predict others
+        self._before = np.arange(block) + np.arange(REACH)[:, None]  # levels that predict others
         self.start(0.0, scatter=_PRIOR, count=1)
 
-    def start(self, level: float, *, scatter: float, count: int, intervals: Sequence[float] = ()
-              ) -> None:
+    def start(self, level: float, *, scatter: float, count: int, intervals: Sequence[float] = (),
+              unsteady: bool = False) -> None:
         """
         Begin with this level; `count` intervals had this scatter, relative to 1.
 
-        `intervals` (k,) in s show the tick of a clock.
+        `intervals` (k,) in s show the tick of a clock. If `unsteady`, the speed scatters so.
         """
-        self._levels = [level] * _REACH
+        self.unsteady = unsteady
+        self._levels = [level] * REACH
         self._variance = np.full(len(_WEIGHTS), scatter**2)
         self._count = float(count)
         #: so many intervals tell the scatter, at least one
         self.told = max(self._count, 1.0)
         self._chosen = 0
-        self._settling = _REACH
+        self._settling = REACH
         self._intervals = deque(intervals, maxlen=self._window)
         self._tick = self._latest = 0.0  # relative to the interval; and when it was seen (s)
         self._lone = -math.inf, 0.0  # time and size (s) of the latest step that is in doubt
@@ -120,12 +122,12 @@ class IntervalModel:
     @property
     def room(self) -> int:
         """Return the number of intervals until the scatter is computed anew."""
-        return self.block + _REACH - len(self._levels)
+        return self.block + REACH - len(self._levels)
 
     @property
     def irregular(self) -> bool:
         """Whether the intervals scatter so much that they are not those of a shaft."""
-        return not self.given and self.scatter > _NO_SHAFT
+        return not self.given and self.scatter > (_UNSTEADY if self.unsteady else _NO_SHAFT)
 
     @property
     def has_tick(self) -> bool:
@@ -160,8 +162,27 @@ class IntervalModel:
     @property
     def slowed(self) -> int:
         """Return how many of the last intervals were each longer than the one before."""
-        longer = [after > before for before, after in pairwise(self._levels[-_REACH:])]
+        longer = [after > before for before, after in pairwise(self._levels[-REACH:])]
         return next((k for k, item in enumerate(reversed(longer)) if not item), len(longer))
+
+    @property
+    def recent(self) -> tuple[float, ...]:
+        return tuple(self._levels[-REACH:])
+
+    @property
+    def chosen(self) -> int:
+        """Return the number of the prediction that is the best one."""
+        return self._chosen
+
+    @property
+    def predictions(self) -> list[Prediction]:
+        """Return the predictions, each with how unlikely it is to be the best one."""
+        variance = np.maximum(self._variance, (self._floor / _WIDTH)**2)
+        prices = np.minimum(OTHER, 0.5 * self._count * np.log(variance / variance.min()))
+        if self._settling:
+            prices[:] = 0.0
+        return [Prediction(float(price), weights in _LINES, weights)
+                for price, weights in zip(prices, _WEIGHTS)]
 
     @property
     def expected(self) -> float:
@@ -206,7 +227,7 @@ class IntervalModel:
     def jump(self, level: float) -> None:
         """Take a level that was not expected: the next ones may follow it."""
         self.accept([level])
-        self._settling = _REACH
+        self._settling = REACH
 
     def explains(self, intervals: FloatArray, widths: FloatArray, latest: float) -> bool:
         """
@@ -236,12 +257,12 @@ class IntervalModel:
     def _learn(self) -> None:
         every, weight = np.array(self._levels), self.block / min(
             self._count + self.block, _MEMORY)
-        off = np.expm1(every[_REACH:] - _ALL_WEIGHTS @ every[self._before])
-        square = _robust_square(np.minimum(off * off, self.tolerance**2))
+        off = np.expm1(every[REACH:] - _ALL_WEIGHTS @ every[self._before])
+        square = robust_square(np.minimum(off * off, self.tolerance**2))
         self._variance += weight * (square - self._variance)
         self._count = self.told = min(self._count + self.block, _MEMORY)
         self._chosen = int(np.argmin(self._variance))
-        del self._levels[:-_REACH]
+        del self._levels[:-REACH]
         if self._tick:  # the smallest so far; others may show that it is a fraction of that
             tick = clock_tick(np.array(self._intervals), self._latest) / math.exp(self.expected)
             self._tick = min(self._tick, tick or self._tick)
@@ -255,7 +276,11 @@ class IntervalModel:
                            (_TICKS[self._chosen] + self._of_marks) * self._tick / _WIDTH)
         if self.given:
             self.scatter = min(self.scatter, self.given / _BELIEVED)
-        widest = min(_WIDTH * self.scatter, _WIDEST)
+        #: the speed scatters so much that a missing pulse does not show
+        self.hides_missing = self.unsteady and self.scatter > _HIDING
+        widest = _WIDTH * self.scatter
+        if not self.hides_missing:
+            widest = min(widest, _WIDEST)
         #: a deviation up to this is regular
         self.tolerance = self.given or widest
         #: a deviation up to this passes without looking at the next pulse
@@ -279,26 +304,3 @@ def _expected(weights: tuple[float, ...], levels: list[float], place: int) -> fl
     """Return what is expected of the level at this place, from those before it."""
     total: float = sum(map(mul, weights, levels[place - len(weights):place]))
     return total
-
-
-def _robust_square(squares: FloatArray) -> FloatArray:
-    """Return the mean square (..., n) without the largest quarter: strays may have caused it."""
-    count = squares.shape[-1]
-    squares = np.sort(squares)
-    kept = count - count // 4
-    # Where most deviations are 0, as those of a slow clock, the largest ones tell the scatter.
-    return np.asarray(np.maximum(squares[..., :kept].sum(axis=-1) / (kept * _KEPT_SQUARE),
-                                 squares.sum(axis=-1) / (4.0 * count)))
-
-
-def chain_scatter(levels: FloatArray) -> float:
-    """Return the robust scatter of levels (n,) about the better of two predictions."""
-    if levels.size < 2:
-        return _PRIOR
-    kinds = [np.abs(np.diff(levels))]
-    if levels.size > 3:
-        kinds.append(np.abs(np.diff(levels, 2)))
-    squares = [np.square(kind) for kind in kinds]
-    return math.sqrt(min(
-        min(float(_robust_square(square)), float(square.mean())) if square.size > 4
-        else float(square.mean()) for square in squares))

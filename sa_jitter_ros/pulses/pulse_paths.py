@@ -13,72 +13,94 @@ Explanations of doubtful pulses: which of them are true, which are strays, and w
 
 A *path* says of each of the latest pulses whether it is true, and how many teeth after the true
 pulse before it. It costs as much as what it assumes is unlikely: a stray, missing pulses, a speed
-that jumps, or intervals that scatter. The paths are extended pulse by pulse, the unlikely ones are
-dropped. What all likely paths have in common is decided.
+that jumps, intervals that scatter, or a prediction that was worse than others so far. The paths
+are extended pulse by pulse, the unlikely ones are dropped. What all likely paths have in common is
+decided.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 import math
-from operator import itemgetter
+from operator import itemgetter, mul
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 # Logarithms of how unlikely they are.
 STRAY, MISSING, MORE_MISSING, JUMP = 6.0, 5.0, 1.5, 12.0
 # More, of a speed that falls to a half, a third, ... at once: rather, pulses are missing.
 FRACTION, _WHOLE = 48.0, 0.03
+#: the most that it costs to leave the prediction that was the best one so far
+OTHER = 4.0
 #: intervals that tell the scatter as surely as it can be
 CERTAIN = 1e6
+#: intervals that predict the next one
+REACH = 8
 _NEAREST = 1e-3  # intervals from its place at which no average shows that a pulse is displaced
 BELIEVED = 3.0  # the most that a deviation within a given tolerance costs
 MARGIN = 4.0  # paths that cost so much more than the best one are out of the question
 _DROPPED = 16.0
-_MOST_PATHS, _MOST_OF_CHAIN = 48, 16
-_FEW = 8
-_CHAIN_COST = 6.0  # of an acceptable chain, for each pulse
-#: cost of a stray among the first pulses of one mark, and of marks that may be uneven
-STRAY_OF_ONE, STRAY_OF_MARKS = 8.0, 10.0
-_LADDER = (0.002, 0.01, 0.05, 0.15)  # scatter that a chain is tried with
-_REGULAR = 0.02
+_MOST_PATHS = 48
 _SLOWED = 4  # intervals that show that a shaft slows down
 _STOPS = 0.05  # of the speed, or of its square, that must be left
-_LEAST = 1e-6  # of the longest interval; shorter ones are no pulses of one shaft
+
+
+class Prediction(NamedTuple):
+    """
+    The next level as a sum of the latest ones, with these `weights`.
+
+    It is `cost` less likely to be the best one. With `slopes` it follows a change of speed.
+    """
+
+    cost: float
+    slopes: bool
+    weights: tuple[float, ...]
+
+
+#: before any is known to be better
+SIMPLE = (Prediction(0.0, False, (1.0,)), Prediction(0.0, True, (-1.0, 2.0)))
+
+
+class Step(NamedTuple):
+    """
+    What a path says of a pulse: how many slots it is after the last true one, 0 for a stray.
+
+    `level` is that of its interval (NaN for a stray), which is `off` from what is expected. With
+    `jumps` no speed explains it.
+    """
+
+    mark: int
+    level: float = math.nan
+    off: float = 0.0
+    jumps: bool = False
+
+
+_STRAY = Step(0)
 
 
 class Path(NamedTuple):
     """
-    An explanation: `cost`, and of each pulse how many slots it is after the last true one.
+    An explanation: its `cost`, and a step for each pulse.
 
-    The mark of a stray is 0. `last` (s) is the last true pulse, at `slot` and `passed` teeth from
-    where the path began, `level` and `before` those of the last two intervals (None: not known).
-    With `jumped` the speed is no longer that of earlier intervals. `deviations` are those of the
-    intervals of true pulses, 0 for strays; `levels` likewise. `stray_at` (s) is the latest stray.
+    `last` (s) is the last true pulse, at `slot` and `passed` teeth from where the path began,
+    `recent` are the levels of the last intervals. With `jumped` the speed is no longer that of
+    earlier intervals. The prediction number `using` is used. `stray_at` (s) is the latest stray.
     The last `slowed` intervals were each longer than the one before.
     """
 
     cost: float
     last: float
     slot: int
-    passed: int
-    level: float | None
-    before: float | None
-    jumped: bool = False
-    marks: tuple[int, ...] = ()
-    deviations: tuple[float, ...] = ()
-    levels: tuple[float, ...] = ()
-    stray_at: float = -math.inf
+    passed: int = 0
+    recent: tuple[float, ...] = ()
+    using: int = 0
     slowed: int = 0
+    jumped: bool = False
+    steps: tuple[Step, ...] = ()
+    stray_at: float = -math.inf
 
-    def stray(self, pulse: float, cost: float) -> 'Path':
-        """Return the path that takes the next pulse (s) for a stray."""
-        return self._replace(cost=self.cost + cost, marks=(*self.marks, 0), stray_at=pulse,
-                             deviations=(*self.deviations, 0.0), levels=(*self.levels, math.nan))
+    @property
+    def marks(self) -> tuple[int, ...]:
+        """Return how many slots each pulse is after the last true one."""
+        return tuple(step.mark for step in self.steps)
 
 
 @dataclass(frozen=True)
@@ -100,6 +122,7 @@ class PathRules:
     given: Sequence[float]
     maximum_missing: int
     expected: float | None
+    predictions: Sequence[Prediction] = SIMPLE
     tick: float = 0.0
     told: float = CERTAIN
     stray: float = STRAY
@@ -110,51 +133,44 @@ class PathRules:
         """Return the paths with one more pulse, the most likely first."""
         found = []
         for path in paths:
-            found.append(path.stray(pulse, self.stray))
-            found += self._true(path, pulse)
+            found.append(path._replace(
+                cost=path.cost + self.stray, steps=(*path.steps, _STRAY), stray_at=pulse))
+            if pulse > path.last:
+                found += self._true(path, pulse)
         found.sort(key=itemgetter(0))
         most = found[0].cost + _DROPPED
         return [path for path in found[:self.most] if path.cost <= most]
 
-    def _true(self, path: Path, pulse: float) -> list[Path]:
+    def _true(self, path: Path, pulse: float) -> Iterator[Path]:
+        """Yield the paths on which the next pulse (s) is true."""
         gap = pulse - path.last
-        if gap <= 0.0:
-            return []
-        found: list[Path] = []
-        width, passed, slot = 0.0, 0, path.slot
+        expected = list(self._expected(path))
+        width, passed, slot = 0.0, path.passed, path.slot
         for mark in range(1, 2 + self.maximum_missing):
             width += self.widths[slot]
             passed += self.steps[slot]
             slot = (slot + 1) % len(self.steps)
             level = math.log(gap / width)
-            off = self._deviation(path, level, mark)
-            beyond = max(abs(off) - self.tick / mark, 0.0)
-            cost = min(0.5 * (self.told + 1.0) * math.log1p(
-                (beyond / self.scatter)**2 / self.told), JUMP)
-            if self._believed(path, level, off):
-                cost = min(cost, BELIEVED)
-            if mark > 1:
-                if cost == JUMP:
-                    if off < 0.0:
-                        break
-                    continue
+            cost, off, using = self._deviation(path, expected, level, mark)
+            jumps = cost == JUMP
+            if mark > 1 and not jumps:
                 cost += MISSING + MORE_MISSING * (mark - 2) + self._by_chance(path, gap / width)
-            if cost == JUMP:
-                # The angle jumps, and the speed stays as it was; or the speed jumps.
-                found.append(path._replace(
-                    cost=path.cost + cost + self.each, last=pulse, slot=slot,
-                    passed=path.passed + passed, marks=(*path.marks, mark),
-                    deviations=(*path.deviations, off), levels=(*path.levels, level)))
-            unlike = FRACTION if cost == JUMP and is_multiple(off) else 0.0
-            found.append(path._replace(
-                cost=path.cost + cost + unlike + self.each, last=pulse, slot=slot,
-                passed=path.passed + passed, level=level, before=path.level,
-                jumped=path.jumped or cost == JUMP, marks=(*path.marks, mark),
-                deviations=(*path.deviations, off), levels=(*path.levels, level),
-                slowed=path.slowed + 1 if path.level is not None and level > path.level else 0))
+            if mark == 1 or not jumps:
+                true = path._replace(
+                    cost=path.cost + cost + self.each, last=pulse, slot=slot, passed=passed,
+                    steps=(*path.steps, Step(mark, level, off, jumps)))
+                if jumps:  # of the angle, and the speed stays as it was; or of the speed
+                    yield true
+                    true = true._replace(
+                        cost=true.cost + (FRACTION if is_multiple(off) else 0.0), jumped=True,
+                        recent=(*path.recent[-1:], level))
+                else:
+                    true = true._replace(
+                        recent=(*path.recent, *(level,) * mark)[-REACH:], using=using)
+                slower = bool(path.recent) and level > path.recent[-1]
+                yield true._replace(slowed=path.slowed + 1 if slower else 0)
             if off < 0.0:
                 break  # with more missing pulses it would be shorter still
-        return found
 
     def _by_chance(self, path: Path, interval: float) -> float:
         """
@@ -167,32 +183,43 @@ class PathRules:
         off = (path.stray_at - path.last) / interval
         return max(-math.log(2.0 * max(abs(off - max(round(off), 1)), _NEAREST)), 0.0)
 
-    def _believed(self, path: Path, level: float, off: float) -> bool:
-        """Whether the deviation from what the intervals before all paths let expect is given."""
-        if self.expected is not None and not path.jumped:
-            off = math.expm1(level - self.expected)
-        return abs(off) <= self.given[path.slot]
+    def _expected(self, path: Path) -> Iterator[tuple[float, bool, float, int]]:
+        """Yield cost, whether it slopes, expected level and number of the predictions."""
+        recent = path.recent
+        for number, (cost, slopes, weights) in enumerate(self.predictions):
+            size = len(weights)
+            if size > len(recent):
+                continue
+            cost = 0.0 if number == path.using else cost
+            yield cost, slopes, sum(map(mul, weights, recent[-size:])), number
+            if size == 2 and path.slowed >= _SLOWED and recent[-1] > recent[-2]:
+                for level in slowing(recent[-1], recent[-2]):
+                    yield cost, slopes, level, number
 
-    def _deviation(self, path: Path, level: float, mark: int) -> float:
+    def _deviation(self, path: Path, expected: list[tuple[float, bool, float, int]], level: float,
+                   mark: int) -> tuple[float, float, int]:
         """
-        Return the deviation from the nearest of what the intervals before let expect.
+        Return how unlikely a level is, its deviation from what is expected, and by which number.
 
         With missing pulses `level` is that of the mean of `mark` intervals; where the speed
         changes, it lies half way along them.
         """
-        if path.level is None:
-            return 0.0
-        expected = [path.level]
+        best, off, using = math.inf, 0.0, path.using
+        half, tick = 0.5 * (mark - 1), self.tick / mark
+        for cost, slopes, each, number in expected:
+            apart = level - each
+            if slopes and mark > 1:
+                apart = min(apart, apart - half * (each - path.recent[-1]), key=abs)
+            beyond = max(abs(apart) - tick, 0.0) / self.scatter
+            cost += 0.5 * (self.told + 1.0) * math.log1p(beyond * beyond / self.told)
+            if cost < best:
+                best, off, using = cost, apart, number
+        off = math.expm1(off)
+        given = off
         if self.expected is not None and not path.jumped:
-            expected.append(self.expected)
-        if path.before is not None:
-            expected.append(2.0 * path.level - path.before)
-            if path.slowed >= _SLOWED and path.level > path.before:
-                expected += slowing(path.level, path.before)
-        if mark > 1:
-            half = 0.5 * (mark - 1)
-            expected += [each + half * (each - path.level) for each in expected[1:]]
-        return math.expm1(min((level - each for each in expected), key=abs))
+            given = math.expm1(level - self.expected)
+        best = min(best, JUMP) if expected else 0.0
+        return min(best, BELIEVED) if abs(given) <= self.given[path.slot] else best, off, using
 
 
 def slowing(level: float, before: float) -> list[float]:
@@ -219,55 +246,3 @@ def is_multiple(off: float) -> bool:
 def likely(paths: list[Path]) -> list[Path]:
     """Return the paths that are not out of the question, of those sorted by cost."""
     return [path for path in paths if path.cost < paths[0].cost + MARGIN]
-
-
-def find_chain(pulses: FloatArray, scatter: float | None, *, stray: float = STRAY_OF_ONE
-               ) -> tuple[IntArray, IntArray] | None:
-    """
-    Return which of the pulses (n,) follow each other regularly, and in how many intervals each.
-
-    `scatter` is what earlier intervals had, None if it is not known. A stray costs `stray`. None
-    without such a chain.
-
-    >>> chain, steps = find_chain(np.array([0.0, 0.9, 1.0, 2.0, 3.0, 3.3, 5.0]), None)
-    >>> chain.tolist(), steps.tolist()
-    ([0, 2, 3, 4, 6], [1, 1, 1, 2])
-    """
-    intervals = np.diff(pulses)
-    if intervals.size < 2 or not intervals.min() > _LEAST * intervals.max():
-        return None
-    levels = np.log(intervals)
-    change = np.diff(levels)
-    turn = np.append(change[0], np.diff(change))
-    if np.all(np.minimum(np.abs(change), np.abs(turn)) <= _REGULAR):
-        return np.arange(pulses.size), np.ones(intervals.size, np.int64)
-    found, doubt = None, False
-    for tried in _LADDER if scatter is None else (*_LADDER, scatter):
-        # A wide normal distribution explains everything, but each interval with less density.
-        each = math.log(tried / min(_LADDER)) if tried > min(_LADDER) else 0.0
-        rules = PathRules((1,), (1.0,), tried, (0.0,), 1, None, stray=stray, each=each,
-                          most=_MOST_OF_CHAIN)
-        paths: list[Path] = []
-        for number, pulse in enumerate(pulses.tolist()):
-            paths = rules.extend(paths, pulse) if paths else []
-            paths.append(Path(stray * number, pulse, 0, 0, None, None, False,
-                              (0,) * number + (1,)))
-        paths.sort(key=itemgetter(0))
-        best = next((path for path in paths if _acceptable(path.marks)), None)
-        if best is not None and (found is None or best.cost < found.cost):
-            found = best
-            doubt = best.cost > paths[0].cost + MARGIN
-    if found is not None and not doubt and found.cost <= _CHAIN_COST * pulses.size:
-        marks = np.array(found.marks, np.int64)
-        true = np.flatnonzero(marks)
-        return true, marks[true[1:]]
-    return None
-
-
-def _acceptable(marks: tuple[int, ...]) -> bool:
-    """Whether enough pulses are true to call them a chain: of few all but one, of many a half."""
-    true = sum(mark > 0 for mark in marks)
-    least = len(marks) - (1 if len(marks) < 6 else 2)
-    if len(marks) >= _FEW:
-        least = (len(marks) + 1) // 2
-    return true >= max(3, least) and bool(marks[-1] or marks[-2])

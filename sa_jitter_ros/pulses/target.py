@@ -23,9 +23,9 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.pulses.interval_model import chain_scatter
 from sa_jitter_ros.pulses.mark_pattern import MarkPattern
-from sa_jitter_ros.pulses.pulse_paths import find_chain, STRAY_OF_MARKS, STRAY_OF_ONE
+from sa_jitter_ros.pulses.pulse_chain import (
+    Chain, find_chain, STRAY_OF_MARKS, STRAY_OF_ONE, unsteadiness)
 from scipy.ndimage import median_filter
 
 FloatArray = npt.NDArray[np.float64]
@@ -36,6 +36,7 @@ _LEARNING_TIME, _FEWEST, _MOST = 1.0, 4, 12
 # How often the pulses double after which noise is tried again, 2 of them at first; the most that
 # are waited for after locks that were lost soon.
 _DOUBLED, _MORE = 5, 6
+_LATEST = 16  # pulses of a chain
 # A pulse after less than this fraction of the expected interval is a second one of the same tooth.
 _DOUBLE = 0.5
 # Sensors shift the pulses of teeth next to a gap by up to 2 degrees, a fifth of the pitch of 36
@@ -54,7 +55,7 @@ class Lock:
     its number, and `widths`, the steps with what is known of uneven marks. Deviations of the
     interval behind it within `believed` are expected as long as the widths are not known.
     `interval` (s) is the first time from tooth to tooth; `known` intervals had the `scatter`;
-    `intervals` (k,) in s are those from tooth to tooth.
+    `intervals` (k,) in s are those from tooth to tooth. If `unsteady`, the speed scatters.
     """
 
     first: int
@@ -67,6 +68,7 @@ class Lock:
     scatter: float
     known: int
     intervals: FloatArray
+    unsteady: bool = False
 
     @cached_property
     def even(self) -> bool:
@@ -125,7 +127,7 @@ class Target(Protocol):
 class EvenTarget:
     """Equal or nearly equal angles: several intervals that follow each other are a lock."""
 
-    memory = 16
+    memory = 64
 
     def __init__(self, *, marks: int) -> None:
         self.marks = marks
@@ -148,19 +150,32 @@ class EvenTarget:
 
     def lock(self, pulses: FloatArray, scatter: float | None) -> Lock | None:
         """Match the latest pulses (n,) in s; `scatter` is that of earlier intervals."""
-        start = max(pulses.size - self.memory, 0)
-        found = find_chain(pulses[start:], scatter,
-                           stray=STRAY_OF_ONE if self.marks == 1 else STRAY_OF_MARKS)
+        start = max(pulses.size - _LATEST, 0)
+        found = self._chain(pulses[start:], scatter)
         if found is None:
+            return self.unsteady(pulses)
+        return self._locked(pulses[start:], found, start)
+
+    def unsteady(self, pulses: FloatArray) -> Lock | None:
+        """Match pulses (n,) in s that follow each other at a speed that scatters, None if not."""
+        if not unsteadiness(np.log(np.diff(pulses))):
             return None
-        chain, steps = found
-        gaps = np.diff(pulses[start + chain])
-        levels = np.log(gaps / steps)
+        found = self._chain(pulses, None)
+        return self._locked(pulses, found, 0) if found is not None and found.unsteady else None
+
+    def _chain(self, pulses: FloatArray, scatter: float | None) -> Chain | None:
+        return find_chain(pulses, scatter,
+                          stray=STRAY_OF_ONE if self.marks == 1 else STRAY_OF_MARKS)
+
+    def _locked(self, pulses: FloatArray, found: Chain, start: int) -> Lock:
+        """Return the lock on pulses (n,), the latest, of which `start` came before."""
+        gaps = np.diff(pulses[found.pulses])
+        levels = np.log(gaps / found.steps)
         ones = np.ones(self.marks, dtype=np.int64)
-        return Lock(first=start + int(chain[0]), slot=0, interval=float(np.exp(levels[0])),
+        return Lock(first=start + int(found.pulses[0]), slot=0, interval=float(np.exp(levels[0])),
                     steps=ones, teeth=np.arange(self.marks), widths=ones.astype(np.float64),
-                    believed=np.zeros(self.marks), scatter=chain_scatter(levels),
-                    known=levels.size, intervals=gaps[steps == 1])
+                    believed=np.zeros(self.marks), scatter=found.scatter, known=levels.size,
+                    intervals=gaps[found.steps == 1], unsteady=found.unsteady)
 
 
 class ToothedWheel:
@@ -227,8 +242,8 @@ class ToothedWheel:
                                 steps=steps, teeth=np.cumsum(steps) - steps,
                                 widths=steps.astype(np.float64),
                                 believed=np.where(tolerance > self._tolerance, tolerance, 0.0),
-                                scatter=chain_scatter(levels), known=levels.size,
-                                intervals=intervals[np.roll(steps, -slot) == 1])
+                                scatter=Chain(single, steps, levels).scatter,
+                                known=levels.size, intervals=intervals[np.roll(steps, -slot) == 1])
         return None
 
     def _tolerances(self, steps: IntArray) -> FloatArray:

@@ -11,7 +11,7 @@
 """
 Pulse validation: which pulses of a keyphasor are valid, and which of them begin a trigger cycle.
 
-This module checks the order in time. `interval_judge` then decides by the intervals which pulses
+This module checks the order in time. `pulse_judge` then decides by the intervals which pulses
 are valid, and `trigger_counter` counts these. A pulse that is earlier than the last one by at most
 `time_tolerance` is out of order and is dropped. A pulse that is earlier by more waits for the next
 pulses. If one of these continues the old sequence, the one or two waiting pulses are out of order.
@@ -30,8 +30,9 @@ import numpy as np
 import numpy.typing as npt
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.every_pulse import EveryPulse
-from sa_jitter_ros.pulses.interval_judge import IntervalJudge, JudgeOptions
 from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
+from sa_jitter_ros.pulses.pulse_follower import JudgeOptions
+from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
 from sa_jitter_ros.pulses.target_geometry import TargetGeometry
 from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter, TriggerPulses
@@ -86,9 +87,9 @@ class PulseValidator:
 
     A trigger pulse is returned as soon as it ends a trigger cycle, the first one of a run together
     with the second; a doubtful one waits for the next pulses. At the start, the pulses of a second
-    wait, at least 4 and at most 12, and those of four revolutions of a target with several marks,
-    at most 3 s, or twice as many where a gap or a stray hides the angles of a few marks; no pulse
-    is lost by this. `flush` returns those that wait at the end.
+    wait, at least 4 and at most 12, or 56 where intervals scatter, and those of four revolutions
+    of a target with several marks, at most 3 s, or twice as many where a gap or a stray hides the
+    angles of a few marks; no pulse is lost by this. `flush` returns those that wait at the end.
 
     :param pulses_per_revolution: of the tach shaft; with missing teeth, those counted.
     :param pulses_per_trigger: pulses in a trigger cycle, None for all of a revolution.
@@ -169,9 +170,9 @@ class PulseValidator:
             bridge=missing_pulses == 'bridge', tolerance=interval_tolerance,
             maximum_missing=maximum_missing, minimum_interval=minimum_interval,
             pulses_per_trigger=per_trigger)
-        self._judge: IntervalJudge | EveryPulse = (
+        self._judge: PulseJudge | EveryPulse = (
             EveryPulse(self._sink, options) if every
-            else IntervalJudge(target, self._sink, options))
+            else PulseJudge(target, self._sink, options))
         self.pulses_per_revolution, self.pulses_per_trigger = teeth, per_trigger
         self._time_tolerance, self._path_delay = time_tolerance, path_delay
         self._held: list[float] = []  # pulses after time ran back
@@ -181,8 +182,9 @@ class PulseValidator:
     def counts(self) -> PulseCounts:
         """Return the counts so far."""
         return PulseCounts(
-            **self._judge.counts, out_of_order=self._out_of_order, restarts=self._restarts,
-            non_finite=self._non_finite, cycles_discarded=self._counter.discarded,
+            **self._judge.verdicts.counts, out_of_order=self._out_of_order,
+            restarts=self._restarts, non_finite=self._non_finite,
+            cycles_discarded=self._counter.discarded,
             geometry_refused=0 if self._corrector is None else self._corrector.refused)
 
     @property
@@ -193,7 +195,7 @@ class PulseValidator:
         Each has its time in s, with the path delay, and the reason: the name of a count, or
         'missing'. There are 2000 at most.
         """
-        return [(time + self._path_delay, why) for time, why in self._judge.rejected]
+        return [(time + self._path_delay, why) for time, why in self._judge.verdicts.rejected]
 
     @property
     def corrects_marks(self) -> bool:
@@ -247,7 +249,8 @@ class PulseValidator:
 
     def take_messages(self) -> list[str]:
         """Return what pulses cannot do and did, a sentence each, and forget it."""
-        found, self._judge.messages = self._judge.messages, []
+        verdicts = self._judge.verdicts
+        found, verdicts.messages = verdicts.messages, []
         if self._corrector is not None:
             found += self._corrector.messages
             self._corrector.messages = []

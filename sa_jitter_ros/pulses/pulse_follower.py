@@ -1,0 +1,446 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+The pulses of a target whose marks and speed are known: which of them are true.
+
+A pulse is *regular* if its interval is within the tolerance of the expected one
+(`interval_model`), and it passes at once if it is so near that no average would show the
+difference. All others wait for the next pulses. Then every explanation (`pulse_paths`) is tried:
+the pulse is true, it is a stray, pulses are missing before it, the speed changed. What all likely
+explanations have in common is decided:
+
+* double, early: a stray less, or more, than half an interval after the last true pulse. It is
+  dropped; the trigger cycle continues if the true pulse came, too.
+* missing: pulses did not come. They are interpolated (bridge), or the trigger cycle is discarded
+  and a new run begins (break).
+* late: the interval is none that the shaft can have. The trigger cycle is discarded and a new run
+  begins.
+* a change of speed, which the intervals on either side show: nothing is lost.
+
+If two pulses explain one tooth equally well, neither is used and the tooth counts as missing.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+from sa_jitter_ros.pulses.alternation import Alternation
+from sa_jitter_ros.pulses.interval_model import IntervalModel
+from sa_jitter_ros.pulses.mark_pattern import mark_pattern
+from sa_jitter_ros.pulses.pulse_paths import likely, Path, PathRules
+from sa_jitter_ros.pulses.target import Lock
+from sa_jitter_ros.pulses.trigger_counter import PulseSink
+from sa_jitter_ros.pulses.verdicts import Verdicts
+
+_MOST_WAITING = 10  # doubtful pulses, until the match is lost
+_NEAR_WHOLE = 0.2  # intervals by which a gap may differ from a whole number of them
+_RAMP = 0.25  # largest change of an interval that is a change of speed
+_AGREEING = 5  # equal intervals that show another pulse rate
+_AGREE, _FASTER = 0.03, 0.75
+_LONGEST_GAP = 1000.0  # revolutions
+_LONG = 2.0  # revolutions, of a gap behind which the marks are matched again
+_LACKING = 6  # intervals in a row with as many missing pulses that show another pulse rate
+_FITS = 0.1  # tolerance with which a pulse after a step of time fits
+# A change of the interval that is reported: across so many intervals, by this much of its
+# logarithm; and how near to a factor of two.
+_SHORT, _CHANGED, _NEAR = 5.0, 0.3, 0.03
+#: revolutions from which the angles between the marks are learnt
+REVOLUTIONS = 5
+_NEVER = 1 << 62
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Options of `PulseValidator` that decide which pulses are true."""
+
+    bridge: bool
+    tolerance: float
+    maximum_missing: int
+    minimum_interval: float
+    pulses_per_trigger: int
+
+
+class PulseFollower:
+    """
+    Follow the pulses of a target, the first of which is the first of the `queue`.
+
+    Those in the queue (s) that are decided about are taken away; the true ones go to the `sink`.
+    `confirmed` (s) is the latest of these. Once the match is `lost`, nothing is decided; of a
+    `probe`, which has no trigger cycles to lose, it is lost wherever the number of passed teeth is
+    not sure. `marks`, `levels` and `times` are those of the intervals since the pattern of the
+    marks was learnt, which a probe does not learn.
+    """
+
+    def __init__(self, lock: Lock, queue: list[float], model: IntervalModel, *,
+                 options: JudgeOptions, sink: PulseSink, verdicts: Verdicts, probe: bool = False
+                 ) -> None:
+        self._lock, self._queue, self._model, self._options = lock, queue, model, options
+        self._sink, self._verdicts, self._probe = sink, verdicts, probe
+        self.lost = False
+        self.slot = lock.slot
+        self.marks: list[int] = []
+        self.levels: list[float] = []
+        self.times: list[float] = []
+        self._learnt = 0  # times that the pattern was learnt
+        self._lacking: list[int] = []  # slots of the latest intervals, all of which lacked pulses
+        self._alternation = Alternation()
+        self._recent: list[float] = []  # of the latest pulses, dropped ones too
+        verdicts.counts['accepted'] += 1
+        self.confirmed = queue.pop(0)
+        self._remember(self.confirmed)
+
+    def follow(self, *, final: bool) -> None:
+        """Decide about the pulses in the queue, all of them if none follows: `final`."""
+        while self._queue and not self.lost and (
+                self._take_regular(final) or self._decide(final)):
+            self.lost |= self._model.irregular
+
+    def fits(self, gap: float) -> bool:
+        """Whether a pulse at this interval (s) from the last one would be regular."""
+        expected = math.exp(self._model.expected) * float(self._lock.widths[self.slot])
+        return abs(gap / expected - 1.0) <= max(self._model.tolerance, _FITS)
+
+    def _drop(self, kind: str, at: int = 0) -> None:
+        """Drop a waiting pulse."""
+        pulse = self._queue.pop(at)
+        self._remember(pulse)
+        self._verdicts.reject(pulse, kind)
+        if kind != 'unlocked':
+            self._sink.drop()
+
+    def _remember(self, pulse: float) -> None:
+        self._recent = [*self._recent[-_AGREEING:], pulse]
+
+    # --- regular pulses ---
+
+    def _take_regular(self, final: bool) -> int:
+        """Accept the pulses up to the first doubtful one; return their number."""
+        lock, model = self._lock, self._model
+        room = min(model.room, self._room_of_marks)
+        pulses, (steps, widths, believed) = self._queue[:room + 1], lock.lists
+        size = len(steps)
+        slots = [number % size for number in range(self.slot, self.slot + len(pulses))]
+        gaps = [pulse - before for before, pulse in zip((self.confirmed, *pulses), pulses)]
+        levels = [math.log(gap / widths[slot]) for gap, slot in zip(gaps, slots)]
+        off = [abs(item) for item in model.deviations(levels)]
+        # Teeth beside gaps are uneven; a stray among marks that may be uneven needs a search.
+        tolerance, uneven = model.tolerance, not lock.even
+        regular = [item <= tolerance or (uneven and item <= believed[slot])
+                   for item, slot in zip(off, slots)]
+        # A pulse with a small deviation cannot spoil an average. A larger one may be a stray's:
+        # then the next interval is too short.
+        regular.append(final and len(pulses) == len(self._queue))
+        passes = [item <= model.harmless or (fits and following)
+                  for item, fits, following in zip(off, regular, regular[1:])]
+        count = min(passes.index(False) if False in passes else len(pulses), room)
+        if count:
+            taken, slots, levels = pulses[:count], slots[:count], levels[:count]
+            self._sink.extend(taken, [steps[slot] for slot in slots])
+            self._verdicts.counts['accepted'] += count
+            model.accept(levels, gaps[:count])
+            self._lacking = []
+            if size == 1:
+                self._look_at_turns(levels)
+            self._recent = [*self._recent, *taken[-_AGREEING - 1:]][-_AGREEING - 1:]
+            self._note(slots, levels, taken)
+            self.slot = (slots[-1] + 1) % size
+            self.confirmed = taken[-1]
+            del self._queue[:count]
+            self._learn_marks()
+        return count
+
+    def _look_at_turns(self, levels: list[float]) -> None:
+        """Say that intervals of one mark are longer and shorter in turns."""
+        known = self._alternation.size
+        self._alternation.update(levels)
+        size = abs(self._alternation.size)
+        if not size or known or self._probe or self._model.has_tick:
+            return
+        usual = math.exp(0.5 * (self._model.level + self._model.before))
+        self._verdicts.say(
+            f'the pulse intervals are longer and shorter in turns, {usual * math.exp(size):.6g} s '
+            f'and {usual * math.exp(-size):.6g} s: are they pulses of two keyphasors of one name, '
+            'or of two marks (pulses_per_revolution)? A load that repeats every two revolutions '
+            'does the same')
+
+    def _note(self, slots: list[int], levels: list[float], times: list[float]) -> None:
+        """Note the intervals behind these slots, and when they end, for the pattern."""
+        if self._lock.steps.size > 1:
+            self.marks += slots
+            self.levels += levels
+            self.times += times
+
+    # --- doubtful pulses ---
+
+    def _rules(self) -> PathRules:
+        return PathRules(
+            self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
+            np.maximum(self._lock.believed, self._options.tolerance).tolist(),
+            self._options.maximum_missing, self._model.expected, self._model.predictions,
+            self._model.tick, self._model.told)
+
+    def _decide(self, final: bool) -> bool:
+        """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""
+        queue, model = self._queue, self._model
+        expected = math.exp(model.expected) * float(self._lock.widths[self.slot])
+        same = model.same * expected
+        if queue[0] - self.confirmed < same:
+            self._drop('doubles')
+            return True
+        if len(queue) > 1 and queue[1] - queue[0] < same:
+            first_is_nearer = expected <= 0.5 * (queue[0] + queue[1]) - self.confirmed
+            self._drop('doubles', at=int(first_is_nearer))
+            return True
+        if len(queue) == 1 and not final:
+            return False
+        if self._is_of_clock():
+            return True
+        rules = self._rules()
+        paths = [Path(0.0, self.confirmed, self.slot, recent=model.recent,
+                      using=model.chosen, slowed=model.slowed)]
+        for number, pulse in enumerate(queue[:_MOST_WAITING]):
+            paths = rules.extend(paths, pulse)
+            if (number or len(queue) == 1) and self._commit(paths, final):
+                return True
+        if len(queue) >= _MOST_WAITING:
+            self.lost = True
+            return True
+        if final:
+            self._drop('unlocked')
+        return final
+
+    def _is_of_clock(self) -> bool:
+        """Whether the ticks of a clock explain the next two intervals, which are regular then."""
+        pulses = np.array([self.confirmed, *self._queue[:2]])
+        gaps, widths, slot = np.diff(pulses), [], self.slot
+        for gap in gaps.tolist():
+            passed = self._slots_in(gap, self._model.expected, slot)
+            if not 0 < passed <= 1 + self._options.maximum_missing:
+                return False
+            slots = (slot + np.arange(passed)) % self._lock.steps.size
+            widths.append(float(self._lock.widths[slots].sum()))
+            slot = (slot + passed) % self._lock.steps.size
+        return self._model.explains(gaps, np.array(widths), float(pulses[-1]))
+
+    def _commit(self, paths: list[Path], final: bool) -> bool:
+        """Decide about the first pulses if the likely paths agree about them."""
+        near = likely(paths)
+        if self._model.hides_missing:
+            near = [path for path in near if path.steps[0].mark == 1] or near
+        best = near[0]
+        marks, first = best.marks, best.steps[0]
+        if all(path.steps[0].mark == first.mark for path in near):
+            if first.mark == 0:
+                if not (any(marks) or final):  # strays come between true pulses
+                    return False
+                self._drop_stray()
+                return True
+            if first.mark == 1 and (abs(first.off) <= self._tolerance or (
+                    self._model.unsteady and not first.jumps)):
+                self._accept(1, first.level)
+                return True
+            later = [step.level for step in best.steps[1:] if step.mark]
+            if not later and not final:
+                return False
+            self._irregular(first.mark, first.level, first.off, later[0] if later else None)
+            return True
+        count = len(marks)
+        if count < 3 or not (marks[-1] and marks[-2]):
+            return False
+        if any(path.marks[-2:] != marks[-2:] or path.slot != best.slot
+               or path.passed != best.passed for path in near):
+            return False
+        # Which of the pulses before is true makes no difference to these two.
+        skipped = sum(marks[:-1])
+        for _ in range(count - 2):
+            self._drop('early')
+        lock = self._lock
+        slots = (self.slot + np.arange(skipped)) % lock.steps.size
+        gap = self._queue[0] - self.confirmed
+        level = math.log(gap / float(lock.widths[slots].sum()))
+        self._irregular(skipped, level, 0.0, best.steps[-1].level)
+        return True
+
+    def _drop_stray(self) -> None:
+        gap = self._queue[0] - self.confirmed
+        expected = math.exp(self._model.expected) * float(self._lock.widths[self.slot])
+        self._model.refuse(gap / expected - 1.0)
+        self._drop('doubles' if gap < 0.5 * expected else 'early')
+        recent = np.diff(self._recent)
+        mean = float(recent.mean()) if recent.size == _AGREEING else np.inf
+        if (self._lock.even and mean < _FASTER * expected
+                and np.all(np.abs(np.diff(recent))
+                           < max(_AGREE, self._model.tolerance) * recent[1:])):
+            self._verdicts.counts['relearnt'] += 1
+            self.lost = True
+
+    def _accept(self, mark: int, level: float) -> None:
+        """Accept the first waiting pulse, `mark` slots after the last one."""
+        slots, steps = self._passed(mark)
+        pulse = self._next(slots, level)
+        self._model.accept([level])
+        self._lacking = []
+        self._sink.extend([pulse], [steps])
+
+    def _irregular(self, mark: int, level: float, deviation: float, after: float | None) -> None:
+        """
+        Accept the first waiting pulse, whose interval needs an explanation.
+
+        `after` is the level of the interval behind it, None if there is none.
+        """
+        model, tolerance = self._model, self._tolerance
+        slots, steps = self._passed(mark)
+        gap = self._queue[0] - self.confirmed
+        regular = abs(deviation) <= tolerance
+        known = self._is_whole(gap, slots, model.level) and (
+            after is None or self._is_whole(gap, slots, after))
+        if mark == 1 and after is not None and abs(math.expm1(level - model.level)) <= max(
+                _RAMP, self._options.tolerance):
+            low, high = sorted((model.level, after))
+            changes = low - tolerance <= level <= high + tolerance  # the speed does
+            if changes:
+                pulse = self._next(slots, level)
+                model.jump(level)
+                self._sink.extend([pulse], [steps])
+                return
+        if mark > 1 and regular:
+            kind = 'missing_bridged' if self._options.bridge else 'missing_broken'
+            self._verdicts.counts[kind] += mark - 1
+            self._verdicts.rejected += [
+                (self.confirmed + gap * number / mark, 'missing')
+                for number in range(1, min(mark, _MOST_WAITING))]
+            pulse = self._next(slots, level)
+            model.accept([level])
+            if self._lacks_alike(mark, gap):
+                self._sink.begin(pulse, 0, passed=steps)
+            elif self._options.bridge:
+                self._sink.extend([pulse], [steps])
+            else:
+                self._sink.begin(pulse, 0, passed=steps)
+            return
+        self._verdicts.reject(self._queue[0], 'late')
+        if mark == 1:
+            model.refuse(deviation)
+        if not known and mark == 1 and after is not None:
+            passed = self._slots_in(gap, model.level, self.slot)
+            if passed and passed == self._slots_in(gap, after, self.slot):
+                slots, steps = self._passed(passed)
+                known = True
+        # A step of the time may be whole by chance: uneven marks tell which of them comes next.
+        long = gap > _LONG * float(self._lock.widths.sum()) * math.exp(model.level)
+        if (not known or long) and (self._probe or not self._lock_is_plain):
+            self.lost = True
+            return
+        if after is not None and abs(after - model.level) > tolerance:
+            self._verdicts.counts['relearnt'] += 1
+            self.report_change(gap, model.level, after)
+        pulse = self._next(slots, level if len(slots) == 1 and known else math.nan)
+        if after is not None:
+            model.jump(after)
+        self._sink.begin(pulse, 0, passed=steps if known else None)
+
+    def _lacks_alike(self, mark: int, gap: float) -> bool:
+        """Take the latest interval for the usual one if many have lacked as many pulses."""
+        self._lacking = [*self._lacking, mark] if mark in self._lacking else [mark]
+        if len(self._lacking) < _LACKING:
+            return False
+        level = self._model.level
+        self.report_change(gap, level, level + math.log(mark))
+        self._verdicts.counts['relearnt'] += 1
+        self._model.jump(level + math.log(mark))
+        self._lacking = []
+        return True
+
+    def report_change(self, gap: float, before: float, after: float) -> None:
+        """Say that the interval changed across a gap (s) as no shaft changes it."""
+        old, new = math.exp(before), math.exp(after)
+        if self._probe or gap > _SHORT * max(old, new) or abs(after - before) < _CHANGED:
+            return
+        why = ('did another keyphasor take over, or the pulses of several marks become visible? '
+               'interval_tolerance 1 accepts every pulse of a machine that turns so unevenly')
+        if abs(new / old - 0.5) < _NEAR:
+            why = ('twice as many pulses come: is there a second keyphasor of the same name, or '
+                   'are both edges of a mark detected?')
+        elif abs(old / new - 0.5) < _NEAR:
+            why = 'every other pulse is missing: is the threshold of the detector too high?'
+        self._verdicts.say(
+            f'the pulse interval changes from {old:.4g} s to {new:.4g} s at {self.confirmed:.6f} '
+            f's, faster than a shaft can change its speed: {why}')
+
+    @property
+    def _tolerance(self) -> float:
+        """Largest deviation of a regular interval from the last pulse."""
+        return max(self._model.tolerance, float(self._lock.believed[self.slot]))
+
+    @property
+    def _lock_is_plain(self) -> bool:
+        """Whether all marks are alike, so that none has to be found again."""
+        lock = self._lock
+        return lock.even and bool(np.all(lock.widths == 1.0))
+
+    def _passed(self, mark: int) -> tuple[list[int], int]:
+        """Return the next `mark` slots, and the teeth that they span."""
+        slots = [(self.slot + k) % self._lock.steps.size for k in range(mark)]
+        return slots, int(self._lock.steps[slots].sum())
+
+    def _next(self, slots: list[int], level: float) -> float:
+        """Take the first pulse out of the queue as the one at the end of these slots."""
+        self._alternation = Alternation()
+        pulse = self._queue.pop(0)
+        self._remember(pulse)
+        self._verdicts.counts['accepted'] += 1
+        self.confirmed = pulse
+        if len(slots) > self._lock.steps.size:  # a gap of more than a revolution
+            self.marks, self.levels, self.times = [], [], []
+        else:
+            self._note(slots, [level if len(slots) == 1 else math.nan] * len(slots),
+                       [pulse] * len(slots))
+        self.slot = (slots[-1] + 1) % self._lock.steps.size
+        self._learn_marks()
+        return pulse
+
+    def _slots_in(self, gap: float, level: float, slot: int) -> int:
+        """Return how many slots a gap (s) from `slot` on has at a level, 0 if no whole one."""
+        widths = np.roll(self._lock.widths, -slot)
+        revolution = float(widths.sum())
+        turns, rest = divmod(gap / math.exp(level), revolution)
+        if not turns <= _LONGEST_GAP:  # nor NaN
+            return 0
+        ends = np.append(0.0, np.cumsum(widths))
+        nearest = int(np.argmin(np.abs(ends - rest)))
+        if abs(float(ends[nearest]) - rest) > _NEAR_WHOLE:
+            return 0
+        return int(turns) * widths.size + nearest
+
+    def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
+        """Whether intervals of this level make the gap (s) the whole number of teeth."""
+        width = float(self._lock.widths[slots].sum())
+        return abs(gap / math.exp(level) - width) <= _NEAR_WHOLE
+
+    @property
+    def _room_of_marks(self) -> int:
+        """Return the number of intervals until the angles between marks are learnt."""
+        size = self._lock.steps.size
+        if size == 1 or self._probe:
+            return _NEVER
+        return REVOLUTIONS * size + 1 - len(self.levels)
+
+    def _learn_marks(self) -> None:
+        """Learn the angles between the marks from the latest revolutions."""
+        lock = self._lock
+        size = lock.steps.size
+        if self._room_of_marks > 0:
+            return
+        self._lock = lock.with_pattern(
+            mark_pattern(np.array(self.marks, np.int64), np.array(self.levels), size),
+            weight=1.0 / min(2 + self._learnt, 8))
+        self._learnt += 1
+        self.marks, self.levels, self.times = [], [], []

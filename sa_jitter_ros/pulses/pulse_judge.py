@@ -1,0 +1,145 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+Judges pulses by what the shaft can do: finds a sequence, follows it, and finds it again.
+
+`pulse_start` finds the first pulses and the speed, `pulse_follower` decides which of the next ones
+are true. If nothing explains ten pulses, the match is lost and a start is looked for again.
+"""
+
+import math
+
+from sa_jitter_ros.pulses.pulse_follower import JudgeOptions, PulseFollower
+from sa_jitter_ros.pulses.pulse_start import End, new_model, PulseStart
+from sa_jitter_ros.pulses.target import Lock, Target
+from sa_jitter_ros.pulses.trigger_counter import PulseSink
+from sa_jitter_ros.pulses.verdicts import Verdicts
+
+_NEAR_WHOLE = 0.2  # intervals by which a gap may differ from a whole number of them
+_SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
+_KNOWN_WELL = 16  # intervals that tell the scatter better than the first ones behind a gap
+
+
+class PulseJudge:
+    """
+    Judge pulses in order of time and pass the valid ones on to a trigger counter.
+
+    `last` is the latest pulse (s) not dropped, `confirmed` the latest that was accepted.
+    """
+
+    def __init__(self, target: Target, counter: PulseSink, options: JudgeOptions) -> None:
+        self._target, self._counter, self._options = target, counter, options
+        self.verdicts = Verdicts()
+        self._model = new_model(target, options)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the interval and the match: the next pulses begin a new sequence."""
+        self._counter.stop(known=False)
+        self._queue: list[float] = []
+        self._start = PulseStart(self._target, self._queue, self._options, self.verdicts)
+        self._follower: PulseFollower | None = None
+        self._end: End | None = None
+        self._confirmed = -math.inf
+
+    @property
+    def confirmed(self) -> float:
+        """Time (s) of the latest pulse that was accepted."""
+        return self._confirmed if self._follower is None else self._follower.confirmed
+
+    @property
+    def last(self) -> float:
+        """Time (s) of the latest pulse that was not dropped."""
+        return self._queue[-1] if self._queue else self.confirmed
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of pulses not yet judged."""
+        return len(self._queue)
+
+    def take(self, pulses: list[float]) -> None:
+        """Take the next pulses in s, in order of time, none before the last one."""
+        least, last = self._options.minimum_interval, self.last
+        for pulse in pulses:
+            if pulse - last < least or pulse == last:
+                self.verdicts.reject(pulse, 'doubles')
+            else:
+                self._queue.append(pulse)
+                last = pulse
+        self._run(final=False)
+
+    def flush(self) -> None:
+        """Judge the pulses that wait, because none follows."""
+        self._run(final=True)
+
+    def fits(self, gap: float) -> bool:
+        """Whether a pulse at this interval (s) from the last one would be regular."""
+        return self._follower is not None and self._follower.fits(gap)
+
+    def drop_later(self, time: float, most: int) -> int:
+        """Drop the waiting pulses after a time (s) if they are `most` or fewer; their number."""
+        later = sum(pulse > time for pulse in self._queue)
+        if not 0 < later <= most:
+            return 0
+        del self._queue[-later:]
+        self._start.drop_later()
+        return later
+
+    def _run(self, *, final: bool) -> None:
+        while self._queue:
+            if self._follower is None:
+                lock = self._start.find(self._end, final=final)
+                if lock is None:
+                    return
+                self._follower = self._begun(lock)
+            self._follower.follow(final=final)
+            if not self._follower.lost:
+                return
+            self._lose(self._follower)
+
+    def _lose(self, follower: PulseFollower) -> None:
+        """Discard the trigger cycle and match the target again from the waiting pulses on."""
+        model = self._model
+        soon = model.taken < _KNOWN_WELL  # what is lost so may have other intervals
+        self._start.failed = self._start.failed + 1 if soon else 0
+        self._end = None if model.irregular else End(
+            follower.confirmed, model.level, model.scatter,
+            model.known // 2 if soon else model.known, model.unsteady)
+        self._confirmed, self._follower = follower.confirmed, None
+        self._counter.stop()
+
+    def _begun(self, lock: Lock) -> PulseFollower:
+        """Begin a sequence at the first waiting pulse."""
+        first, end, model = self._queue[0], self._end, self._model
+        passed = None
+        scatter, count = lock.scatter, lock.known
+        if end is not None:
+            gap = first - end.time
+            teeth = [gap / math.exp(level) for level in (end.level, math.log(lock.interval))]
+            number = round(teeth[0]) if math.isfinite(teeth[0]) else 0
+            if number and max(abs(item - number) for item in teeth) <= _NEAR_WHOLE:
+                passed = number
+            known_better = end.known >= max(_KNOWN_WELL, count)
+            if known_better or scatter < _SAME_SCATTER * end.scatter:
+                scatter, count = end.scatter, max(count, end.known)
+        self._counter.begin(first, int(lock.teeth[lock.slot]), passed=passed)
+        model.start(math.log(lock.interval), scatter=scatter, count=count,
+                    intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
+        follower = PulseFollower(lock, self._queue, model, options=self._options,
+                                 sink=self._counter, verdicts=self.verdicts)
+        if model.hides_missing:
+            self.verdicts.say(
+                'the speed scatters so much from one pulse to the next that a stray or a missing '
+                'one does not show: all are taken for true')
+        if end is not None:
+            follower.report_change(first - end.time, end.level, math.log(lock.interval))
+        self._end = None
+        return follower

@@ -1,0 +1,42 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""What was decided about pulses, in numbers and in words."""
+
+from collections import deque
+
+#: Latest pulses that were rejected, or are missing, of which times and reasons are kept.
+REMEMBERED = 2000
+_MESSAGES = 10  # that wait
+
+
+class Verdicts:
+    """
+    The `counts` of all kinds of pulses, the latest that were `rejected`, and `messages`.
+
+    `rejected` are pulses (s) that were not taken as they came, each with the count that it is in,
+    and where pulses are missing.
+    """
+
+    def __init__(self) -> None:
+        self.counts = dict.fromkeys(
+            ('accepted', 'doubles', 'missing_bridged', 'missing_broken', 'early', 'late',
+             'unlocked', 'relearnt'), 0)
+        self.rejected: deque[tuple[float, str]] = deque(maxlen=REMEMBERED)
+        self.messages: list[str] = []
+
+    def reject(self, pulse: float, kind: str) -> None:
+        """Count a pulse (s) that is not taken as it came."""
+        self.counts[kind] += 1
+        self.rejected.append((pulse, kind))
+
+    def say(self, message: str) -> None:
+        """Keep a message, and the latest before it."""
+        self.messages = [*self.messages, message][-_MESSAGES:]
