@@ -18,6 +18,7 @@ from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.target import EvenTarget
 from sa_jitter_ros.pulses.trigger_counter import TriggerPulses
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator
+from sa_jitter_ros.recordings import read
 
 STEADY = 5.0 + np.arange(40.0) / 30.0
 
@@ -520,3 +521,87 @@ def test_a_fan_that_coasts_down_loses_no_pulse(speed, tau):
         assert found.accepted >= count - 2 * dry
         assert found.early <= 2 * dry
         assert found.late == found.missing_broken == 0
+
+
+def uneven_encoder(rng, scatter, alike, count=800):
+    """Return the times of 16 marks whose speed scatters, each interval `alike` the one before."""
+    levels = rng.normal(0.0, 1.0, count)
+    for number in range(1, count):
+        levels[number] = (alike * levels[number - 1]
+                          + np.sqrt(1.0 - alike**2) * levels[number])
+    return 1.0 + np.cumsum(np.exp(scatter * levels)) / (16.0 * 4.0)
+
+
+@pytest.mark.parametrize('alike', [0.0, 0.5, 0.8, 0.95])
+@pytest.mark.parametrize('scatter', [0.1, 0.2, 0.3])
+def test_a_clean_encoder_on_a_machine_that_turns_unevenly_loses_next_to_nothing(scatter, alike):
+    """Intervals of a speed that scatters by 30 % change by a factor of 0.4 to 2.4."""
+    lost = 0
+    for seed in range(3):
+        pulses = uneven_encoder(np.random.default_rng(seed), scatter, alike)
+        found, *_, counts = validate(pulses, pulses_per_revolution=16)
+        assert np.isin(found, pulses).all()
+        lost += pulses.size - counts.accepted + counts.missing_broken + 16 * counts.late
+        cuts = np.sort(np.random.default_rng(seed).integers(0, pulses.size, 40))
+        parts, *_, of_parts = validate(pulses, cuts, pulses_per_revolution=16)
+        assert np.array_equal(parts, found)
+        assert of_parts == counts
+    assert lost <= 0.01 * 3 * 800
+
+
+def test_an_encoder_of_a_motor_that_turns_unevenly_loses_nothing(shared_data):
+    pulses = read(shared_data / 'encoder_motor_slow.npz', pulses_suffice=True).keyphasor_pulses()
+    validator = PulseValidator(pulses_per_revolution=16)
+    found = TriggerPulses.joined([validator.update(pulses), validator.flush()])
+    assert validator.finish() == PulseCounts(accepted=pulses.size)
+    assert np.array_equal(found.times, pulses[::16])
+    assert np.count_nonzero(found.starts_run) == 1
+    message, = validator.take_messages()
+    assert 'a stray or a missing one does not show' in message
+
+
+@pytest.mark.parametrize('jitter', [0.0, 0.01, 0.02, 0.036])
+def test_lost_pulses_beside_jitter_are_missing(jitter):
+    """Of 36 marks 3 % are lost, whose neighbours are displaced by up to a tenth of an interval."""
+    missing = lost = turns = unused = 0
+    for seed in range(6):
+        rng = np.random.default_rng([seed, 36])
+        true = 1.0 + np.arange(3600) / (36 * 25.0)
+        there = rng.random(true.size) > 0.03
+        there[[0, -1]] = True
+        pulses = (true + jitter / (36 * 25.0) * rng.normal(size=true.size))[there]
+        _, runs, _, counts = validate(pulses, pulses_per_revolution=36, missing_pulses='bridge')
+        cycles = 25.0 * np.concatenate([np.diff(run) for run in runs])
+        assert np.abs(cycles - 1.0).max() < 0.5 / 36.0
+        missing += counts.missing_bridged
+        lost += true.size - pulses.size
+        unused += pulses.size - counts.accepted + counts.late
+        turns += cycles.size
+    assert missing == pytest.approx(lost, rel=0.03)
+    assert unused <= 2e-3 * 6 * 3600
+    assert turns >= 0.97 * 6 * 99
+
+
+@pytest.mark.parametrize('share', [0.1, 0.2, 0.3])
+def test_missing_pulses_are_no_speed_that_scatters(share):
+    """Of one mark with jitter of up to 3 %, from which up to a third of the pulses is missing."""
+    wrong = found = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        marks = np.arange(600) / 30.0
+        pulses = (marks + rng.choice([1e-4, 1e-2, 3e-2]) / 30.0 * rng.normal(size=600))
+        given = pulses[rng.random(600) > share]
+        _, runs, *_ = validate(given)
+        turns = np.concatenate([np.diff(np.searchsorted(pulses, run)) for run in runs])
+        wrong += np.count_nonzero(turns != 1)
+        found += turns.size
+    assert wrong <= 0.05 * found
+
+
+def test_an_expected_interval_that_ran_away_stops_nothing():
+    """Half of the pulses are missing: an expected interval is no number then."""
+    rng = np.random.default_rng([7, 4, 50])
+    jitter = rng.choice([1e-4, 1e-3, 0.01, 0.03])
+    pulses = np.cumsum(1.0 + 0.02 * np.sin(np.arange(600) / 50)) + jitter * rng.normal(size=600)
+    validate(pulses[rng.random(600) > 0.5] / 100.0, pulses_per_revolution=4,
+             pulses_per_trigger=1)
