@@ -425,7 +425,7 @@ def table_of_parameters():
              '`<shaft>` stands for each name in `shafts`. A float parameter accepts an integer. '
              'A *fixed* parameter is read when the node starts. `ros2 param describe` prints the '
              'same. `python test/test_docs.py` writes this page. Units of channels: '
-            '[interfaces.md](interfaces.md#units-of-the-channels).',
+             '[interfaces.md](interfaces.md#units-of-the-channels).',
              '', '## Several nodes', *table('parameter', 'nodes', 'default', 'allowed', 'meaning')]
     lines += [f'| {key} | {those(nodes)} | {" | ".join(rest)} |'
               for (key, *rest), nodes in nodes_of.items()

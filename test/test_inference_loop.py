@@ -293,7 +293,7 @@ def test_declared_effect_on_the_lines_of_another_size_is_named(name, true, param
     assert content['verdict'] == 'traced'
     changed, = [item for item in content['declared_changes'] if item['parameter'] == parameter]
     assert (changed['name'], changed['declared']) == (name, wrong)
-    assert f'lacks the right numbers of {name}' in verdict_sentence(content)
+    assert f'lacks the right numbers of {name.replace("_", " ")}' in verdict_sentence(content)
     assert f'{name}: {parameter} = ' in summary(content)
     assert any(text.startswith(f'{parameter} = ') for _, text in findings(content))
     assert abs(changed['value'] - true[parameter]) < 4.0 * changed['standard_error']
@@ -444,7 +444,7 @@ def test_noise_that_hides_the_pulse_errors_is_found():
     content = report(trace([observe(recording, model)], [recording]))
     assert content['error_before']['rms'] is None
     assert 'no line is compared' in ' '.join(content['remarks'])
-    assert verdict_sentence(content).startswith('Lines and pulse times show additive_noise;')
+    assert verdict_sentence(content).startswith('Lines and pulse times show additive noise;')
     effect, = content['missing_effects']
     assert effect['name'] == 'additive_noise'
     std = effect['parameters']['std']
@@ -464,7 +464,7 @@ def test_pulse_times_alone_show_lost_pulses(rng, tmp_path):
     assert content['error_after']['rms'] is None
     assert 'missing_pulses' in summary(content)
     html = report_files(found, content)['report.html'].decode()
-    assert 'The pulse times alone show missing_pulses' in html
+    assert 'The pulse times alone show missing pulses' in html
     # noise holds no line that a drift would move
     upper = {item['name']: item['upper_95'] for item in content['limits']}
     assert upper['clock_skew'] is None

@@ -39,7 +39,7 @@ ROSDEP_KEYS = {
     'ament_copyright', 'ament_flake8', 'ament_pep257', 'diagnostic_msgs', 'python3-dev',
     'python3-hypothesis', 'python3-matplotlib', 'python3-numpy', 'python3-pytest',
     'python3-scipy', 'python3-yaml',
-    'rcl_interfaces', 'rclpy', 'sensor_msgs', 'std_msgs'}
+    'launch', 'launch_ros', 'rcl_interfaces', 'rclpy', 'sensor_msgs', 'std_msgs'}
 
 
 def setup_called(*arguments):

@@ -128,7 +128,7 @@ class PlanetaryStage:
     fixed: str
     input_shaft: str
     output_shaft: str
-    input: str | None = None
+    input: str | None = None  # noqa: A003 (the key of the machine file)
     MEMBERS: ClassVar = ('sun', 'ring', 'carrier')
     KINDS: ClassVar = {
         **dict.fromkeys(('sun', 'ring', 'planet'), _TEETH),

@@ -99,6 +99,7 @@ def require_node_name(parameter: str, name: str) -> None:
         raise ParameterError(f'{parameter} is {name!r}: give the name of a node, with or without '
                              'its namespace')
 
+
 # Parameters of rclpy, and what only some nodes use of the machine.
 _OF_OTHERS = ('qos_overrides.', 'use_sim_time', 'start_type_', 'machine.')
 
