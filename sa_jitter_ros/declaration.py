@@ -25,7 +25,7 @@ from typing import Any
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
-from sa_jitter_ros.machine import following
+from sa_jitter_ros.machine import following, PREFIX
 from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
@@ -148,7 +148,7 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         raise ModelError(str(error)) from error
     try:
         found = following(values)
-        values = {name: value for name, value in values.items() if not name.startswith('machine.')}
+        values = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
         shafts = SHAFTS.convert((found | values).get(SHAFTS.name, SHAFTS.default))
         known = {item.name: item for item in predictor_parameters(shafts, values)}
         if values and not known.keys() & (found | values).keys():
@@ -163,5 +163,5 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
         raise ModelError(f'{path}: {one_line(error)}') from error
     others = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # of the node, not of the model
     unknown = sorted(name for name in values if name not in (*known, *others)
-                     and not name.startswith(('qos_overrides.', 'machine.')))
+                     and not name.startswith('qos_overrides.'))
     return replace(declaration, unknown=tuple(unknown))

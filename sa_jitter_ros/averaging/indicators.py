@@ -79,6 +79,8 @@ INDICATORS: tuple[str, ...] = (
     'rms', 'peak', 'crest_factor', 'kurtosis', 'fm0', 'fm4', 'm6a', 'm8a', 'na4',
     'energy_ratio', 'sideband_ratio', 'sideband_level_factor', 'na4_star', 'nb4', 'm6a_star',
     'm8a_star')
+#: Those in the unit of the vibration; the others have none.
+IN_UNIT = ('rms', 'peak')
 
 # Fraction of the peak of the average, below which a value is a rounding error.
 _ROUNDING = 1e-13

@@ -33,7 +33,7 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
-from sa_jitter_ros.machine import machine_of, UNKNOWN
+from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.parameter_file import read_parameters
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
                      **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
-    machine = UNKNOWN if options.params is None else machine_of(
+    machine = UNKNOWN if options.params is None else Machine.among(
         read_parameters(options.params, NODE))
     return check_keyphasor(recording, teeth=options.teeth, machine=machine,
                            progress=progress), recording

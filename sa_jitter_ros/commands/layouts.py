@@ -61,7 +61,7 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class Machine:
+class Shown:
     """What is shown: shafts with their orders, channels, units, and the nodes that run."""
 
     prefix: str  # namespace with a stroke at its end
@@ -71,7 +71,7 @@ class Machine:
     nodes: tuple[str, ...]
 
     @classmethod
-    def read(cls, params: Path, namespace: str = '') -> 'Machine':
+    def read(cls, params: Path, namespace: str = '') -> 'Shown':
         """Read a machine file; raises SaJitterError."""
         values = MachineFile.read(params).averager
         models = (read_declaration(params).models
@@ -139,7 +139,7 @@ class Machine:
         return {'Speed of the tach shaft': [Curve(f'{self.prefix}shaft_speed', None, 'Hz')]}
 
 
-def plotjuggler(machine: Machine) -> str:
+def plotjuggler(machine: Shown) -> str:
     """Return the layout of PlotJuggler: for each shaft a tab of plots under the speed."""
     root = ET.Element('root')
     tabs = ET.SubElement(root, 'tabbed_widget', {
@@ -177,7 +177,7 @@ def _splitter(parent: ET.Element, orientation: str, count: int) -> ET.Element:
                          sizes=';'.join([f'{1 / count:.6f}'] * count))
 
 
-def foxglove(machine: Machine) -> str:
+def foxglove(machine: Shown) -> str:
     """Return the layout of Foxglove: plots on the left, waveforms and texts on the right."""
     panels: dict[str, dict[str, object]] = {}
 
@@ -224,7 +224,7 @@ def _column(names: Sequence[str]) -> object:
             'splitPercentage': 100 / len(names)}
 
 
-def aggregator(machine: Machine) -> str:
+def aggregator(machine: Shown) -> str:
     """Return the configuration of diagnostic_aggregator: a group for each part that runs."""
     lines = [
         '# One light for the whole chain, and one for each of its parts. Start with',
@@ -268,7 +268,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Write the files; return the exit status."""
     options = make_parser().parse_args(args)
     try:
-        machine = Machine.read(options.params, options.namespace)
+        machine = Shown.read(options.params, options.namespace)
         require_writable(options.output)
         options.output.mkdir(parents=True, exist_ok=True)
         for name, make in ((PLOTJUGGLER, plotjuggler), (FOXGLOVE, foxglove),

@@ -21,7 +21,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from sa_jitter_ros.effects import Effect, EFFECTS
-from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, Finding, ONE_SIDED
+from sa_jitter_ros.effects.effect import (
+    absent, departs, DirectEffect, effects_of, Finding, ONE_SIDED)
 from sa_jitter_ros.inference.residual import ACCURACY, ACCURACY_OF_CHANGE
 from sa_jitter_ros.inference.scoring import Bench
 from scipy import special
@@ -44,7 +45,7 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
 
     A declared one is a candidate where its numbers are others than the declared.
     """
-    effects = [item.effect for item in chosen if item.effect is not None]
+    effects = effects_of(chosen)
     declared = {item.name: item for item in bench.declared}
     shared, found = bench.gather(effects, bench.fit), []
     for name, kind in EFFECTS.items():

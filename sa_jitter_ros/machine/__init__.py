@@ -14,7 +14,7 @@ The machine by its parts: ratios and orders from numbers of teeth and geometry o
 `Machine` is read from the machine file, `following` gives the parameters that follow from it.
 """
 
-from sa_jitter_ros.machine.following import following, machine_of, PREFIX
-from sa_jitter_ros.machine.train import Machine, UNKNOWN
+from sa_jitter_ros.machine.following import following
+from sa_jitter_ros.machine.train import Machine, PREFIX, UNKNOWN
 
-__all__ = ['PREFIX', 'UNKNOWN', 'Machine', 'following', 'machine_of']
+__all__ = ['PREFIX', 'UNKNOWN', 'Machine', 'following']

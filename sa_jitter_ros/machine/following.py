@@ -16,14 +16,6 @@ from typing import Any
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine.train import Machine
 
-PREFIX = 'machine.'
-
-
-def machine_of(given: Mapping[str, Any]) -> Machine:
-    """Return the machine among given parameters, one without parts where there is none."""
-    return Machine.of({name.removeprefix(PREFIX): value for name, value in given.items()
-                       if name.startswith(PREFIX)})
-
 
 def following(given: Mapping[str, Any]) -> dict[str, Any]:
     """
@@ -40,7 +32,7 @@ def following(given: Mapping[str, Any]) -> dict[str, Any]:
     >>> found['input.ratio'], found['input.mesh_orders']
     (2.5, [20.0])
     """
-    machine = machine_of(given)
+    machine = Machine.among(given)
     if not machine.shafts:
         return {}
     shafts = given.get('shafts') or list(machine.shafts)

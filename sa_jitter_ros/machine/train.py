@@ -22,6 +22,8 @@ from sa_jitter_ros.machine.parts import Bearing, GearPair, PlanetaryStage
 from sa_jitter_ros.parameter_file import flattened, read_parameters
 from sa_jitter_ros.parameters import require_shaft_names
 
+#: What the names of all parameters of a machine begin with.
+PREFIX = 'machine.'
 _KINDS: dict[str, Any] = {'gears': GearPair, 'planetary': PlanetaryStage, 'bearings': Bearing}
 _OTHERS = ('channels', 'limits')  # of a machine, read elsewhere
 _SAME = 1e-5  # by which an order may differ from that of a part, relative
@@ -95,15 +97,24 @@ class Machine:
         return cls(tach_shaft, **found)
 
     @classmethod
+    def among(cls, given: Mapping[str, Any]) -> 'Machine':
+        """
+        Return the machine among parameters by their full names, without parts where there is none.
+
+        Raises ParameterError, in one line.
+        """
+        return cls.of({name.removeprefix(PREFIX): value for name, value in given.items()
+                       if name.startswith(PREFIX)})
+
+    @classmethod
     def read(cls, path: str | Path) -> 'Machine':
         """Read the section `machine` of a machine file; raises ParameterError, in one line."""
-        values = {name.removeprefix('machine.'): value for name, value in read_parameters(
-            Path(path), 'machine').items() if name.startswith('machine.')}
-        if not values:
+        values = read_parameters(Path(path), 'machine')
+        if not any(name.startswith(PREFIX) for name in values):
             raise ParameterError(f'{path}: no machine: give it under "/**:", "ros__parameters:", '
                                  '"machine:"')
         try:
-            return cls.of(values)
+            return cls.among(values)
         except ParameterError as error:
             raise ParameterError(f'{path}: {error}') from None
 

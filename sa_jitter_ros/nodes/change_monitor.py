@@ -21,7 +21,7 @@ from urllib.parse import quote
 
 from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import ParameterError, RecordingError
-from sa_jitter_ros.machine import machine_of
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -88,7 +88,7 @@ class ChangeMonitor(MonitoringNode):
         try:
             self._monitor = MachineMonitor(
                 values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
-                parts=machine_of(self.parameters.given_values), anew=anew)
+                parts=Machine.among(self.parameters.given_values), anew=anew)
             self._was_complete = self._monitor.is_complete
         except RecordingError as error:
             reason = str(error)

@@ -30,7 +30,7 @@ from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescr
 from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.machine import following
+from sa_jitter_ros.machine import following, PREFIX
 from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
@@ -101,7 +101,7 @@ def require_node_name(parameter: str, name: str) -> None:
 
 
 # Parameters of rclpy, and what only some nodes use of the machine.
-_OF_OTHERS = ('qos_overrides.', 'use_sim_time', 'start_type_', 'machine.')
+_OF_OTHERS = ('qos_overrides.', 'use_sim_time', 'start_type_', PREFIX)
 
 
 class ParameterSet:
@@ -129,8 +129,7 @@ class ParameterSet:
 
     def declare_channels(self) -> Channels:
         """Declare what the machine file says of the channels, and return it."""
-        given = {name: self._node._parameter_overrides[name].value
-                 for name in self._node._parameter_overrides if name in self.given}
+        given = self.given_values
         self.declare(channel_parameters(given))
         return channels_of(given)
 

@@ -16,6 +16,7 @@ import math
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from numpy.typing import NDArray
+from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
 from sa_jitter_ros.number_text import measured_text, order_text
@@ -26,7 +27,6 @@ FloatArray = NDArray[np.float64]
 
 _ORDERS = 10  # the strongest ones
 _HALF = 1.96  # of a 95 % interval, standard errors
-_OF_UNIT = ('rms', 'peak')  # indicators in the unit of the channel
 
 
 def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: ChannelScale,
@@ -69,7 +69,7 @@ def _indicators(results: Mapping[str, AverageMessage], channel: int, unit: str) 
     found, errors = (results.get(f'condition_indicator{end}') for end in ('', '_error'))
     if found is None or errors is None:
         return {}
-    return {name: _interval(value, error, unit if name in _OF_UNIT else '')
+    return {name: _interval(value, error, unit if name in IN_UNIT else '')
             for name, value, error in zip(found.names, found.values[channel],
                                           errors.values[channel]) if math.isfinite(value)}
 

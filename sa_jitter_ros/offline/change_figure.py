@@ -13,6 +13,7 @@
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.offline.changes import Changes, Key, key_of
 from sa_jitter_ros.offline.plotting import Array, legend_under, MARK, MEASURED
 
@@ -91,6 +92,6 @@ def _draw(axes: Axes, changes: Changes, key: Key) -> None:
     units = changes.recordings[0].units
     known = f' [{units[channel] or "unit unknown"}]' if channel < len(units) else ''
     quantity = {'order': f'amplitude{known}', 'bearing': 'depth of\nmodulation'}.get(
-        kind, f'{name}{known}' if name in ('rms', 'peak') else name.replace('_', ' '))
+        kind, f'{name}{known}' if name in IN_UNIT else name.replace('_', ' '))
     axes.set_ylabel(quantity, fontsize='small')
     axes.margins(x=0.01)

@@ -22,7 +22,7 @@ from sa_jitter_ros.averaging.averager import Averager
 from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
 from sa_jitter_ros.errors import ParameterError, RecordingError
-from sa_jitter_ros.machine import following, Machine, machine_of, PREFIX
+from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
@@ -63,7 +63,7 @@ class MachineFile:
     @property
     def machine(self) -> Machine:
         """Return the machine by its parts, one without parts where none are given."""
-        return machine_of(self.parts)
+        return Machine.among(self.parts)
 
     @classmethod
     def read(cls, params: Path | None, given: Collection[str] = ()) -> 'MachineFile':
@@ -95,7 +95,7 @@ class MachineFile:
             raise ParameterError(f'{AVERAGER} has no parameter {", ".join(wrong)}: give some of '
                                  f'{", ".join(sorted(known))}')
         unknown = sorted(name for name in values if name not in (*known, *_OF_NODE)
-                         and not name.startswith(('qos_overrides.', 'machine.')))
+                         and not name.startswith('qos_overrides.'))
         if params is not None and not known.keys() & (values.keys() - overrides.keys()):
             raise ParameterError(f'{params}: no parameter of {AVERAGER}: give a file with its '
                                  f'section, "/**/{AVERAGER}:" and "ros__parameters:"')

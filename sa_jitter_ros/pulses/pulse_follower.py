@@ -41,7 +41,6 @@ from sa_jitter_ros.pulses.trigger_counter import PulseSink
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
 _MOST_WAITING = 10  # doubtful pulses, until the match is lost
-_NEAR_WHOLE = 0.2  # intervals by which a gap may differ from a whole number of them
 _RAMP = 0.25  # largest change of an interval that is a change of speed
 _AGREEING = 5  # equal intervals that show another pulse rate
 _AGREE, _FASTER = 0.03, 0.75
@@ -54,6 +53,8 @@ _FITS = 0.1  # tolerance with which a pulse after a step of time fits
 _SHORT, _CHANGED, _NEAR = 5.0, 0.3, 0.03
 #: revolutions from which the angles between the marks are learnt
 REVOLUTIONS = 5
+#: intervals by which a gap may differ from a whole number of them
+NEAR_WHOLE = 0.2
 _NEVER = 1 << 62
 
 
@@ -416,14 +417,14 @@ class PulseFollower:
             return 0
         ends = np.append(0.0, np.cumsum(widths))
         nearest = int(np.argmin(np.abs(ends - rest)))
-        if abs(float(ends[nearest]) - rest) > _NEAR_WHOLE:
+        if abs(float(ends[nearest]) - rest) > NEAR_WHOLE:
             return 0
         return int(turns) * widths.size + nearest
 
     def _is_whole(self, gap: float, slots: list[int], level: float) -> bool:
         """Whether intervals of this level make the gap (s) the whole number of teeth."""
         width = float(self._lock.widths[slots].sum())
-        return abs(gap / math.exp(level) - width) <= _NEAR_WHOLE
+        return abs(gap / math.exp(level) - width) <= NEAR_WHOLE
 
     @property
     def _room_of_marks(self) -> int:

@@ -17,13 +17,12 @@ are true. If nothing explains ten pulses, the match is lost and a start is looke
 
 import math
 
-from sa_jitter_ros.pulses.pulse_follower import JudgeOptions, PulseFollower
+from sa_jitter_ros.pulses.pulse_follower import JudgeOptions, NEAR_WHOLE, PulseFollower
 from sa_jitter_ros.pulses.pulse_start import End, new_model, PulseStart
 from sa_jitter_ros.pulses.target import Lock, Target
 from sa_jitter_ros.pulses.trigger_counter import PulseSink
 from sa_jitter_ros.pulses.verdicts import Verdicts
 
-_NEAR_WHOLE = 0.2  # intervals by which a gap may differ from a whole number of them
 _SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
 _KNOWN_WELL = 16  # intervals that tell the scatter better than the first ones behind a gap
 
@@ -125,7 +124,7 @@ class PulseJudge:
             gap = first - end.time
             teeth = [gap / math.exp(level) for level in (end.level, math.log(lock.interval))]
             number = round(teeth[0]) if math.isfinite(teeth[0]) else 0
-            if number and max(abs(item - number) for item in teeth) <= _NEAR_WHOLE:
+            if number and max(abs(item - number) for item in teeth) <= NEAR_WHOLE:
                 passed = number
             known_better = end.known >= max(_KNOWN_WELL, count)
             if known_better or scatter < _SAME_SCATTER * end.scatter:

@@ -20,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.effects.effect import Effect
+from sa_jitter_ros.effects.effect import Effect, effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
@@ -99,7 +99,7 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
 
 
 def _effects(trace: Trace) -> tuple[Effect, ...]:
-    return tuple(item.effect for item in trace.findings if item.effect is not None)
+    return tuple(effects_of(trace.findings))
 
 
 def _versions(trace: Trace) -> list[tuple[str, str, Expectation, Residual]]:
