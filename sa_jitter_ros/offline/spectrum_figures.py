@@ -118,7 +118,7 @@ def _draw_spectrum(axes: Axes, signals: Signals, series: ShaftSeries, amplitude:
     axes.plot(whole, np.maximum(amplitude[whole], floor), 'v', color='tab:green', markersize=4.0,
               label=f'tracked orders, {corrected}', linestyle='none')
     axes.set_yscale('log')
-    axes.margins(x=0.01, y=0.25)
+    axes.margins(x=0.01, y=0.45)  # room for the names above the lines
     axes.set_ylim(bottom=floor)
 
 
