@@ -89,7 +89,8 @@ NODES = {
 
 
 @pytest.mark.parametrize('name', NODES)
-def test_any_parameters_are_refused_or_used(ros_graph, recording, name):
+def test_any_parameters_are_refused_or_used(ros_graph, recording, name, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)  # of files with a random relative name
     node_class, needed = NODES[name]
     if name == 'player':
         needed = {**needed, 'recording': recording}
