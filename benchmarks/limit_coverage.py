@@ -33,7 +33,7 @@ from sa_jitter_ros.effects.timing import Setting, SOURCE
 from sa_jitter_ros.inference.limits import Limit, limits
 from sa_jitter_ros.inference.timing import read_timing
 from sa_jitter_ros.inference.timing_data import steering, Stretch
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from scipy import special
 from scipy.signal import lfilter
@@ -153,7 +153,7 @@ def lines(seed: int | Sequence[int], *, std: float = 0.0, gain: float = 0.0, los
         np.arange(float(_LINES)), none, none, density,
         modulation + rng.standard_normal(shape), np.ones(_LINES))
     return Evidence(
-        replace(MODEL, noise_std=1.0, sample_rate=20e3), (Pulses(none),), none, none, none,
+        replace(MODEL, noise_std=1.0, sample_rate=20e3), (AveragePulses(none),), none, none, none,
         none, rng.geometric(1.0 - lost, _COUNT) - 1, Clock(0.0, 0.0), evidence)
 
 

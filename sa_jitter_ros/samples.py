@@ -35,16 +35,16 @@ def finite_spans(samples: NDArray[np.float64]) -> list[tuple[int, int]]:
             for begin, end in np.flatnonzero(np.diff(finite)).reshape(-1, 2)]
 
 
-def unresolved(time: float, sample_rate: float) -> str:
+def unresolved_times(time: float, sample_rate: float) -> str:
     """
     Say why a float64 cannot hold the times around `time` (s) of samples at a rate (Hz), or ''.
 
     It must resolve a thousandth of a sample. Times since 1970 are admitted at every rate: they are
     rounded to 0.24 us.
 
-    >>> unresolved(1.8e9, 1e5)
+    >>> unresolved_times(1.8e9, 1e5)
     ''
-    >>> unresolved(1e12, 1e4).partition(':')[0]
+    >>> unresolved_times(1e12, 1e4).partition(':')[0]
     'time 1e+12 s is so large that a float64 rounds it to 1.2 samples'
     """
     step = math.ulp(time) * sample_rate

@@ -11,7 +11,9 @@
 """The rules of the rooms: which module may import what."""
 
 import ast
+from collections import defaultdict
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -68,6 +70,8 @@ ROOMS = {
     'nodes': {'pytest'} | SCIENCE | CORE.keys(),
     'commands': {'matplotlib', 'nodes'} | SCIENCE | CORE.keys(),
 }
+#: What people look at; the others average, predict and infer, and know nothing of it.
+TOOLS = {'report', 'loop', 'offline', 'commands', 'nodes'}
 ROS = {'ament_index_python', 'builtin_interfaces', 'rcl_interfaces', 'rclpy'}
 ROS_USERS = ('nodes', 'commands.demo')  # the demo starts nodes
 INFERENCE_USERS = ('', 'inference', 'report', 'loop', 'nodes.residual_analyser')
@@ -155,6 +159,30 @@ def test_module_imports_what_its_room_allows(path):
     assert 'pytest' not in needed or name == 'nodes.testing'
     if not is_one_of(name, INFERENCE_USERS):
         assert not needed & {'inference', 'report'}
+
+
+def test_what_people_look_at_is_apart_from_the_core():
+    """The library's own door, which loads `loop` when it is used, stands above both."""
+    for room in ROOMS.keys() - TOOLS - {''}:
+        assert not ROOMS[room] & TOOLS, room
+
+
+def test_rooms_use_public_names_of_one_another():
+    for path in MODULES:
+        for name in imports(path):
+            room, _, inside = name.removeprefix('sa_jitter_ros.').partition('.')
+            if name.startswith('sa_jitter_ros.') and room != room_of(path):
+                assert not re.search(r'\b_(?!_version)', inside), f'{path}: {name}'
+
+
+def test_no_two_classes_have_one_name():
+    """A simulated effect has the name of the effect, beside which it stands in the docs."""
+    homes = defaultdict(list)
+    for path in MODULES:
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+            if isinstance(node, ast.ClassDef) and room_of(path) != 'simulation':
+                homes[node.name].append(name_of(path))
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}
 
 
 def test_no_circle_of_imports():

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.averager_parameters import PARAMETERS, shaft_parameters
-from sa_jitter_ros.pulses.resampling import gain, METHODS
+from sa_jitter_ros.pulses.resampling import interpolator_gain, METHODS
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATE, SPEED = 2000.0, 25.0
@@ -275,7 +275,7 @@ def test_amplitudes_are_over_the_gain_of_the_interpolator_as_far_as_half_is_left
     rate, speed = 4000.0, 24.2
     time, pulses = np.arange(12_000) / rate, 0.031 + np.arange(60) / speed
     orders = np.round(np.array([0.1, 0.3, 0.376, 0.43, 0.45, 0.49, 0.499]) * rate / speed)
-    expected = np.where(gain(method, orders * speed / rate) >= 0.5, 0.4, np.nan)
+    expected = np.where(interpolator_gain(method, orders * speed / rate) >= 0.5, 0.4, np.nan)
     with warnings.catch_warnings():
         warnings.simplefilter('ignore', sa.DataWarning)
         for order, amplitude in zip(orders, expected):
@@ -313,7 +313,7 @@ def test_correction_and_attenuation_near_the_end_of_the_band():
     average, = sa.average(vibration, rate, late, orders=[20.0, order], correct_jitter=True,
                           keyphasor_rate=4e3)
     found = average.correction
-    assert average.gain[1] == pytest.approx(gain('band_limited', 0.375), abs=1e-4)
+    assert average.gain[1] == pytest.approx(interpolator_gain('band_limited', 0.375), abs=1e-4)
     for off in (abs(found.amplitudes[0]) - [1.0, 0.4]) / found.amplitude_errors.amplitude[0]:
         assert abs(off) < 4.0
     assert found.amplitude_errors.amplitude[0, 1] < 1e-3

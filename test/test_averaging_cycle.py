@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.average import AverageSettings
-from sa_jitter_ros.averaging.cycle import CycleSamples, joined, on_grid
+from sa_jitter_ros.averaging.cycle import CycleSamples, has_same_angles, joined_cycles
 from sa_jitter_ros.averaging.shaft import average_cycles
 
 RATE, SPEED, CYCLES, START = 10e3, 10.0, 36, 0.0123
@@ -47,7 +47,7 @@ def test_amplitudes_of_a_cycle_are_integrals_over_it(ratio, tone):
                            count=CYCLES)
     average = average_cycles([run], AverageSettings(
         cycle_length=ratio, trigger_cycles=CYCLES, orders=orders))
-    assert not on_grid(average.angle.size, ratio)
+    assert not has_same_angles(average.angle.size, ratio)
     for amplitudes, order in zip(average.cycle_amplitudes[:, 0].T, orders):
         # The gain of the interpolator is 1 to 0.001 dB.
         np.testing.assert_allclose(amplitudes, integrals(order, tone, ratio), atol=1.2e-4)
@@ -63,7 +63,7 @@ def test_cycles_are_joined_to_the_samples_that_they_were_cut_from(layout, rng):
             for k in range(3)]
     if layout == 'copies':
         runs = [replace(run, samples=run.samples.copy()) for run in runs]
-    run, = joined(runs)
+    run, = joined_cycles(runs)
     np.testing.assert_array_equal(run.samples, samples[41:361])
     assert np.shares_memory(run.samples, samples) == (layout != 'copies')
     assert run.count == 3

@@ -26,7 +26,7 @@ from sa_jitter_ros.averaging.shaft import average_cycles, ShaftAverager
 from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.resampling import gain
+from sa_jitter_ros.pulses.resampling import interpolator_gain
 from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.samples import SampleBlock
 
@@ -174,7 +174,7 @@ def test_gain_through_the_averager_is_that_of_the_interpolator(method):
             averager(validator=PulseValidator(pulses_per_revolution=1, pulses_per_trigger=teeth),
                      shaft={'cycle_length': ratio * teeth, 'orders': orders, 'trigger_cycles': 40,
                             'interpolation': method}), machine, seconds=4.0)
-        expected = gain(method, np.array(orders) * speed / rate)
+        expected = interpolator_gain(method, np.array(orders) * speed / rate)
         np.testing.assert_allclose(np.abs(average.amplitudes[0]), 1.0, atol=2e-3)
         np.testing.assert_allclose(average.gain, expected, atol=1e-5)
         if method == 'band_limited':

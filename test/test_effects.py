@@ -21,7 +21,7 @@ from sa_jitter_ros.effects import (
 from sa_jitter_ros.effects.effect import departs
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
 from sa_jitter_ros.errors import ModelError, ParameterError
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.signal import lfilter
@@ -223,13 +223,13 @@ def test_geometry_repeats_with_the_pulse_index(rng):
     effect = make_effect('target_geometry', pulse_angles=angles)
     check(predict(MODEL, [effect]),
           average_of(declared_errors(rng, 20_000) + pattern[index % 3]))
-    pulses = Pulses(np.arange(21.0) / 25.0, first=4)
+    pulses = AveragePulses(np.arange(21.0) / 25.0, first=4)
     assert effect.pattern(MODEL, pulses) == pytest.approx(pattern[(4 + np.arange(21)) % 3])
 
 
 def test_geometry_counts_missing_pulses():
     effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0))
-    pulses = Pulses(np.arange(4.0), first=1, missing=np.array([0, 1, 0]))
+    pulses = AveragePulses(np.arange(4.0), first=1, missing=np.array([0, 1, 0]))
     assert pulses.index.tolist() == [1, 2, 4, 5]
     model = DeclaredModel(**{**vars(MODEL), 'trigger_cycles': 3})
     late = effect.pattern(model, pulses) * 2.0 * np.pi * 25.0
@@ -239,7 +239,7 @@ def test_geometry_counts_missing_pulses():
 @pytest.mark.parametrize(('before', 'after'), [(2, 1), (0, 0)])
 def test_pulses_without_those_beside_are_the_same_pulses(before, after):
     missing = np.array([0, 1, 0, 2, 0, 0, 0, 0, 1])
-    pulses = Pulses(0.04 * np.arange(10.0), 3, np.arange(10.0), missing)
+    pulses = AveragePulses(0.04 * np.arange(10.0), 3, np.arange(10.0), missing)
     kept = pulses.without(before, after)
     kept_pulses = slice(before, 10 - after)
     for name in ('times', 'errors', 'index'):
@@ -250,7 +250,7 @@ def test_pulses_without_those_beside_are_the_same_pulses(before, after):
 def test_geometry_counts_pulses_and_not_triggers():
     model = DeclaredModel(**{**vars(MODEL), 'pulses_per_revolution': 6, 'pulses_per_trigger': 2})
     effect = make_effect('target_geometry', pulse_angles=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0))
-    late = effect.pattern(model, Pulses(np.arange(21.0), first=1)) * 2.0 * np.pi * 25.0
+    late = effect.pattern(model, AveragePulses(np.arange(21.0), first=1)) * 2.0 * np.pi * 25.0
     assert late[:4] == pytest.approx([2.0, 4.0, 0.0, 2.0])
 
 
@@ -273,7 +273,7 @@ def test_delay_that_a_skew_has_made_turns_an_average_as_the_speed_changes():
     speed = 25.0 / (1.0 - 4e-4 * (index[first:] - first))
     angle = late * speed / speed.mean()  # in s at the mean speed
     found = make_effect('clock_skew', skew=skew).pattern(
-        MODEL, Pulses(times[first:] + late, first=first))
+        MODEL, AveragePulses(times[first:] + late, first=first))
     assert np.std(late * (speed / speed.mean() - 1.0)) > 0.3 * np.std(late)
     np.testing.assert_allclose(found - found.mean(), angle - angle.mean(),
                                atol=0.02 * np.std(angle))
@@ -287,7 +287,7 @@ def test_marks_are_counted_from_the_one_that_a_recording_begins_with(rng):
     jitter = 2e-5 * rng.standard_normal(index.shape)
     jitter[2, 5] = np.nan
     for item in (target, other):
-        errors = jitter + item.pattern(model, Pulses(np.zeros(121)))[index]
+        errors = jitter + item.pattern(model, AveragePulses(np.zeros(121)))[index]
         errors -= np.nanmean(errors, axis=1, keepdims=True)
         assert target.counted_anew(model, index, errors) == item
     assert target.counted_anew(model, index, 100.0 * jitter) == target  # nothing shows

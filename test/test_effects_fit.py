@@ -22,7 +22,7 @@ from sa_jitter_ros.effects.common_gain import fit_common_gain
 from sa_jitter_ros.effects.effect import beyond_chance, ODDS
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, root
 from sa_jitter_ros.effects.lattice import Clock, find_clock
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from scipy.linalg import toeplitz
@@ -60,7 +60,7 @@ def evidence_of(rng, errors, *, moving=None, ripple=None, noise_density=None, ra
         noise_density=np.zeros((count, 4)) if noise_density is None else noise_density,
         radial=radial, radial_noise=np.full(4, 0.01))
     return Evidence(
-        model=MODEL, pulses=tuple(Pulses(row, a * (pulses - 1), row * 0.0)
+        model=MODEL, pulses=tuple(AveragePulses(row, a * (pulses - 1), row * 0.0)
                                   for a, row in enumerate(times)),
         errors=seen - seen.mean(axis=1, keepdims=True),
         standard_errors=np.full(errors.shape, NOISE),

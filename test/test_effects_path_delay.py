@@ -17,7 +17,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.prediction.amplitudes import component_gain, known_amplitudes
-from sa_jitter_ros.prediction.influence import Pulses, random_processes
+from sa_jitter_ros.prediction.influence import AveragePulses, random_processes
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.simulation import Component, DeclaredJitter, Gearbox, PathDelay
 
@@ -38,8 +38,9 @@ def averages(*effects, seed=1, speed=((0.0, 20.0), (20.0, 30.0))):
 def predicted(average, jitter=()):
     """Return what is predicted of an average whose pulses were measured."""
     model = replace(MODEL, trigger_speed=average.trigger_speed)
-    return known_amplitudes(model, jitter, EFFECT.pattern(model, Pulses(average.pulses))[None],
-                            gain=component_gain(model, [EFFECT]))
+    return known_amplitudes(
+        model, jitter, EFFECT.pattern(model, AveragePulses(average.pulses))[None],
+        gain=component_gain(model, [EFFECT]))
 
 
 def test_delay_turns_with_the_speed_and_attenuates_where_it_changes():
@@ -80,14 +81,14 @@ def test_delay_and_jitter_have_the_predicted_mean_and_scatter():
 
 def test_unknown_times_leave_the_known_ones_their_errors():
     times = np.cumsum(np.linspace(0.05, 0.04, 20))
-    whole = EFFECT.pattern(MODEL, Pulses(times))
+    whole = EFFECT.pattern(MODEL, AveragePulses(times))
     holes = times.copy()
     holes[[0, 7, 19]] = np.nan
-    found = EFFECT.pattern(MODEL, Pulses(holes))
+    found = EFFECT.pattern(MODEL, AveragePulses(holes))
     assert np.all(np.isfinite(found))
     np.testing.assert_allclose(np.diff(found)[2:17], np.diff(whole)[2:17], atol=0.05 * DELAY)
-    assert EFFECT.pattern(MODEL, Pulses(np.full(20, np.nan))) is None
+    assert EFFECT.pattern(MODEL, AveragePulses(np.full(20, np.nan))) is None
     missing = np.zeros(17, int)
     missing[8] = 2
-    gap = EFFECT.pattern(MODEL, Pulses(np.delete(times, [9, 10]), missing=missing))
+    gap = EFFECT.pattern(MODEL, AveragePulses(np.delete(times, [9, 10]), missing=missing))
     np.testing.assert_allclose(gap, np.delete(whole, [9, 10]), atol=0.01 * DELAY)

@@ -18,7 +18,7 @@ from decisions import stored
 import numpy as np
 import pytest
 from sa_jitter_ros.averaging.noise import noise_floor
-from sa_jitter_ros.effects.lattice import on_grid, placed_on_grid, ticks_leave_room
+from sa_jitter_ros.effects.lattice import placed_on_grid, ticks_leave_room, within_half_tick
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.record_pulses import record_pulses
@@ -144,7 +144,7 @@ def test_errors_within_ticks_are_separated_from_larger_ones(rng):
     assert beyond < 0.02 / clock
     assert np.abs(placed).max() < 0.54 / clock
     slipped = recovered[0] + np.where(np.arange(21) == 7, 2.0 / clock, 0.0)
-    assert np.abs(on_grid(slipped, clock)).max() < 0.75 / clock
+    assert np.abs(within_half_tick(slipped, clock)).max() < 0.75 / clock
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.inference.expectation import _leakage, expect, Lines, RESOLUTION
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_pulses import RecordPulses
-from sa_jitter_ros.prediction.influence import Influence, Pulses, random_processes
+from sa_jitter_ros.prediction.influence import AveragePulses, Influence, random_processes
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import angle_law
@@ -96,7 +96,7 @@ def test_loop_scores_with_the_published_distribution(name, cycles, law):
     effects = [make_effect(key, **values) for key, values in EFFECTS[name].items()]
     count = cycles + 1 + model.weights.before + model.weights.after
     found = expected(model, [Unknown(effect) for effect in effects],
-                     [Pulses(np.full(count, np.nan))])
+                     [AveragePulses(np.full(count, np.nan))])
     published = predict(model, [*effects, Resolution()])
     np.testing.assert_allclose(found.amplitude[0], published.mean_attenuation, rtol=1e-6)
     np.testing.assert_allclose(found.amplitude_variance[0], published.variance, rtol=1e-5)
@@ -126,7 +126,7 @@ def test_known_pulses_give_the_distribution_of_their_own_average(cycles, bias, o
         for k in range(1, cycles + 1):
             steps[:, k] += 0.99 * steps[:, k - 1]
         errors = errors + 2e-4 * steps
-    pulses = [Pulses(np.full(cycles + 1, np.nan), first=first) for first in (1, 2)]
+    pulses = [AveragePulses(np.full(cycles + 1, np.nan), first=first) for first in (1, 2)]
     found = expected(model, effects, pulses)
     noise = np.sqrt(2.0) * np.sqrt(found.noise[0, 0] / 4.0) * (
         rng.standard_normal(draws) + 1j * rng.standard_normal(draws))
@@ -161,7 +161,7 @@ def test_orders_beside_leak_as_late_as_the_corrected_pulses_are(rng):
     seen = np.abs(signal.whole_trigger_cycles(
         (errors - errors.mean())[None] * model.fundamental_frequency))
     for delay in (0.0, 0.02):
-        pulses = [[Pulses(np.full(cycles + 1, np.nan), errors=errors + delay)]]
+        pulses = [[AveragePulses(np.full(cycles + 1, np.nan), errors=errors + delay)]]
         found = expect(observation, Lines(np.zeros(1, int), np.zeros(1, int)), np.ones(1),
                        [clock], pulses, np.zeros(1, int), [0])
         assert found.attenuation[0, 0] == pytest.approx(seen[0], abs=2e-3)  # mirror image
@@ -186,8 +186,9 @@ def test_orders_beside_scatter_by_jitter_too(correlated, rng):
         for k in range(1, cycles + 1):
             steps[:, k] += 0.5 * steps[:, k - 1]
         errors = errors + 1.5e-4 * steps
-    found = expect(observation, Lines(np.zeros(1, int), np.zeros(1, int)), np.ones(1), effects,
-                   [[Pulses(np.full(cycles + 1, np.nan))]], np.zeros(1, int), [0])
+    found = expect(
+        observation, Lines(np.zeros(1, int), np.zeros(1, int)), np.ones(1), effects,
+        [[AveragePulses(np.full(cycles + 1, np.nan))]], np.zeros(1, int), [0])
     errors = errors * model.fundamental_frequency
     powers = []
     for phase in rng.uniform(0.0, 2.0 * np.pi, (12, 2)):

@@ -20,7 +20,7 @@ import sa_jitter_ros as sa
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.effects.effect import Finding
 from sa_jitter_ros.inference.expectation import Lines
-from sa_jitter_ros.inference.gate import CERTAIN, Gain, gain, HeldOut, passed
+from sa_jitter_ros.inference.gate import CERTAIN, HeldOut, passed, score_gain, ScoreGain
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.trace import trace
 from sa_jitter_ros.inference.unsteady import unsteady_lines
@@ -66,12 +66,12 @@ def held_out(rng, expected, std, bias=0.0):
 def test_worse_prediction_does_not_pass_and_a_tie_does(rng):
     right = held_out(rng, 0.9, 0.01)
     wrong = replace(right, expected=right.expected + 0.05)
-    assert gain(right, wrong, of_mean=False).worse
-    better = gain(wrong, right, of_mean=True)
+    assert score_gain(right, wrong, of_mean=False).worse
+    better = score_gain(wrong, right, of_mean=True)
     assert not better.worse
     assert better.log_score > CERTAIN * better.log_score_error
     assert better.rms < 0.0
-    assert not gain(right, right, of_mean=True).worse
+    assert not score_gain(right, right, of_mean=True).worse
 
 
 def test_wider_distribution_that_is_right_is_no_harm(rng):
@@ -79,7 +79,8 @@ def test_wider_distribution_that_is_right_is_no_harm(rng):
     harmed = 0
     for _ in range(400):
         wide = held_out(rng, 1.0, 0.03)
-        harmed += gain(replace(wide, variance=wide.variance / 9.0), wide, of_mean=False).worse
+        harmed += score_gain(
+            replace(wide, variance=wide.variance / 9.0), wide, of_mean=False).worse
     assert harmed == 0
 
 
@@ -106,7 +107,7 @@ def test_trace_with_effects_that_harm_can_not_be_made():
     assert [item.name for item in found.findings] == ['excess_jitter']
     assert found.gain.log_score > 0.0
     with pytest.raises(ValueError, match='excess_jitter: held-out acquisitions are predicted'):
-        replace(found, gain=Gain(-1.0, 0.1, 0.0, 0.1, True))
+        replace(found, gain=ScoreGain(-1.0, 0.1, 0.0, 0.1, True))
 
 
 @pytest.mark.machines

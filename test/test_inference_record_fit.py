@@ -180,7 +180,7 @@ def test_sidebands_turn_with_those_of_their_spacing(rng):
                        measured=np.ones(count, bool), cycle_length=1.0, orders=[8.0, 16.0, 24.0],
                        jitter_std=5e-5).fit()
     lines = np.append(found.orders, found.tones / speed)
-    turning = {other: found.turning[np.argmin(np.abs(lines - other))] for other in others}
+    turning = {other: found.synchronous[np.argmin(np.abs(lines - other))] for other in others}
     assert [other for other, turns in turning.items() if not turns] == [11.21]
 
 
@@ -249,7 +249,7 @@ def test_a_foreign_shaft_hides_no_lines_and_tells_no_errors(rng, varying):
     own = np.append(found.orders, found.tones / 25.0)
     foreign = np.abs(own[:, None] - 60.6 / 25.0 * np.array([1, 2, 3, 5])).min(axis=1) < 0.04
     assert foreign.sum() >= 4
-    assert not found.turning[foreign].any()
+    assert not found.synchronous[foreign].any()
 
 
 def test_sidebands_that_do_not_change_are_no_bend_of_all_cycles(rng):

@@ -22,7 +22,7 @@ from sa_jitter_ros.inference.gathering import line_evidence
 from sa_jitter_ros.inference.observation import observe
 from sa_jitter_ros.inference.scoring import STEADY
 from sa_jitter_ros.inference.trace import trace
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 from sa_jitter_ros.simulation.components import mesh
@@ -137,7 +137,7 @@ def lines_of(observation):
 
 def test_each_acquisition_is_predicted_at_its_speed(observation):
     slow = tuple(replace(item, times=1.25 * item.times) for item in observation.acquisitions)
-    pulses = [[Pulses(item.times, item.first)] for item in slow]
+    pulses = [[AveragePulses(item.times, item.first)] for item in slow]
     lines, level, group = lines_of(observation)
     found = expect(replace(observation, acquisitions=slow), lines, level, (), pulses, group, [0])
     model = replace(MODEL, trigger_speed=SPEED / 1.25)
@@ -152,7 +152,7 @@ def test_acquisitions_are_predicted_alike_together_alone_and_from_memory(observa
     effects = [make_effect('keyphasor_quantisation', clock_rate=MODEL.keyphasor_rate),
                make_effect('amplitude_modulation', std=0.05)]
     lines, level, group = lines_of(observation)
-    pulses = [[Pulses(item.times, item.first, item.errors, None, 1e-6 * (i % 2))]
+    pulses = [[AveragePulses(item.times, item.first, item.errors, None, 1e-6 * (i % 2))]
               for i, item in enumerate(observation.acquisitions)]
     memory = Memory()
 
@@ -175,8 +175,8 @@ def test_uncertain_pulse_errors_do_not_attenuate(observation, rng):
     off, everything = 40e-6, range(len(observation.acquisitions))
 
     def predicted(noise, error_std):
-        pulses = [[Pulses(item.times, item.first, item.errors + noise
-                          * rng.standard_normal(item.errors.size), None, error_std)]
+        pulses = [[AveragePulses(item.times, item.first, item.errors + noise
+                                 * rng.standard_normal(item.errors.size), None, error_std)]
                   for item in observation.acquisitions]
         return expect(observation, lines, level, [clock], pulses, group, everything).attenuation
 
@@ -200,7 +200,7 @@ def test_noise_that_passes_for_larger_jitter_is_not_corrected():
 def test_slow_errors_turn_averages_and_do_not_scatter_their_amplitude(observation, correlation):
     effect = make_effect('correlated_jitter', std=1e-4, correlation=correlation)
     lines, level, group = lines_of(observation)
-    pulses = [[Pulses(item.times, item.first)] for item in observation.acquisitions]
+    pulses = [[AveragePulses(item.times, item.first)] for item in observation.acquisitions]
     found = expect(observation, lines, level, [effect], pulses, group, [0])
     rng, draws = np.random.default_rng(2), 20_000
     slow = np.empty((draws, CYCLES + 1))

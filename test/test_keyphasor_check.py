@@ -15,7 +15,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.errors import RecordingError, SignalError
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
-from sa_jitter_ros.keyphasor_check.clock import clock_of
+from sa_jitter_ros.keyphasor_check.clock import find_clock
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.machine_file import machine_parameters
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses
@@ -186,13 +186,13 @@ def test_standstill_costs_nothing_else(rng):
 @pytest.mark.parametrize(('marks', 'strays'), [(1, 0), (12, 30)])
 def test_clock_at_a_steady_and_a_changing_speed(rng, clock, drift, marks, strays):
     times = tach(rng, marks, drift=drift, clock=clock, strays=strays)[0]
-    assert clock_of(times).rate == pytest.approx(clock, rel=1e-9)
-    since_1970 = clock_of(times + 1.7e9)
+    assert find_clock(times).rate == pytest.approx(clock, rel=1e-9)
+    since_1970 = find_clock(times + 1.7e9)
     assert since_1970.rate in (0.0, pytest.approx(clock, rel=1e-4))
 
 
 def test_no_clock_in_pulses_of_full_precision(rng):
-    assert not any(clock_of(tach(rng, marks, drift=drift)[0]).rate
+    assert not any(find_clock(tach(rng, marks, drift=drift)[0]).rate
                    for marks in (1, 8) for drift in (0.0, 0.5) for _ in range(5))
 
 

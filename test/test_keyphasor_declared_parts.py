@@ -15,7 +15,7 @@ import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.declared_parts import contradictions
-from sa_jitter_ros.keyphasor_check.lines import Lines
+from sa_jitter_ros.keyphasor_check.lines import ToothLines
 from sa_jitter_ros.recordings.recording import ArraySource, Recording
 
 RATIO = 183 / 76  # of the input shaft
@@ -32,7 +32,7 @@ def gearbox(first=19, second=61, third=32, fourth=24):
 
 
 def lines_at(places):
-    return Lines(np.sort(places), np.full(len(places), 50.0), np.ones(len(places)), 0.005)
+    return ToothLines(np.sort(places), np.full(len(places), 50.0), np.ones(len(places)), 0.005)
 
 
 def test_the_right_teeth_are_not_contradicted():

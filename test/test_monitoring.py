@@ -24,7 +24,7 @@ from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.monitoring.baseline_file import read_baseline, write_baseline
 from sa_jitter_ros.monitoring.change_test import ChangeTest
-from sa_jitter_ros.monitoring.evidence import Evidence, threshold
+from sa_jitter_ros.monitoring.evidence import ChangeEvidence, threshold
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Settings, YEAR
 from sa_jitter_ros.monitoring.quantities import monitored
@@ -50,7 +50,7 @@ def alarms_of(draw, *, units, quantities, learning, scores, length):
 def test_evidence_reaches_its_threshold_once_in_the_stated_number_of_scores():
     rng = np.random.default_rng(1)
     units, quantities, scores = 400, 4, 400.0
-    evidence, times, started = Evidence((units, quantities)), [], np.zeros(units)
+    evidence, times, started = ChangeEvidence((units, quantities)), [], np.zeros(units)
     mix = np.array([0.0, 0.5, 0.9, 0.99])  # quantities that scatter together with the first
     for now in range(1, 6001):
         own = rng.standard_normal((units, quantities))

@@ -20,7 +20,7 @@ from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.amplitude_distribution import AmplitudeDistribution
 from sa_jitter_ros.prediction.angle_error import GaussianAngleError, IndependentPulseJitter
 from sa_jitter_ros.prediction.distributions import Empirical, Normal, Triangular, Uniform
-from sa_jitter_ros.prediction.influence import Gain, Influence
+from sa_jitter_ros.prediction.influence import Influence, KnownGain
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.prediction.sampled_distribution import SampledDistribution
@@ -133,10 +133,10 @@ def test_noise_adds_to_the_mean_square_what_one_line_holds():
 def test_gain_acts_on_the_component_alone_and_noise_adds_to_the_mean_square(cycles):
     model = replace(MODEL, trigger_cycles=cycles)
     usual = predict(model)
-    half = predict(model, [Gain(0.5)])
+    half = predict(model, [KnownGain(0.5)])
     np.testing.assert_allclose(half.mean_attenuation, 0.5 * usual.mean_attenuation, rtol=1e-6)
     np.testing.assert_allclose(half.quantile_05, 0.5 * usual.quantile_05, rtol=1e-5)
-    turned = predict(model, [Gain(1j)])
+    turned = predict(model, [KnownGain(1j)])
     np.testing.assert_allclose(turned.quantile_95, usual.quantile_95, rtol=1e-6)
     loud = predict(model, [Given(variance=np.array([0.0, 0.1, 0.2]))])
     np.testing.assert_allclose(loud.moments.mean_square - usual.moments.mean_square,
@@ -244,8 +244,8 @@ def test_models_that_make_no_sense_are_refused(changes, message):
 
 
 @pytest.mark.parametrize(('effect', 'message'), [
-    (Gain(np.nan), 'gain is nan: it must be finite'),
-    (Gain(np.ones(2)), r'gain has the shape \(2,\): give one value, or 3'),
+    (KnownGain(np.nan), 'gain is nan: it must be finite'),
+    (KnownGain(np.ones(2)), r'gain has the shape \(2,\): give one value, or 3'),
     (Given(variance=-1.0), 'line_variance is -1.0: it must be finite and at least 0')])
 def test_gain_and_noise_that_are_none_are_refused(effect, message):
     with pytest.raises(ModelError, match=message):

@@ -14,7 +14,8 @@ from hypothesis import given, strategies as st
 import numpy as np
 import pytest
 from sa_jitter_ros.errors import ParameterError, SignalError
-from sa_jitter_ros.pulses.resampling import gain, interpolate, margin, METHODS, periodic
+from sa_jitter_ros.pulses.resampling import (
+    interpolate, interpolator_gain, margin, METHODS, periodic)
 from scipy import signal
 
 
@@ -35,27 +36,29 @@ def measured_gain(method, frequency, cutoff=1.0):
 @pytest.mark.parametrize('method', METHODS)
 @pytest.mark.parametrize('frequency', [0.013, 0.0903, 0.1703, 0.3001, 0.4203])
 def test_gain_is_the_transform_of_the_kernel(method, frequency):
-    expected = gain(method, np.array(frequency))
+    expected = interpolator_gain(method, np.array(frequency))
     assert measured_gain(method, frequency) == pytest.approx(complex(expected), abs=2e-3)
 
 
 def test_gains_are_those_of_the_literature():
     f = np.array([0.05, 0.09, 0.17, 0.3])
-    np.testing.assert_allclose(gain('linear', f), np.sinc(f) ** 2, rtol=1e-5)
+    np.testing.assert_allclose(interpolator_gain('linear', f), np.sinc(f) ** 2, rtol=1e-5)
     np.testing.assert_allclose(
-        gain('spline', f), 3.0 * np.sinc(f) ** 4 / (2.0 + np.cos(2.0 * np.pi * f)), rtol=1e-5)
+        interpolator_gain('spline', f),
+        3.0 * np.sinc(f) ** 4 / (2.0 + np.cos(2.0 * np.pi * f)), rtol=1e-5)
     # Keys 1981: cubic convolution with a = -1/2
     s, c = np.sinc(f), np.sinc(2.0 * f)
     np.testing.assert_allclose(
-        gain('cubic', f), 3.0 / (np.pi * f) ** 2 * (s**2 - c) - 4.0 / (2.0 * np.pi * f) ** 2 * (
+        interpolator_gain('cubic', f),
+        3.0 / (np.pi * f) ** 2 * (s**2 - c) - 4.0 / (2.0 * np.pi * f) ** 2 * (
             3.0 * c**2 - 2.0 * c - np.sinc(4.0 * f)), rtol=1e-5)
-    decibels = 20.0 * np.log10(gain('linear', np.array([0.09, 0.17, 0.3])))
+    decibels = 20.0 * np.log10(interpolator_gain('linear', np.array([0.09, 0.17, 0.3])))
     np.testing.assert_allclose(decibels, [-0.233, -0.847, -2.636], atol=0.02)
 
 
 def test_default_loses_nothing_that_matters():
     f = np.linspace(0.0, 0.3, 61)
-    loss = np.abs(20.0 * np.log10(gain('band_limited', f)))
+    loss = np.abs(20.0 * np.log10(interpolator_gain('band_limited', f)))
     assert loss.max() < 0.01
     assert loss[f <= 0.17].max() < 0.001
     for frequency in (0.05, 0.17, 0.3):

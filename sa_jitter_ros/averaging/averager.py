@@ -34,7 +34,7 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.averaging.timeline import VibrationTimeline
 from sa_jitter_ros.errors import DataWarning, ParameterError, SignalError
 from sa_jitter_ros.parameters import number, numbers
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.unit_check import is_waveform, likely_mistake, other_rate
 from sa_jitter_ros.samples import SampleBlock
 
@@ -143,7 +143,7 @@ class Averager:
         return self._indicators.problem
 
     @property
-    def geometry(self) -> TargetGeometry | None:
+    def geometry(self) -> MarkOffsets | None:
         """Return what `target_geometry` takes from the pulses of each mark, None for nothing."""
         return self._stream.geometry
 

@@ -76,11 +76,12 @@ class LatestGrid:
         """
         if self._found is None or not self._has(cycles, method):
             grid = cycle_grid(cycles, method=method)
-            told = telling(grid, cycles)
-            if not told.any():
-                told[:] = True
+            informative = telling(grid, cycles)
+            if not informative.any():
+                informative[:] = True
             self._method, self._cycles = method, cycles
-            self._found = grid, GridCycles(grid if told.all() else grid[..., told]), told
+            seen = grid if informative.all() else grid[..., informative]
+            self._found = grid, GridCycles(seen), informative
         return self._found
 
     def _has(self, cycles: list[CycleSamples], method: str) -> bool:
@@ -290,11 +291,11 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     Return the amplitudes (channel, order) that raw and `aligned` average show together.
 
     `aligned` is that between the expected pulses. What is uncertain of their errors makes an order
-    smaller there; in an order that has told the errors the noise has aligned itself, too, and it
-    is larger (`PulseErrorRecovery.aligned`). The factor that makes up for either is uncertain
-    itself. Where noise leaves more of that than the attenuation is worth, the amplitude stays
-    nearer to what it is without the factor or, of an order that has told the errors, to the raw
-    one. An order whose phase is uncertain by more than `_UNCERTAIN` has none.
+    smaller there; in an order that the errors were recovered from the noise has aligned itself,
+    too, and it is larger (`PulseErrorRecovery.aligned`). The factor that makes up for either is
+    uncertain itself. Where noise leaves more of that than the attenuation is worth, the amplitude
+    stays nearer to what it is without the factor or, of an order that the errors were recovered
+    from, to the raw one. An order whose phase is uncertain by more than `_UNCERTAIN` has none.
 
     The second result (channel, order) is the relative standard error that the factors add, the
     third the largest size of the amplitude: that with the whole factor.
@@ -306,29 +307,29 @@ def _amplitudes(raw: Average, aligned: Average, recovery: PulseErrorRecovery
     lost = 1.0 / left - 1.0
     size = np.maximum(np.abs(raw.amplitudes), _TINY)
     noise = np.nan_to_num(2.0 * aligned.noise**2, nan=np.inf)
-    told, factor = np.zeros(size.shape, np.bool_), np.ones(size.shape)
+    informative, factor = np.zeros(size.shape, np.bool_), np.ones(size.shape)
     beside = np.broadcast_to(turn * recovery.excess_error, size.shape)
     for order, of_one, ratio, error in zip(recovery.orders, recovery.noise.T, recovery.aligned.T,
                                            recovery.aligned_error.T):
         same = np.isclose(raw.orders, order, rtol=1e-9, atol=0.0) & np.isfinite(ratio)[:, None]
-        told |= same
+        informative |= same
         beside = np.where(same, error[:, None], beside)
         factor = np.where(same, 1.0 / ratio[:, None], factor)
         noise = np.where(same, (of_one[:, None] / raw.gain) ** 2 / raw.trigger_cycles, noise)
-    whole = aligned.amplitudes * np.where(told, factor, 1.0 + lost)
-    start = np.where(told, raw.amplitudes, aligned.amplitudes)
+    whole = aligned.amplitudes * np.where(informative, factor, 1.0 + lost)
+    start = np.where(informative, raw.amplitudes, aligned.amplitudes)
     # Noise that has aligned itself makes an order clear by chance: without evidence it is as clear
     # as the raw one.
     evident = recovery.evidence > _EVIDENT
     noise = noise / (np.fmax(size, np.abs(whole)) if evident else size) ** 2
     unsure = np.clip((noise - _CLEAR) / (_WEAK - _CLEAR), 0.0, 1.0)
-    doubt = _CAUTION * np.where((unsure > 0.0) & ~(told & evident), unsure * noise, 0.0)
-    gained = np.where(told, np.abs(whole) / size - 1.0, lost)
+    doubt = _CAUTION * np.where((unsure > 0.0) & ~(informative & evident), unsure * noise, 0.0)
+    gained = np.where(informative, np.abs(whole) / size - 1.0, lost)
     share = np.where(doubt > 0.0, np.maximum(gained - doubt, 0.0) / np.maximum(
         gained + doubt, _TINY), 1.0)
     ambiguous = np.clip((1.0 - left - _SURE) / (_AMBIGUOUS - _SURE), 0.0, 1.0)
     chance = math.exp(-max(recovery.evidence - _DOUBT, 0.0) / _DECAY)
-    share = share * np.where(told, 1.0 - np.maximum(unsure, ambiguous) * chance, 1.0)
+    share = share * np.where(informative, 1.0 - np.maximum(unsure, ambiguous) * chance, 1.0)
     amplitudes = start + share * (whole - start)
     withheld = np.abs(whole) / np.maximum(np.abs(amplitudes), _TINY) - 1.0
     # The factor is as uncertain as the size of the errors, to which N_t cycles contribute what
@@ -381,28 +382,29 @@ def _recovered(raw: Average, cycles: list[CycleSamples], settings: AverageSettin
                grids: LatestGrid) -> tuple[PulseErrorRecovery, FloatArray]:
     """Recover the errors of the pulses of `raw` from its trigger `cycles`; return both."""
     # The recovery is a model of the linear law, whatever law the settings have.
-    grid, seen, told = grids.of(cycles, settings.interpolation)
+    grid, seen, informative = grids.of(cycles, settings.interpolation)
     recover = partial(
         recover_pulse_errors, cycle_length=settings.cycle_length, first_angle=raw.first_angle,
         additional_orders=settings.orders,
         declared_standard_deviation=_declared(cycles, settings))
     if raw.discarded_cycles:
-        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[told]), seen.cycles,
+        found = _recovered_over_gaps(replace(raw, waveform=raw.waveform[informative]), seen.cycles,
                                      recover, settings.cycle_length)
     else:
         found = recover(seen, periods=raw.periods)
-    return _of_all_channels(found, told), grid
+    return _of_all_channels(found, informative), grid
 
 
-def _of_all_channels(recovery: PulseErrorRecovery, told: NDArray[np.bool_]) -> PulseErrorRecovery:
-    """Return what was recovered from the channels that `told` (channel,) as one of all."""
-    if told.all():
+def _of_all_channels(recovery: PulseErrorRecovery, informative: NDArray[np.bool_]
+                     ) -> PulseErrorRecovery:
+    """Return what was recovered from `informative` channels (channel,) as one of all."""
+    if informative.all():
         return recovery
-    shape = told.size, recovery.orders.size
+    shape = informative.size, recovery.orders.size
     amplitudes = np.zeros(shape, np.complex128)
-    amplitudes[told] = recovery.amplitudes
+    amplitudes[informative] = recovery.amplitudes
     noise, aligned, error = np.full((3, *shape), np.nan)
-    noise[told], aligned[told], error[told] = (
+    noise[informative], aligned[informative], error[informative] = (
         recovery.noise, recovery.aligned, recovery.aligned_error)
     return replace(recovery, amplitudes=amplitudes, noise=noise, aligned=aligned,
                    aligned_error=error)

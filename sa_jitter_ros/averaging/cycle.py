@@ -173,7 +173,7 @@ class CycleSamples:
         return round(self.lead * self.rate)
 
 
-def joined(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
+def joined_cycles(runs: Sequence[CycleSamples]) -> list[CycleSamples]:
     """Return the same cycles with those together whose samples and pulses continue."""
     groups: list[list[CycleSamples]] = []
     size = 0
@@ -553,6 +553,6 @@ def multiples(step: Fraction, first: int, count: int) -> tuple[IntArray, FloatAr
 
 
 @lru_cache(maxsize=64)
-def on_grid(points: int, cycles: float) -> bool:
+def has_same_angles(points: int, cycles: float) -> bool:
     """Whether the points of the waveform are at the same angles of every trigger cycle."""
     return (exact_cycles(cycles) * points).denominator == 1

@@ -129,8 +129,9 @@ def residual_envelope(
         _squared_envelope(run, settings.band, points / period)
         for run in np.split(residual, np.flatnonzero(np.diff(cycle_numbers) != 1) + 1)])
     squares = squares.reshape(*squares.shape[:2], -1, together).mean(axis=-1)
-    lines = _Lines(squares, np.asarray(cycle_length * cycle_numbers, np.float64), cycle_length,
-                   together / points, fundamental_cycles)
+    lines = _EnvelopeLines(
+        squares, np.asarray(cycle_length * cycle_numbers, np.float64), cycle_length,
+        together / points, fundamental_cycles)
     resolution = 1.0 / (cycle_length * (int(cycle_numbers[-1] - cycle_numbers[0]) + 1))
     orders = settings.orders(cycle_length * trigger_cycles)
     rows = [_around(lines, order, resolution) for order in settings.bearing_orders]
@@ -165,7 +166,7 @@ def _squared_envelope(residual: FloatArray, band: tuple[float, ...], rate: float
     return found
 
 
-class _Lines:
+class _EnvelopeLines:
     """Amplitudes of lines of squared envelopes (cycle, channel, point) at any order."""
 
     def __init__(self, squares: FloatArray, begins: FloatArray, cycle_length: float, step: float,
@@ -195,7 +196,7 @@ class _Lines:
         return np.asarray(total / (left * np.sinc(orders * self._width)))
 
 
-def _around(lines: _Lines, order: float, resolution: float
+def _around(lines: _EnvelopeLines, order: float, resolution: float
             ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return order, amplitude and standard error (channel,) of the largest line near an order."""
     reach = max(round(SLIP * order * _FINE / resolution), 1)

@@ -70,7 +70,7 @@ class GridCycles:
         window = np.sin(pi * np.arange(points) / points) ** 2
         spectra = np.empty((points // 2 + 1, count, channels), np.complex128)
         # A taper over the cycles keeps strong orders from showing at their neighbours.
-        for number, share in enumerate(taper(count)):
+        for number, share in enumerate(cycle_weights(count)):
             spectra[:, number] = rfft((part[number] - mean) * (share * window)[:, None], axis=0)
         return spectra
 
@@ -91,7 +91,7 @@ class GridCycles:
         return _in_panels(rows, length), self._compact[length]
 
 
-def taper(count: int) -> FloatArray:
+def cycle_weights(count: int) -> FloatArray:
     """Return the weights of cycles with which strong orders do not show at their neighbours."""
     return np.asarray(np.sin(pi * (np.arange(count) + 0.5) / count) ** 2)
 

@@ -50,7 +50,7 @@ _MOST_NODES = 20
 _ITERATIONS = 25
 # Iterations in which the size of the errors is estimated, and the change of an amplitude, over its
 # value, at which the iterations end.
-_SIZE_ITERATIONS, _SETTLED = 6, 1e-4
+_SIZE_ITERATIONS, _CONVERGED = 6, 1e-4
 # Sizes of the errors over the declared one, and their chances beforehand.
 _SIZES = np.geomspace(0.05, 20.0, 41)
 _DECLARED = 0.9
@@ -334,8 +334,8 @@ class PulseErrorProblem:
             of_order = np.add.reduceat((first**2 + last**2).sum(axis=0), model.blocks)
             share = of_order / of_order.sum()
             moved = np.abs(amplitudes - before)[self.significant]
-            settled = np.all(moved < _SETTLED * np.abs(amplitudes[self.significant]))
-            if settled and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
+            converged = np.all(moved < _CONVERGED * np.abs(amplitudes[self.significant]))
+            if converged and np.max(np.abs(step)) < 0.02 * np.sqrt(np.min(covariance[0])):
                 break
         evidence = 0.5 * (self._misfit_without_errors(weight) - np.sum(residual**2)
                           - np.sum(errors**2) / std**2) - _occam(information, std)

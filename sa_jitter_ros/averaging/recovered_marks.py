@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -51,7 +51,7 @@ class RecoveredMarks:
         self._numbering = numbering
         self._angles, self._sum, self._weight = np.zeros((3, self._count))
         self._shares, self._errors = np.zeros((2, self._count))
-        self._shown: tuple[TargetGeometry, TargetGeometry] | None = None  # without, and with it
+        self._shown: tuple[MarkOffsets, MarkOffsets] | None = None  # without, and with it
 
     def take_from(self, items: NDArray[Any], first: int, stop: int, *, revolutions: float,
                   remember: bool) -> None:
@@ -112,7 +112,7 @@ class RecoveredMarks:
         self._errors[seen], self._shown = error, None
         self._angles[seen] = self._shares[seen] * found
 
-    def added_to(self, geometry: TargetGeometry, teeth: IntArray) -> TargetGeometry:
+    def added_to(self, geometry: MarkOffsets, teeth: IntArray) -> MarkOffsets:
         """Return the geometry of the `teeth` (mark,) with what the vibration shows of it."""
         if not self._weight.any():
             return geometry
@@ -120,7 +120,7 @@ class RecoveredMarks:
             self._shown = geometry, self._added(geometry, teeth)
         return self._shown[1]
 
-    def _added(self, geometry: TargetGeometry, teeth: IntArray) -> TargetGeometry:
+    def _added(self, geometry: MarkOffsets, teeth: IntArray) -> MarkOffsets:
         angles, share = geometry.angles + self._angles[teeth], self._shares[teeth]
         return replace(
             geometry, angles=angles - angles.mean(), by_vibration=bool(share.min() > _DECIDES),

@@ -28,7 +28,7 @@ from sa_jitter_ros.averaging.amplitude_errors import Repeatability, waveform_err
 from sa_jitter_ros.averaging.average import Average, AverageSettings
 from sa_jitter_ros.averaging.cycle import (
     choose_samples_per_revolution, CycleProjection, CycleSamples, EDGE, exact_cycles, grid_points,
-    joined, needed_margin, on_grid, waveform_cutoff, WaveformPoints)
+    has_same_angles, joined_cycles, needed_margin, waveform_cutoff, WaveformPoints)
 from sa_jitter_ros.averaging.interpolator_gain import InterpolatorGain, mean_gain
 from sa_jitter_ros.averaging.jackknife import PARTS, waveform_parts
 from sa_jitter_ros.averaging.latest_rows import LatestRows
@@ -197,7 +197,7 @@ class ShaftAverager:
     def _average_waiting(self) -> None:
         """Average the cycles that wait."""
         numbers = self._numbers_waiting
-        for run in joined([run for _, run in self._waiting]):
+        for run in joined_cycles([run for _, run in self._waiting]):
             if numbers[0] != self._cycle:  # behind discarded ones
                 self._cycle = numbers[0]
                 self._full = False
@@ -261,7 +261,7 @@ class ShaftAverager:
         """Return the grid's points in each cycle, those of the waveform where these will do."""
         r, n = self.settings.cycle_length, self._points
         points = grid_points(cycles.periods, cycles.rate)
-        if on_grid(n, r) or self._needs_edges(n):
+        if has_same_angles(n, r) or self._needs_edges(n):
             points = np.where(self._cutoff(cycles) == 1.0, round(n * r), points)
         return points
 
@@ -272,7 +272,7 @@ class ShaftAverager:
         Short cycles have a grid of their own, and other angle laws, which end at the pulses.
         """
         r = self.settings.cycle_length
-        return points * r >= _LONG and self._law is LINEAR_LAW and not on_grid(points, r)
+        return points * r >= _LONG and self._law is LINEAR_LAW and not has_same_angles(points, r)
 
     def _cutoff(self, cycles: CycleSamples) -> FloatArray:
         return waveform_cutoff(self._points, self.settings.cycle_length, cycles.periods,
@@ -312,7 +312,7 @@ class ShaftAverager:
         if len(self._wave) != n:
             self._wave = np.full((n, channels), np.nan)
         points = WaveformPoints.of(n, r, self._cycle, cycles.count)
-        if on_grid(n, r) and cutoff == 1.0:
+        if has_same_angles(n, r) and cutoff == 1.0:
             return self._resample_even(cycles, points)
         if self._needs_edges(n) and cutoff == 1.0:
             return self._resample_uneven(cycles, points)

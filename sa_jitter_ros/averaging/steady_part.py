@@ -29,7 +29,7 @@ from scipy.special import betainc
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-# Cycles from which on a line in them can be told, and cycles for each of them.
+# Cycles from which on a line in them can be identifiable, and cycles for each of them.
 _LEAST_CYCLES, _OF_EACH = 8, 4
 _MOST_LINES = 8
 # Probability that noise alone passes for a line.
@@ -80,9 +80,9 @@ def steady_part(cycles: ComplexArray, turns: FloatArray) -> SteadyPart:
     inflation, lost = np.ones(mean.shape), np.zeros(mean.shape)
     deviations = cycles - mean
     scatter = np.sum(np.abs(deviations) ** 2, axis=0)
-    told = scatter > 0.0  # not those of a silent channel, or NaN
-    channels = told.any(axis=1)
-    known = np.flatnonzero(told[channels].all(axis=0))
+    identifiable = scatter > 0.0  # not those of a silent channel, or NaN
+    channels = identifiable.any(axis=1)
+    known = np.flatnonzero(identifiable[channels].all(axis=0))
     if count < _LEAST_CYCLES or not channels.any() or not known.size:
         return SteadyPart(mean, cycles, np.empty(0), inflation, lost)
     turns = np.mod(np.round(turns, _DIGITS), 1.0)
@@ -109,8 +109,8 @@ def _apart(rate: FloatArray, turn: FloatArray) -> FloatArray:
     return np.asarray(np.abs(np.mod(rate - turn + 0.5, 1.0) - 0.5))
 
 
-def _told(rates: FloatArray, turns: FloatArray, count: int
-          ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _identifiable(rates: FloatArray, turns: FloatArray, count: int
+                  ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """
     Return which tones (rate, order) `count` cycles tell from an order and from each other.
 
@@ -124,7 +124,7 @@ def _told(rates: FloatArray, turns: FloatArray, count: int
 
 def _design(rates: FloatArray, count: int, turn: float) -> ComplexArray:
     """Return columns (cycle, tone): a constant, and what lines of `rates` are in an order."""
-    own, negative = _told(rates, np.array([turn]), count)
+    own, negative = _identifiable(rates, np.array([turn]), count)
     tones = np.concatenate(([turn], rates[own[:, 0]], -rates[negative[:, 0]]))
     return np.asarray(np.exp(2j * np.pi * np.multiply.outer(np.arange(count), tones - turn)))
 
@@ -172,7 +172,7 @@ class _Lines:
     def _chance(self, rates: FloatArray, left: ComplexArray) -> float:
         """Return the logarithm of the probability that noise has as little `left` as lines."""
         count = len(left)
-        unknowns = sum(item.sum(axis=0) for item in _told(rates, self._turns, count))
+        unknowns = sum(item.sum(axis=0) for item in _identifiable(rates, self._turns, count))
         share = np.sum(np.abs(left) ** 2, axis=0) / np.maximum(
             np.sum(np.abs(self._deviations) ** 2, axis=0), _TINY)
         freedom = float(len(share) * np.sum(np.maximum(count - 1 - unknowns, 0)))
@@ -202,20 +202,20 @@ class _Lines:
         the rates and at their negative. NaN where the cycles do not tell a line from the order.
         """
         count, whole = len(left), np.maximum(np.sum(np.abs(left) ** 2, axis=0), _TINY)
-        told = [item[:, None] for item in _told(rates, self._turns, count)]
+        shown = [item[:, None] for item in _identifiable(rates, self._turns, count)]
         mean_own, mean_negative = (_sum_of(self._turns - sign * rates[:, None], count)
                                    for sign in (1.0, -1.0))
         # Tones without their means, multiplied with one another.
         first, second = (np.where(item, count - np.abs(mean[:, None]) ** 2 / count, 1.0)
-                         for item, mean in zip(told, (mean_own, mean_negative)))
-        both = np.where(told[0] & told[1], (_sum_of(-2.0 * rates, count)[:, None]
-                                            - mean_own * np.conj(mean_negative) / count)[:, None],
-                        0.0)
-        own, negative = np.where(told[0], own, 0.0), np.where(told[1], negative, 0.0)
+                         for item, mean in zip(shown, (mean_own, mean_negative)))
+        both = (_sum_of(-2.0 * rates, count)[:, None]
+                - mean_own * np.conj(mean_negative) / count)[:, None]
+        both = np.where(shown[0] & shown[1], both, 0.0)
+        own, negative = np.where(shown[0], own, 0.0), np.where(shown[1], negative, 0.0)
         power = (second * np.abs(own) ** 2 + first * np.abs(negative) ** 2
                  - 2.0 * (np.conj(own) * both * negative).real
                  ) / (first * second - np.abs(both) ** 2)
-        return np.where(told[0] | told[1], np.minimum(power / whole, 1.0), np.nan)
+        return np.where(shown[0] | shown[1], np.minimum(power / whole, 1.0), np.nan)
 
     def _refined(self, left: ComplexArray, rate: float) -> float:
         """Return the rate near `rate` at which a line has most of deviations without means."""

@@ -31,7 +31,7 @@ from sa_jitter_ros.averaging.shaft import TOGETHER
 from sa_jitter_ros.averaging.timeline import Segment, VibrationTimeline
 from sa_jitter_ros.errors import ParameterError, SignalError
 from sa_jitter_ros.pulses.angle_law import angle_law
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.validation import PulseCounts, PulseValidator, TriggerPulses
 from sa_jitter_ros.samples import SampleBlock
 
@@ -154,7 +154,7 @@ class StreamingAverager:
         return {name: ramp.doubt for name, ramp in self._ramps.items()}
 
     @property
-    def geometry(self) -> TargetGeometry | None:
+    def geometry(self) -> MarkOffsets | None:
         """Return what is taken from the pulses of each mark of the target, None for nothing."""
         found = self.validator.geometry
         return None if found is None else self._recovered.added_to(found, self.validator.teeth)

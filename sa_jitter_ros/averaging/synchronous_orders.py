@@ -26,7 +26,7 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.averaging.grid_cycles import GridCycles, taper
+from sa_jitter_ros.averaging.grid_cycles import cycle_weights, GridCycles
 from sa_jitter_ros.averaging.noise import long_run_variance
 from sa_jitter_ros.averaging.pulse_error_fit import (CompressedCycles, deviations,
                                                      least_squares, PulseErrorProblem,
@@ -136,11 +136,11 @@ class LineSearch:
         start = self.cycle_length * (self.first + np.arange(count)) + errors[
             self.first:self.first + count]
         apart = g - g[:, None]
-        turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ taper(count)
+        turns = np.exp(2j * pi * np.multiply.outer(apart, start)) @ cycle_weights(count)
         x = apart * self.cycle_length
         lobe = sum(share * (np.sinc(x - shift) + np.sinc(x + shift))
                    for shift, share in enumerate((0.5, 2.0 / 3.0, 1.0 / 6.0)))
-        return np.asarray(turns / taper(count).sum() * np.exp(1j * pi * x) * lobe)
+        return np.asarray(turns / cycle_weights(count).sum() * np.exp(1j * pi * x) * lobe)
 
     def gain(self, errors: FloatArray, orders: FloatArray) -> float:
         """
@@ -178,7 +178,7 @@ class LineSearch:
         # gives to both cancel.
         common = np.exp(-1j * pi * (2.0 * np.outer(g, angle) + x)) * np.sin(pi * x) / (2.0 * pi)
         if not tapered:
-            common = common / taper(count)
+            common = common / cycle_weights(count)
         x = x[:, None] - np.arange(-_MAIN_LOBE, _MAIN_LOBE + 1)[:, None]
         weights = common[:, None] / (x * (1.0 - x) * (1.0 + x))
         for near, weight in zip(nearest.tolist(), weights):

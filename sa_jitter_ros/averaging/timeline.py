@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.inner_loops import frames, room
-from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved
+from sa_jitter_ros.samples import finite_spans, SampleBlock, unresolved_times
 
 FloatArray = NDArray[np.float64]
 _Span = tuple[int, int]  # first index, and the one behind the last
@@ -341,7 +341,7 @@ class VibrationTimeline:
                 and block.sample_rate > 0.0):
             raise SignalError(f'block at {block.start_time} s with {block.sample_rate} Hz: send a '
                               'finite time and a positive rate')
-        if why := unresolved(block.start_time, block.sample_rate):
+        if why := unresolved_times(block.start_time, block.sample_rate):
             raise SignalError(why)
         layout = samples.shape[0], block.sample_rate
         if self.layout is None or _alike(self.layout, layout):

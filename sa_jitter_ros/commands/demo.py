@@ -263,7 +263,7 @@ def stop(children: Sequence[subprocess.Popen[bytes]]) -> None:
             child.wait()
 
 
-def report(plan: Plan, watcher: Watcher, output: Path) -> None:
+def write_report(plan: Plan, watcher: Watcher, output: Path) -> None:
     """Print the table and write the files."""
     averages = watcher.averages()
     if not any(averages.values()):
@@ -343,7 +343,7 @@ def main(args: Sequence[str] | None = None) -> int:
         children += [subprocess.Popen(node_command(name, parameters, plan.params))
                      for name, parameters in processes(plan, live=options.live).items()]
         watch(plan, watcher, executor, children, live=options.live)
-        report(plan, watcher, options.output)
+        write_report(plan, watcher, options.output)
         if options.live:
             watcher.destroy_node()  # it would keep all results
             print('the machine runs on and the page stays until Ctrl-C', flush=True)

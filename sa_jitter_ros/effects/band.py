@@ -137,17 +137,17 @@ def recovered_shapes(frequency: Array) -> tuple[Array, Array]:
     """Return the shapes (f, u, 3) that the recovery fits inside a cycle, and their products."""
     u, weight = INSIDE
     z = np.exp(2j * np.pi * frequency)[:, None]
-    bump = np.broadcast_to(u * (1.0 - u), (frequency.size, u.size))
-    shapes = np.stack([1.0 - u + u * z, bump, bump * (2.0 * u - 1.0)], axis=-1)
+    ripple = np.broadcast_to(u * (1.0 - u), (frequency.size, u.size))
+    shapes = np.stack([1.0 - u + u * z, ripple, ripple * (2.0 * u - 1.0)], axis=-1)
     return shapes, np.einsum('fui,u,fuj->fij', shapes.conj(), weight, shapes, optimize=True)
 
 
 def recovered(frequency: Array, turning: Array) -> Array:
     """
-    Return pulse errors, bumps and bends (f, 3) that the recovery fits to exp(2 pi j turning u).
+    Return pulse errors, ripples and bends (f, 3) that the recovery fits to exp(2 pi j turning u).
 
-    It fits hats between pulses that turn by `frequency`, and in every cycle a bump u (1 - u) and a
-    bend u (1 - u) (2 u - 1), by least squares.
+    It fits hats between pulses that turn by `frequency`, and in every cycle a ripple u (1 - u) and
+    a bend u (1 - u) (2 u - 1), by least squares.
     """
     shapes, normal = recovered_shapes(frequency)
     wave = INSIDE[1] * np.exp(2j * np.pi * turning[:, None] * INSIDE[0])

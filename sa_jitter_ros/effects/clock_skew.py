@@ -18,7 +18,7 @@ import numpy as np
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.path_delay import STEADY
 from sa_jitter_ros.effects.timing import Pattern, Setting
-from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
+from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -93,7 +93,7 @@ class ClockSkew(Effect):
         return (self.skew * model.trigger_period
                 * np.arange(model.trigger_cycles + 1.0))[None, :]
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """
         Return the delay that grows through the average at hand, beyond the turn of all pulses.
 

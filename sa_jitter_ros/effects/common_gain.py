@@ -92,8 +92,8 @@ def _above_noise(powers: Array, counts: Array) -> tuple[Array, Array, Array]:
         least[octave] = min(own[octave], below * (1.0 + ONE_SIDED / np.sqrt(number)))
     more = least > least[-1]
     noise = np.average(least, weights=counts * ~more)
-    told = counts * (own == least)
-    likelihood = told * np.log(np.average(least, weights=told) / np.where(more, least, noise))
+    equal = counts * (own == least)
+    likelihood = equal * np.log(np.average(least, weights=equal) / np.where(more, least, noise))
     error = np.hypot(least / np.sqrt(counts), noise / np.sqrt(np.sum(counts, where=~more)))
     return likelihood, np.where(more, least - noise, 0.0), error
 
@@ -113,15 +113,15 @@ def _shared(power: Array, count: float, gain: Array) -> tuple[float, float, floa
     def cost(logs: Array) -> tuple[float, Array]:
         own, size = np.exp(logs[:-1]), np.exp(logs[-1])
         along = gain / own
-        told = gain @ along
+        strength = gain @ along
         # the inverse of own + size gain gain' is 1 / own - fall along along'
-        fall = size / (1.0 + size * told)
+        fall = size / (1.0 + size * strength)
         seen = power @ along
         both = along @ seen
-        value = np.sum(np.log(own) + each / own) + np.log1p(size * told) - fall * both
+        value = np.sum(np.log(own) + each / own) + np.log1p(size * strength) - fall * both
         by_own = 1.0 - each / own + own * along * (
             fall * (2.0 * seen / own - along) - fall**2 * both * along)
-        by_size = size * (told * (1.0 - fall * told) - both * (1.0 - fall * told) ** 2)
+        by_size = size * (strength * (1.0 - fall * strength) - both * (1.0 - fall * strength) ** 2)
         return count * float(value), count * np.append(by_own, by_size)
 
     first = np.append(np.log(np.maximum(each - gain**2 * start, 0.5 * alone)), np.log(start))
@@ -130,8 +130,8 @@ def _shared(power: Array, count: float, gain: Array) -> tuple[float, float, floa
     own, size = np.exp(found.x[:-1]), float(np.exp(found.x[-1]))
     without = count * float(np.sum(np.log(alone) + each / alone))
     inverse = np.linalg.inv(np.diag(own) + size * np.outer(gain, gain))
-    told = inverse @ gain
-    information = count * np.block([[inverse**2, told[:, None] ** 2],
-                                    [told**2, (gain @ told) ** 2]])
+    strength = inverse @ gain
+    information = count * np.block([[inverse**2, strength[:, None] ** 2],
+                                    [strength**2, (gain @ strength) ** 2]])
     error = float(np.sqrt(max(np.linalg.pinv(information)[-1, -1], 0.0)))
     return max(without - float(found.fun), 0.0), size, error

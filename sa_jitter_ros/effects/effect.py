@@ -272,8 +272,8 @@ def departs(effect: Effect, errors: Mapping[str, Any], declared: Effect, cycles:
                 return True
             continue
         size = np.ravel(error)
-        told = np.isfinite(size) & (size > 0.0)
-        away += (np.ravel(np.subtract(found, known))[told] / size[told]).tolist()
+        given = np.isfinite(size) & (size > 0.0)
+        away += (np.ravel(np.subtract(found, known))[given] / size[given]).tolist()
     return beyond_chance(0.5 * float(np.sum(np.square(away))), len(away), cycles) > ODDS
 
 

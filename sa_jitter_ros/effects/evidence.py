@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.prediction.distributions import PulseErrorDistribution
 from sa_jitter_ros.prediction.influence import (
-    declared_jitter, Influence, mean_period, Pulses)
+    AveragePulses, declared_jitter, Influence, mean_period)
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
@@ -108,7 +108,7 @@ class Evidence:
     """
 
     model: DeclaredModel
-    pulses: tuple[Pulses, ...]
+    pulses: tuple[AveragePulses, ...]
     errors: Array
     standard_errors: Array
     ripple: Array

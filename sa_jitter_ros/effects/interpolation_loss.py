@@ -18,7 +18,7 @@ from sa_jitter_ros.effects.effect import absent, Array, DirectEffect, Finding, p
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.prediction.model import DeclaredModel
-from sa_jitter_ros.pulses.resampling import gain as interpolator_gain
+from sa_jitter_ros.pulses.resampling import interpolator_gain as interpolator_gain
 
 METHODS = ('band_limited', 'linear', 'cubic', 'spline')
 

@@ -28,7 +28,7 @@ from sa_jitter_ros.effects.evidence import root
 from sa_jitter_ros.effects.lattice import Clock, SLOPE_OFF
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.prediction.distributions import Normal
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 _SEED = 6
@@ -78,7 +78,7 @@ class KeyphasorQuantisation(Effect):
         ticks += (rng.permutation(count)[:, None] + 0.5) / count
         return np.asarray((np.ceil(ticks) - ticks - 0.5) / self.clock_rate)
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """Return the errors that follow from the measured times."""
         return pulses.errors
 

@@ -173,7 +173,7 @@ def sizes_within_ticks(left: Callable[[float], Sequence[Array]], tried: Array, v
     return possible, special.softmax(likely) if likely.size else likely
 
 
-def on_grid(errors: Array, clock_rate: float) -> Array:
+def within_half_tick(errors: Array, clock_rate: float) -> Array:
     """Return errors (n,) in s that a clock can make: beyond half a tick, whole ticks go."""
     tick = 1.0 / clock_rate
     placed, _ = placed_on_grid(errors, clock_rate)

@@ -29,7 +29,7 @@ from sa_jitter_ros.effects.effect import (
     absent, Array, DirectEffect, Effect, Finding, most_scenarios, parameter, RARE)
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.angle_error import AngleErrorProcess, joint_characteristic
-from sa_jitter_ros.prediction.influence import mean_period, Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses, mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import AverageMoments, correlation_length
 from scipy import special
@@ -80,7 +80,7 @@ class MissingPulses(DirectEffect):
         return loss_moments(orders, orders * model.cycle_length, self.probability, processes,
                             model.trigger_cycles)
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """Return how far the counted angle is behind in the average at hand."""
         if pulses.missing is None:
             return None

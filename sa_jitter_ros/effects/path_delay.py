@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sa_jitter_ros.effects.effect import Array, Effect, parameter
 from sa_jitter_ros.effects.timing import Pattern, Setting
-from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
+from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -78,7 +78,7 @@ class PathDelay(Effect):
         turns = np.asarray(model.orders) * model.fundamental_frequency * self.delay
         return np.asarray(np.exp(2j * np.pi * turns))
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """
         Return what the change of speed within the average at hand makes of the delay.
 

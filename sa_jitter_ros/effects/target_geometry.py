@@ -25,7 +25,7 @@ from sa_jitter_ros.effects.effect import (
     Array, Effect, most_scenarios, ODDS, parameter, require_in_turn)
 from sa_jitter_ros.effects.timing import Pattern, Setting
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.prediction.influence import Pulses, trigger_periods
+from sa_jitter_ros.prediction.influence import AveragePulses, trigger_periods
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 
@@ -86,7 +86,7 @@ class TargetGeometry(Effect):
         first = (np.arange(kept) * len(self.pulse_angles) // kept)[:, None]
         return self._at(model, first + np.arange(model.trigger_cycles + 1))
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """Return the errors of the pulses at hand."""
         return self._at(model, pulses.index) if self.pulse_angles else None
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.effects.effect import ODDS
 from sa_jitter_ros.effects.evidence import Beat
-from sa_jitter_ros.pulses.resampling import gain
+from sa_jitter_ros.pulses.resampling import interpolator_gain
 from scipy.ndimage import median_filter
 from scipy.optimize import minimize_scalar
 
@@ -70,7 +70,7 @@ def find_beat(radial: Array, order: Array, frequency: Array) -> Beat:
     best = -np.inf
     for method in METHODS:
         # over the place between two samples; the images of a line swing about it
-        below, mean, above = (gain(method, frequency + turn) for turn in (-1.0, 0.0, 1.0))
+        below, mean, above = (interpolator_gain(method, frequency + k) for k in (-1.0, 0.0, 1.0))
         swing = np.abs(below + above)
         wanted = depth_left * swing / mean
         unsure = noise + (_KNOWN * wanted) ** 2

@@ -52,9 +52,9 @@ def candidates_of_lines(bench: Bench, chosen: Sequence[Finding]) -> list[Candida
         if not issubclass(kind, DirectEffect):
             continue
         evidence = bench.without(name).gather(effects, bench.fit) if name in declared else shared
-        untold = bench.untold.get(name) or kind.unmodelled(bench.observation.model)
-        finding = absent(name, untold) if untold else kind.fit(evidence)
-        if name in declared and finding.effect is None and not untold:
+        unidentifiable = bench.unidentifiable.get(name) or kind.unmodelled(bench.observation.model)
+        finding = absent(name, unidentifiable) if unidentifiable else kind.fit(evidence)
+        if name in declared and finding.effect is None and not unidentifiable:
             finding = _without(declared[name], kind.limit(evidence))
         effect = finding.effect
         if name in declared and (effect is None or not departs(

@@ -86,8 +86,8 @@ class States:
         self.states = np.zeros((times.size, self.width))
         self.least = np.array([*[_LEAST_BEND * jitter_std] * (self.width - 2), _LEAST_GAIN])
         self.size = np.append(jitter_std, self.least)
-        self.all_free = self.settled = False
-        self.told = np.zeros(self.width)
+        self.all_free = self.converged = False
+        self.resolved = np.zeros(self.width)
         self.weight, self.around = np.ones(band.samples.shape[1]), np.ones(1)
         # pulses do not err by more than they scatter; a source that moves may do more
         even = self.whole[2:] & self.whole[1:-1] & self.whole[:-2]
@@ -99,7 +99,7 @@ class States:
             (np.arange(times.size) - 0.5 * (times.size - 1)) * float(np.diff(times).mean()))
         self.trend = 0.0
         self.amplitudes = np.zeros((band.samples.shape[1], orders.size), np.complex128)
-        self.turning = self.single = np.ones(orders.size, np.bool_)
+        self.synchronous = self.movable = np.ones(orders.size, np.bool_)
         self._made: tuple[bytes, bytes, Array] = b'', b'', np.zeros(0)
         self.read()
 
@@ -111,12 +111,12 @@ class States:
     @property
     def unsure(self) -> float:
         """Return the standard error of the pulse errors (s), those of most pulses."""
-        return float(self.size[0] * np.sqrt(1.0 - self.told[0]))
+        return float(self.size[0] * np.sqrt(1.0 - self.resolved[0]))
 
     @property
-    def moving(self) -> BoolArray:
+    def moved(self) -> BoolArray:
         """Return which lines (line,) are orders of shafts, which the states move."""
-        return self.single & (np.arange(self.single.size) < self.orders.size)
+        return self.movable & (np.arange(self.movable.size) < self.orders.size)
 
     @property
     def no_jitter(self) -> Array:
@@ -215,7 +215,7 @@ class States:
     def rate(self) -> Array:
         """Return the derivative (channel, cycle, point) of the lines by the pulse errors."""
         turns = 2j * np.pi * np.append(self.orders, np.zeros(self.tones.size))
-        found = self.signals(turns * self.moving * self.amplitudes)
+        found = self.signals(turns * self.moved * self.amplitudes)
         found *= self.slope[:, None]
         return found
 
@@ -239,12 +239,12 @@ class States:
         """Do a Gauss-Newton step; return the RMS change of the pulse errors (s)."""
         self.make_tables()
         # a line of no shaft tells nothing of the angle: its own frequency may vary
-        moving = self.signals(self.moving * self.amplitudes)
-        residual = self.residual() if not self.moving.all() else (
+        moving = self.signals(self.moved * self.amplitudes)
+        residual = self.residual() if not self.moved.all() else (
             self.vibration - (1.0 + self.states[:-1, -1:]) * moving)
         points = self.whole.sum() * self.u.size
         self.weight = points / np.einsum('ckp,ckp->c', residual, residual)
-        if self.settled:
+        if self.converged:
             self._weigh(residual)
         change, amplitudes, trend = self._solve(residual, (self.rate(), moving), weak)
         self.change = change[:, 0]
@@ -279,13 +279,13 @@ class States:
                                power.shape[1] - (side < 0.0)) for side in (-reach, reach))
         summed = np.pad(np.cumsum(power, axis=1), ((0, 0), (1, 0)))
         around = (summed[:, last] - summed[:, first]) / (last - first)
-        for c, told in enumerate((np.abs(self.amplitudes[:, :self.orders.size])
-                                  * self.orders) ** 2 + np.finfo(np.float64).tiny):
+        for c, height in enumerate((np.abs(self.amplitudes[:, :self.orders.size])
+                                    * self.orders) ** 2 + np.finfo(np.float64).tiny):
             share = np.zeros(power.shape[1])
-            for i in np.argsort(told).tolist():  # of several orders nearby the strongest counts
-                share[first[i]:last[i]] = told[i]
+            for i in np.argsort(height).tolist():  # of several orders nearby the strongest counts
+                share[first[i]:last[i]] = height[i]
             share /= share.sum()
-            taken = cycles * float(self.told.sum()) * float(share @ share) / (2 * len(power))
+            taken = cycles * float(self.resolved.sum()) * float(share @ share) / (2 * len(power))
             colour = float(share @ power[c]) / (1.0 - min(taken, _MOST_TAKEN))
             self.weight[c] /= colour
             around[c] /= colour
@@ -374,7 +374,7 @@ class States:
         n = self.orders.size
         if self.tones.size or 2 * n >= self.u.size:
             return self.sums(values, shapes)
-        part = (self.moving * self.amplitudes[channel]) * (self.turn if which else (
+        part = (self.moved * self.amplitudes[channel]) * (self.turn if which else (
             2j * np.pi * self.slope[:, None] * self.orders * self.turn))
         wave = (shapes[:, None] * self.wave).reshape(-1, self.u.size)
         each = np.ascontiguousarray(self.reading @ wave.T).view(np.float64)
@@ -433,10 +433,10 @@ class States:
         before = self.size[state] ** 2
         expected, variance = share * before, self.variance(state)
         power = float(np.mean(values**2)) + variance
-        self.told[state] = told = max(1.0 - variance / expected, ROUNDING)
+        self.resolved[state] = resolved = max(1.0 - variance / expected, ROUNDING)
         gained = power - expected
         if gained > 0.0:
-            gained /= told**2 if self.settled and not state else told
+            gained /= resolved**2 if self.converged and not state else resolved
         return power, before + gained
 
     def free_all(self) -> None:

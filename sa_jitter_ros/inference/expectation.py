@@ -36,7 +36,7 @@ from sa_jitter_ros.prediction.angle_error import (
     AngleErrorProcess, IndependentPulseJitter, joint_characteristic, unit_nodes)
 from sa_jitter_ros.prediction.distributions import Normal
 from sa_jitter_ros.prediction.influence import (
-    Influence, known_errors, Pulses, random_processes, without_gaps)
+    AveragePulses, Influence, known_errors, random_processes, without_gaps)
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import correlation_length, cycle_moments
 from sa_jitter_ros.prediction.sampled_distribution import COARSEST, SampledDistribution
@@ -203,7 +203,7 @@ class Expectation:
 
 
 def expect(observation: Observation, lines: Lines, level: Array, effects: Sequence[Influence],
-           pulses: Sequence[Sequence[Pulses]], group: Array, chosen: Sequence[int], *,
+           pulses: Sequence[Sequence[AveragePulses]], group: Array, chosen: Sequence[int], *,
            unsteadiness: float | Array = 0.0, memory: Memory | None = None) -> Expectation:
     """
     Predict the `chosen` acquisitions, each at its own speed.
@@ -276,7 +276,7 @@ class _Setting:
     noise: Array
     made: list[Amplitudes] = field(default_factory=list)
 
-    def shown(self, pulses: Sequence[Pulses]) -> list[_Source]:
+    def shown(self, pulses: Sequence[AveragePulses]) -> list[_Source]:
         """Return the predicted amplitudes and leakage of unit components, for all `pulses`."""
         known = [self._of_corrected(item) for item in pulses]
         found: dict[int, _Source] = {}
@@ -292,7 +292,7 @@ class _Setting:
             found.update(zip(some, rows))
         return [found[i] for i in range(len(pulses))]
 
-    def _of_corrected(self, item: Pulses) -> Array | None:
+    def _of_corrected(self, item: AveragePulses) -> Array | None:
         """
         Return the known errors of an acquisition, as if its corrected pulses were right.
 
@@ -306,7 +306,7 @@ class _Setting:
         own = slice(model.weights.before, len(errors) - model.weights.after)
         return np.asarray(errors - without_gaps(errors, item.missing, item.times)[own].mean())
 
-    def _of_known_pulses(self, errors: Array, like: Pulses) -> list[_Source]:
+    def _of_known_pulses(self, errors: Array, like: AveragePulses) -> list[_Source]:
         """Return what is predicted with known `errors` (acquisition, pulse), unsure alike."""
         model = self.observation.model
         blur, unsure = 0.0, self.processes

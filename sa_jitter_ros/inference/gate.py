@@ -69,7 +69,7 @@ class HeldOut:
 
 
 @dataclass(frozen=True)
-class Gain:
+class ScoreGain:
     """
     What a prediction gains over another one, with standard errors of the paired differences.
 
@@ -91,10 +91,10 @@ class Gain:
 
 
 #: With nothing added, nothing changes.
-NO_GAIN = Gain(0.0, 0.0, 0.0, 0.0, False)
+NO_GAIN = ScoreGain(0.0, 0.0, 0.0, 0.0, False)
 
 
-def gain(before: HeldOut, after: HeldOut, *, of_mean: bool) -> Gain:
+def score_gain(before: HeldOut, after: HeldOut, *, of_mean: bool) -> ScoreGain:
     """
     Return what `after` gains over `before`; the RMS errs by the jackknife over acquisitions.
 
@@ -104,17 +104,17 @@ def gain(before: HeldOut, after: HeldOut, *, of_mean: bool) -> Gain:
     apart = after.log_density - before.log_density
     count = apart.size
     if count < 2:
-        return Gain(float(apart.mean()), math.inf, after.rms - before.rms, math.inf, of_mean)
+        return ScoreGain(float(apart.mean()), math.inf, after.rms - before.rms, math.inf, of_mean)
     every = np.arange(count)
     without = [_rms(after.difference[every != i]) - _rms(before.difference[every != i])
                for i in every]
     error = max(float(np.std(apart, ddof=1)), _expected_scatter(before, after)) / math.sqrt(count)
-    return Gain(float(apart.mean()), error, after.rms - before.rms,
-                float(np.std(without) * math.sqrt(count - 1)), of_mean)
+    return ScoreGain(float(apart.mean()), error, after.rms - before.rms,
+                     float(np.std(without) * math.sqrt(count - 1)), of_mean)
 
 
 def passed(findings: Sequence[Finding], predict: Callable[[Sequence[Finding]], HeldOut]
-           ) -> tuple[list[Finding], list[Finding], Gain]:
+           ) -> tuple[list[Finding], list[Finding], ScoreGain]:
     """
     Return the findings that pass the gate, those that do not, and what the former gain.
 
@@ -125,7 +125,7 @@ def passed(findings: Sequence[Finding], predict: Callable[[Sequence[Finding]], H
     dropped: list[Finding] = []
     declared = predict([]) if kept else None
     while kept and declared is not None:
-        found = gain(declared, predict(kept), of_mean=any(
+        found = score_gain(declared, predict(kept), of_mean=any(
             item.effect is not None and not item.effect.scatters for item in kept))
         if not found.worse:
             return kept, dropped, found

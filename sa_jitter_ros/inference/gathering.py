@@ -21,15 +21,15 @@ from sa_jitter_ros.averaging.noise import radial_noise
 from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence, LineEvidence, Tone
 from sa_jitter_ros.effects.lattice import (
-    Clock, find_clock, on_grid, ROOM, sizes_within_ticks, SLOPE_OFF, smooth_on_grid,
-    ticks_leave_room)
+    Clock, find_clock, ROOM, sizes_within_ticks, SLOPE_OFF, smooth_on_grid, ticks_leave_room,
+    within_half_tick)
 from sa_jitter_ros.effects.target_geometry import own_marks
 from sa_jitter_ros.inference.beat import find_beat, without_beat
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.line_search import least_seen
 from sa_jitter_ros.inference.observation import Acquisition, CHANCE, Observation, recovered_again
 from sa_jitter_ros.inference.residual import FALSE_ALARM
-from sa_jitter_ros.prediction.influence import known_errors, Pulses, without_gaps
+from sa_jitter_ros.prediction.influence import AveragePulses, known_errors, without_gaps
 from sa_jitter_ros.recordings.recording import Recording
 from scipy import special
 
@@ -89,14 +89,14 @@ def channel_groups(observation: Observation) -> Array:
     """
     corrected = np.abs(observation.stacked('corrected'))
     with np.errstate(divide='ignore', invalid='ignore'):
-        told = observation.sources * corrected / observation.stacked('noise')
-    information = np.sum(np.where(np.isfinite(told), told, 0.0).mean(axis=0) ** 2, axis=1)
+        strength = observation.sources * corrected / observation.stacked('noise')
+    information = np.sum(np.where(np.isfinite(strength), strength, 0.0).mean(axis=0) ** 2, axis=1)
     rank = np.argsort(np.argsort(-information))
     return np.asarray(rank % min(_GROUPS, rank.size))
 
 
 def gather_pulses(recording: Recording, observation: Observation, group: Array
-                  ) -> tuple[Clock, Sequence[Sequence[Pulses]]]:
+                  ) -> tuple[Clock, Sequence[Sequence[AveragePulses]]]:
     """
     Return the clock and the known errors of the pulses.
 
@@ -131,9 +131,9 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
                     item.standard_errors.mean() < 1.0 / math.sqrt(12.0) / clock.rate
                     and np.all(np.isfinite(motion[a]))):
                 errors, std, unknown = smooth.copy(), uncertain, (0.0, 0.0)
-                errors[own] = on_grid(motion[a], clock.rate)
-            rows.append(Pulses(pulses.times[read], first, errors,
-                               pulses.missing[read.start:read.stop - 1], std, *unknown))
+                errors[own] = within_half_tick(motion[a], clock.rate)
+            rows.append(AveragePulses(pulses.times[read], first, errors,
+                                      pulses.missing[read.start:read.stop - 1], std, *unknown))
         known.append(rows)
     return clock, known
 
@@ -153,8 +153,8 @@ def clock_of(observation: Observation) -> tuple[Clock, Array | None]:
         return Clock(0.0, 0.0), None
     smooth = smooth_on_grid(times, clock.rate)
     share = _confirmed(observation, smooth)
-    untold = share < 1.0 - SLOPE_OFF and _independent(observation)
-    if untold or dithered(observation, clock, smooth):
+    unidentifiable = share < 1.0 - SLOPE_OFF and _independent(observation)
+    if unidentifiable or dithered(observation, clock, smooth):
         return replace(clock, dithered=True), None
     return clock, min(max(share, 0.0), 1.0) * smooth
 
@@ -224,7 +224,7 @@ def dithered(observation: Observation, clock: Clock, smooth: Array) -> bool:
 
 
 def gather(observation: Observation, lines: Lines, chosen: Sequence[int],
-           pulses: Sequence[Sequence[Pulses]], clock: Clock, effects: Sequence[Effect],
+           pulses: Sequence[Sequence[AveragePulses]], clock: Clock, effects: Sequence[Effect],
            scatter: LineEvidence) -> Evidence:
     """Return the evidence of the `chosen` acquisitions, less the contributions of `effects`."""
     model = observation.model
@@ -331,7 +331,7 @@ def _tone(observation: Observation, lines: Lines) -> Tone | None:
         return None
     frequency = np.append(fit.orders * model.fundamental_frequency, fit.tones)
     amplitudes = np.hstack([fit.amplitudes, fit.tone_amplitudes])
-    chosen = np.flatnonzero(~fit.turning)
+    chosen = np.flatnonzero(~fit.synchronous)
     if not chosen.size:
         return None
     order = np.append(lines.order, hidden_lines(observation, lines).order)

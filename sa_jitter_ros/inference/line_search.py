@@ -247,17 +247,17 @@ def prune(states: States, least: float) -> None:
     orders, tones = np.split(kept, [states.orders.size])
     states.orders, states.tones = states.orders[orders], states.tones[tones]
     states.amplitudes = states.amplitudes[:, kept]
-    states.turning, states.single = states.turning[kept], states.single[kept]
+    states.synchronous, states.movable = states.synchronous[kept], states.movable[kept]
 
 
-def nearest(lines: Array, declared: Array) -> tuple[NDArray[np.intp], Array]:
+def nearest_orders(lines: Array, declared: Array) -> tuple[NDArray[np.intp], Array]:
     """Return which `declared` order is nearest to each line (line,), and how far that is above."""
     apart = lines[:, None] - declared
     near = np.argmin(np.abs(apart), axis=1)
     return near, apart[np.arange(near.size), near]
 
 
-def _turning(states: States) -> tuple[BoolArray, BoolArray]:
+def _synchronous(states: States) -> tuple[BoolArray, BoolArray]:
     """
     Tell which orders, and tones after them (line,), turn with the shafts, and which may.
 
@@ -272,7 +272,7 @@ def _turning(states: States) -> tuple[BoolArray, BoolArray]:
     exact = np.minimum(np.abs(others - np.rint(others)),
                        np.abs(others * r - np.rint(others * r)) / r) < least
     apart = others[:, None] - declared
-    near, offset = nearest(others, declared)
+    near, offset = nearest_orders(others, declared)
     distance = np.stack([np.abs(offset), others], axis=1)
     alike = np.abs(distance[:, None, :, None] - distance[:, None, :]).min(axis=(2, 3)) < least
     known = exact & (np.arange(others.size) < states.orders.size - states.declared)
@@ -290,9 +290,9 @@ def _turning(states: States) -> tuple[BoolArray, BoolArray]:
     alone = (np.count_nonzero(close, axis=1) < 2) | (np.abs(offset) * states.span < _SKIRT)
     alone &= ~stands
     own = np.ones(states.declared, np.bool_)
-    turning, single = (np.append(own, np.any(alike & found, axis=1) | found)
-                       for found in (known | sharper, known | alone))
-    return turning, single
+    synchronous, movable = (np.append(own, np.any(alike & found, axis=1) | found)
+                            for found in (known | sharper, known | alone))
+    return synchronous, movable
 
 
 def with_a_shaft(states: States) -> BoolArray:
@@ -312,13 +312,13 @@ def with_a_shaft(states: States) -> BoolArray:
 def fit_lines(states: States) -> None:
     """Fit the amplitudes of all lines, and tell which of them turn."""
     states.fit_amplitudes()
-    states.turning, states.single = _turning(states)
+    states.synchronous, states.movable = _synchronous(states)
 
 
 def let_stand(states: States) -> None:
     """Make tones of the undeclared orders that show better over time than over angle."""
     over_angle, over_time, tones = _both_ways(states)
-    standing = (over_time > over_angle) & ~states.turning[states.declared:states.orders.size]
+    standing = (over_time > over_angle) & ~states.synchronous[states.declared:states.orders.size]
     if not standing.any():
         return
     states.orders = states.orders[np.append(np.ones(states.declared, np.bool_), ~standing)]

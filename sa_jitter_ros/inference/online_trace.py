@@ -37,7 +37,7 @@ from sa_jitter_ros.inference.trace import (
     require_acquisitions, timing_of, trace_bench)
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.prediction.amplitudes import line_variance
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
 
 Array = NDArray[Any]
@@ -143,7 +143,7 @@ def _observation(averages: Sequence[ReceivedAverage], model: DeclaredModel) -> O
         model.trigger_speed)
 
 
-def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
+def _pulses(observation: Observation) -> tuple[Clock, list[list[AveragePulses]]]:
     """
     Return the clock of the pulse times and the pulses.
 
@@ -155,13 +155,13 @@ def _pulses(observation: Observation) -> tuple[Clock, list[list[Pulses]]]:
     clock, smooth = clock_of(observation)
     if smooth is None:
         return clock, [
-            2 * [Pulses(item.times, item.first, None, item.missing)] for item in items]
+            2 * [AveragePulses(item.times, item.first, None, item.missing)] for item in items]
     grid = np.array([smooth[item.first:item.first + item.times.size] for item in items])
     recovered = np.asarray(observation.stacked('errors'))
     variance = float(np.mean(np.square(observation.stacked('standard_errors'))))
     better = recovered if ticks_leave_room(list(recovered), variance, clock.rate) else grid
     return clock, [
-        [Pulses(item.times, item.first, errors, item.missing) for errors in pair]
+        [AveragePulses(item.times, item.first, errors, item.missing) for errors in pair]
         for item, pair in zip(items, zip(grid, better))]
 
 

@@ -56,7 +56,7 @@ class RecordFit:
     of them. `orders` (order,), the first of them `declared`, and `tones` (tone,) in Hz are the
     lines; `amplitudes` (channel, order) and `tone_amplitudes` (channel, tone) complex peak
     amplitudes; `amplitude_errors` (channel, order + tone) the standard errors of their real and
-    imaginary parts. `turning` (line,) tells which orders, and tones after them, turn with the
+    imaginary parts. `synchronous` (line,) tells which orders, and tones after them, turn with the
     shafts: orders that shafts must have, those that a varying speed shows to turn, and sidebands
     of several lines. `jitter_std` (s) is the estimated size of the pulse errors; `expected_std`
     (3,) in s are the sizes of errors and bends that the fit expected, towards 0, the errors
@@ -75,7 +75,7 @@ class RecordFit:
     amplitudes: ComplexArray
     tone_amplitudes: ComplexArray
     amplitude_errors: Array
-    turning: BoolArray
+    synchronous: BoolArray
     jitter_std: float
     expected_std: Array
     trend: float
@@ -112,7 +112,7 @@ class OpenRecord:
         states.size = states.size.copy()
         fit_lines(states)
         _search(states, known)
-        states.settled = True
+        states.converged = True
         for _ in range(_MOST_STEPS):
             if states.step() < _SETTLED * states.unsure:
                 break
@@ -168,7 +168,7 @@ def _result(states: States, false_alarm: float) -> RecordFit:
     Declared lines stand out of the noise where it is as strong in fewer than `false_alarm` cases.
     """
     variance = states.variance(0)
-    weak = _WEAK * max(1.0, float(np.sqrt(variance / states.told[0]) / states.size[0]))
+    weak = _WEAK * max(1.0, float(np.sqrt(variance / states.resolved[0]) / states.size[0]))
     states.step(weak=_WEAK)
     states.step(weak=weak, move=False)
     errors = states.states[:, 0] + states.change
@@ -186,7 +186,7 @@ def _result(states: States, false_alarm: float) -> RecordFit:
         errors, np.sqrt(states.variances(0)), _roughness(states), bends, bend_errors,
         states.declared, states.orders, states.tones, states.amplitudes[:, :states.orders.size],
         states.amplitudes[:, states.orders.size:],
-        np.sqrt(variances), states.turning | with_a_shaft(states),
+        np.sqrt(variances), states.synchronous | with_a_shaft(states),
         float(states.size[0]), states.size[:3] * np.array([weak, 1.0, 1.0]), states.trend,
         bool(gammaincc(shown.size, 0.5 * shown.sum()) < false_alarm))
 

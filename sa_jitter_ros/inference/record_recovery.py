@@ -298,7 +298,7 @@ def leaking_orders(recovery: RecordRecovery, model: DeclaredModel) -> list[float
             continue
         exact = _exact(float(fit.orders[i]), model)
         order = float(fit.orders[i]) if exact is None else exact
-        wanted = order == round(order) or fit.turning[i]
+        wanted = order == round(order) or fit.synchronous[i]
         if wanted and np.abs(np.subtract((*model.orders, *found), order)).min() > resolved:
             found.append(order)
     return found

@@ -14,7 +14,7 @@ import numpy as np
 from sa_jitter_ros.effects.additive_noise import less_noise, measured_noise
 from sa_jitter_ros.effects.effect import effects_of, Finding
 from sa_jitter_ros.effects.keyphasor_quantisation import KeyphasorQuantisation
-from sa_jitter_ros.inference.gate import gain
+from sa_jitter_ros.inference.gate import score_gain
 from sa_jitter_ros.inference.remainder import predicting
 from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.scoring import Bench
@@ -58,6 +58,6 @@ def with_its_ticks(bench: Bench, chosen: list[Finding], present: list[Finding]
     chosen, present = ([item for item in items if item not in ticks]
                        for items in (chosen, present))
     own = refined.unsteadiness(effects_of(chosen))
-    worse = gain(*(predicting(item, own)(chosen) for item in (bench, refined)),
-                 of_mean=True).worse
+    worse = score_gain(*(predicting(item, own)(chosen) for item in (bench, refined)),
+                       of_mean=True).worse
     return (bench, [], chosen, present) if worse else (refined, ticks, chosen, present)

@@ -33,7 +33,7 @@ from sa_jitter_ros.inference.residual import (
     ACCURACY, FALSE_ALARM, Residual, residual, Sensitivity)
 from sa_jitter_ros.inference.unsteady import STEADY, unsteady_lines, UnsteadyLine
 from sa_jitter_ros.prediction.amplitudes import component_gain
-from sa_jitter_ros.prediction.influence import Pulses
+from sa_jitter_ros.prediction.influence import AveragePulses
 from scipy import special
 
 Array = NDArray[Any]
@@ -57,7 +57,7 @@ class Comparison:
 @dataclass(frozen=True)
 class Bench:
     """
-    Everything that scoring needs; `untold` maps effects that these data cannot show to the reason.
+    What scoring needs; `unidentifiable` maps effects to why these data cannot show them.
 
     `fewer` is the bench of averages of fewer cycles, if the acquisitions have enough of them,
     `hidden` that of declared orders that the vibration holds and that are not worth comparing.
@@ -68,14 +68,14 @@ class Bench:
     observation: Observation
     lines: Lines
     level: Array
-    pulses: Sequence[Sequence[Pulses]]
+    pulses: Sequence[Sequence[AveragePulses]]
     clock: Clock
     group: Array
     scatter: LineEvidence
     fit: tuple[int, ...]
     held_out: tuple[int, ...]
     declared: tuple[Effect, ...]
-    untold: Mapping[str, str] = field(default_factory=dict)
+    unidentifiable: Mapping[str, str] = field(default_factory=dict)
     memory: Memory = field(default_factory=Memory, repr=False)
     fewer: 'Bench | None' = None
     hidden: 'Bench | None' = None

@@ -38,7 +38,7 @@ from sa_jitter_ros.effects.lattice import (
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import FAINT, MOTION, Setting, SOURCE
 from sa_jitter_ros.inference.cycle_states import hann, independent_power
-from sa_jitter_ros.inference.line_search import APART, nearest
+from sa_jitter_ros.inference.line_search import APART, nearest_orders
 from sa_jitter_ros.inference.observation import Acquisition, Observation
 from sa_jitter_ros.inference.record_fit import RecordFit
 from sa_jitter_ros.inference.record_recovery import jitter_unit, RecordRecovery, RESOLVED
@@ -46,7 +46,7 @@ from sa_jitter_ros.inference.residual import ACCURACY
 from sa_jitter_ros.inference.timing_checks import Check, check_timing
 from sa_jitter_ros.inference.timing_choice import (
     Choice, Chooser, DECIDED, EXCESS, NO_EFFECTS, RATIO, RIPPLE, SIDEBANDS)
-from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, Stretch, Torsion
+from sa_jitter_ros.inference.timing_data import ALIASES, FEWEST, SteadyTorsion, Stretch
 from sa_jitter_ros.inference.timing_fit import JITTER, NOISE, SHAFT, TimingFit
 from sa_jitter_ros.inference.timing_shape import through
 from sa_jitter_ros.number_text import measured_text
@@ -88,7 +88,7 @@ class Timing:
         and aligning a line to it changes the line: one that is not there, or comes and goes.
         """
         fit, data = self.choice.fit, self.chooser.data
-        if self.choice.ticked or data.referenced:
+        if self.choice.quantised or data.referenced:
             return 0.0
 
         def mean(values: Sequence[Any]) -> float:
@@ -131,7 +131,8 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             # faster ones are no acceleration of the band
             slow = _turn(sidebands) <= ACCELERATION_BAND[1] + APART / fit.errors.size
             twist = np.sqrt(0.5 * np.sum(np.minimum(bends, most)[slow] ** 2))
-            torsion = [Torsion(*row) for row in zip(  # slower ones are no torsion, but a run-up
+            # slower ones are no torsion, but a run-up
+            torsion = [SteadyTorsion(*row) for row in zip(
                 _turn(sidebands), np.minimum(bends, shown) / math.sqrt(2.0), p_value)
                 if row[0] > ACCELERATION_BAND[0]]
             found.append(replace(stretch, sidebands=sidebands, twist=float(twist),
@@ -148,7 +149,7 @@ def _sidebands(fit: RecordFit, model: DeclaredModel) -> tuple[Array, Array]:
     with the revolution is no torsion, but gears.
     """
     declared, others = np.split(fit.orders, [fit.declared])
-    near, offset = nearest(others, declared)
+    near, offset = nearest_orders(others, declared)
     turns, least = np.abs(offset) * model.cycle_length, APART / fit.errors.size
     chosen = np.flatnonzero((turns > least) & (turns < ALIASES.max()))
     chosen = chosen[np.argsort(turns[chosen])]
@@ -307,7 +308,7 @@ def refitted(timing: Timing, parts: Sequence[Stretch], declared: Sequence[Effect
 
     It is `timing` itself where ticks of a clock make all errors, or where other effects result.
     """
-    if timing.choice.ticked:
+    if timing.choice.quantised:
         return timing
     chooser, best = Chooser(parts, declared), timing.choice.best
     # other stretches may have other sidebands
@@ -339,7 +340,7 @@ def _probabilities(choice: Choice, findings: Sequence[Finding]) -> Mapping[str, 
 
 def _p_value(choice: Choice, name: str, chooser: Chooser) -> float:
     """Return the p value of the likelihood gained by an effect beside the others."""
-    if choice.ticked and name == _CLOCK:
+    if choice.quantised and name == _CLOCK:
         return 0.0  # the pulse times themselves show it
     without = chooser.fit(choice.best - {name}, choice.fit.starts)
     gain = max(choice.fit.value - without.value, 0.0)

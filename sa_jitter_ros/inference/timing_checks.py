@@ -59,7 +59,7 @@ class Check:
 def check_timing(chooser: Chooser, choice: Choice) -> tuple[Check, ...]:
     """Return all checks of the best fit; few where the ticks of a clock hide what is left."""
     torsion = _torsion(chooser.data.stretches)
-    if choice.ticked:
+    if choice.quantised:
         return torsion
     tests = [(_power, PULSES), (_sinusoid, PULSES)]
     if not chooser.data.referenced:  # other pulses show nothing of the source
@@ -95,7 +95,7 @@ def _power(fit: TimingFit, inverse: Array, direction: str) -> Check:
         return np.array([np.convolve(row, window, 'same') for row in np.atleast_2d(gain)])
 
     draws = np.random.default_rng(SEED).gamma(size, 1.0 / size, (DRAWS, size.size))
-    ratio = np.where(_told(fit, inverse), fit.excess(direction, inverse), 1.0)
+    ratio = np.where(_identifiable(fit, inverse), fit.excess(direction, inverse), 1.0)
     gain = statistic(ratio)[0]
     top = int(np.argmax(gain))
     near = slice(max(top - _BINS // 2, 0), top + _BINS // 2 + 1)
@@ -140,7 +140,7 @@ def _highest(fit: TimingFit, inverse: Array, direction: str, size: Array, unit: 
              by_chance: Array) -> Check:
     """Return the test of the sinusoid that is there least `by_chance` (ordinate,)."""
     data, frequency = fit.data, fit.data.each
-    tried = (frequency > _SLOWEST / data.longest) & _told(fit, inverse)[data.bin]
+    tried = (frequency > _SLOWEST / data.longest) & _identifiable(fit, inverse)[data.bin]
     top = int(np.argmin(np.where(tried, by_chance, 2.0)))
     count = int(np.count_nonzero(tried))
     return Check(-math.expm1(count * math.log1p(-min(float(by_chance[top]), 1.0 - 1e-9))),
@@ -163,7 +163,7 @@ def _torsion(stretches: Sequence[Stretch]) -> tuple[Check, ...]:
         for count, torsion in found)
 
 
-def _told(fit: TimingFit, inverse: Array) -> Array:
+def _identifiable(fit: TimingFit, inverse: Array) -> Array:
     """Return which bins (bin,) show more than sidebands, whose shape nobody knows."""
     if SIDEBANDS not in fit.spectra:
         return np.ones(fit.data.size.size, np.bool_)

@@ -75,7 +75,7 @@ class Choice:
         return self.fits[self.best]
 
     @property
-    def ticked(self) -> bool:
+    def quantised(self) -> bool:
         """Return whether the ticks of a clock make all errors, so that no others can be told."""
         return any(isinstance(timing := EFFECTS[name].timing, Pattern) and timing.replaces_jitter
                    for name in self.best - self.fit.columns.keys() & EFFECTS.keys())
@@ -84,7 +84,7 @@ class Choice:
     def probabilities(self) -> Mapping[str, float]:
         """Return the probability of each name that was tried."""
         names = frozenset().union(*self.fits)
-        if self.ticked:
+        if self.quantised:
             return {name: float(name in self.best) for name in names}
         top = max(self.scores.values())
         odds = {key: math.exp(value - top) for key, value in self.scores.items()}
@@ -94,7 +94,7 @@ class Choice:
 
     def rivals(self, name: str) -> tuple[str, ...]:
         """Return what explains the data in place of `name` with odds that decide nothing."""
-        if self.ticked:
+        if self.quantised:
             return ()
         least = self.scores[self.best] - DECIDED
         return tuple(other for other in self.probabilities if other not in self.best and (
@@ -386,8 +386,8 @@ class Chooser:
         if SIDEBANDS not in self.spectra or self.score(more, self.fit(more)) < self.score(
                 alone, self.fit(alone)):
             return best
-        fit, ticked = copy(self.fit(more)), self.fits[best]
-        fit.sizes, fit.size_covariance = ticked.sizes, ticked.size_covariance
+        fit, quantised = copy(self.fit(more)), self.fits[best]
+        fit.sizes, fit.size_covariance = quantised.sizes, quantised.size_covariance
         self.fits[best | {SIDEBANDS}] = fit
         return best | {SIDEBANDS}
 

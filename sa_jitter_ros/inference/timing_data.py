@@ -42,7 +42,7 @@ FEWEST = 12
 
 
 @dataclass(frozen=True)
-class Torsion:
+class SteadyTorsion:
     """
     A steady torsion of the shaft that sidebands and pulse times show alike.
 
@@ -81,7 +81,7 @@ class Stretch:
     referenced: bool = False
     sidebands: Array = field(default_factory=lambda: np.zeros(0))
     twist: float = 0.0
-    torsion: Torsion | None = None
+    torsion: SteadyTorsion | None = None
     held: bool = True
 
 

@@ -80,10 +80,10 @@ class Shapes:
         for item, values in zip(data.stretches, errors):
             if item.error_std > _CLEAR * data.unit:
                 continue
-            told = item.measured.copy()  # by the others: a missing one tells nothing
-            told[1:] &= item.measured[:-1]
-            told[:-1] &= item.measured[1:]
-            beyond = through(values, inverse / mean, data)[told][EDGE:-EDGE]
+            usable = item.measured.copy()  # by the others: a missing one tells nothing
+            usable[1:] &= item.measured[:-1]
+            usable[:-1] &= item.measured[1:]
+            beyond = through(values, inverse / mean, data)[usable][EDGE:-EDGE]
             normal = _normal(beyond, 1.0 / mean)
             # the trend that was taken out is known as well as so many errors tell it
             trend = 2.0 / mean / values.size

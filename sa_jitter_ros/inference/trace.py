@@ -179,7 +179,7 @@ def trace_bench(bench: Bench, timing: Timing | None, *, progress: Progress | Non
         rows, (*undecided_effects(few, effects, rows), *assumed),
         probabilities(timing, candidates), '', noise, final[len(chosen) + len(present):],
         as_declared, gained, left_over, unsteady,
-        {**bench.untold, **_without_timing(timing)}, bench.clock)
+        {**bench.unidentifiable, **_without_timing(timing)}, bench.clock)
 
 
 def _of_findings(chosen: Sequence[Finding], present: Sequence[Finding],
@@ -202,7 +202,7 @@ def _not_tried(bench: Bench, timing: Timing | None, candidates: Sequence[Candida
         elif timing is not None and name in timing.probabilities:
             reason = 'the likelihood of the timing gains too little by it'
         else:
-            reason = bench.untold.get(name, UNSEEN)
+            reason = bench.unidentifiable.get(name, UNSEEN)
         found.append(Candidate(name, 0, absent(name, reason), None, reason))
     return found
 

@@ -22,7 +22,7 @@ from sa_jitter_ros.effects.lattice import Clock, NO_CLOCK
 from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.expectation import Expectation, Lines
-from sa_jitter_ros.inference.gate import Gain, NO_GAIN
+from sa_jitter_ros.inference.gate import NO_GAIN, ScoreGain
 from sa_jitter_ros.inference.limits import Limit
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import Residual, UNDEFINED
@@ -86,7 +86,7 @@ class Trace:
     noise: tuple[float, float] | None = None
     refinements: tuple[Finding, ...] = ()
     as_declared: Residual = UNDEFINED
-    gain: Gain = NO_GAIN
+    gain: ScoreGain = NO_GAIN
     remains: str = ''
     unsteady: tuple[UnsteadyLine, ...] = ()
     not_testable: Mapping[str, str] = field(default_factory=dict)

@@ -24,18 +24,18 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
-from sa_jitter_ros.keyphasor_check.clock import clock_of, is_decimal
+from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
 from sa_jitter_ros.keyphasor_check.declared_parts import contradictions
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
-    find_lines, is_usual, Lines, marks_evidence, on_orders, ratio_evidence, speed_ripples,
+    find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
     usual_marks)
 from sa_jitter_ros.keyphasor_check.marks import fit_pulses, FittedPulses
-from sa_jitter_ros.keyphasor_check.result import Finding, KeyphasorCheck, Warn
+from sa_jitter_ros.keyphasor_check.result import Checked, KeyphasorCheck, Warn
 from sa_jitter_ros.keyphasor_check.teeth import FEWEST, number_pulses, NumberedPulses
 from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, recovered_jitter
-from sa_jitter_ros.keyphasor_check.wheel import Pattern, patterns
+from sa_jitter_ros.keyphasor_check.wheel import Marking, patterns
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
 from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_factor
@@ -112,7 +112,7 @@ class _Check:
         times = self._pulses()
         self._progress(f'{times.size} pulses from {times[0]:.6g} s to {times[-1]:.6g} s')
         numbered = number_pulses(times)
-        clock = clock_of(numbered.times, largest=self._largest)
+        clock = find_clock(numbered.times, largest=self._largest)
         tick = 1.0 / clock.rate if clock.rate else 0.0
         self._progress('looking for the pattern of the target')
         found = patterns(numbered)
@@ -151,7 +151,7 @@ class _Check:
             samples, times, fitted, ratio, clock)
         findings = {
             'pulses_per_revolution': marks,
-            'missing_teeth': Finding(
+            'missing_teeth': Checked(
                 count - fitted.pattern.present,
                 decided_by='teeth without a pulse in every revolution' if decided else ''),
             'marks': self._target(fitted, decided, even),
@@ -250,8 +250,8 @@ class _Check:
 
     # --- marks ---
 
-    def _marks(self, numbered: NumberedPulses, found: Sequence[Pattern], lines: Lines | None
-               ) -> tuple[Finding, bool]:
+    def _marks(self, numbered: NumberedPulses, found: Sequence[Marking], lines: ToothLines | None
+               ) -> tuple[Checked, bool]:
         """Return the marks of a revolution, and whether the pulses themselves show them."""
         declared = self._recording.pulses_per_revolution
         probability, vibration = self._probabilities(numbered, found, lines)
@@ -279,10 +279,10 @@ class _Check:
             self._warn(
                 'marks_contradict', f'the recording states {declared} marks a revolution, but the '
                 f'pulses show {best}: check pulses_per_revolution', spoils=True)
-        return Finding(best, None, '1', others, by), shown
+        return Checked(best, None, '1', others, by), shown
 
-    def _probabilities(self, numbered: NumberedPulses, found: Sequence[Pattern],
-                       lines: Lines | None) -> tuple[dict[int, float], dict[int, float]]:
+    def _probabilities(self, numbered: NumberedPulses, found: Sequence[Marking],
+                       lines: ToothLines | None) -> tuple[dict[int, float], dict[int, float]]:
         """Return the probability of each number of marks, and what the vibration says for it."""
         declared = self._recording.pulses_per_revolution
         span = int(numbered.numbers[-1] - numbered.numbers[0])
@@ -300,8 +300,8 @@ class _Check:
             log[declared] += _DECLARED
         return _normalised(log), vibration
 
-    def _at_both_rates(self, marks: Finding, numbered: NumberedPulses, found: Sequence[Pattern],
-                       lines: Lines | None, others: Lines | None) -> Finding:
+    def _at_both_rates(self, marks: Checked, numbered: NumberedPulses, found: Sequence[Marking],
+                       lines: ToothLines | None, others: ToothLines | None) -> Checked:
         """Return the marks, and say what they are at the other sampling rate."""
         probability, _ = self._probabilities(numbered, found, others)
         other = max(probability, key=lambda count: probability[count])
@@ -319,38 +319,38 @@ class _Check:
         return replace(marks, decided_by=f'{marks.decided_by}; the sampling rate may be '
                        f'{self._other_rate:.10g} Hz: {decides}')
 
-    def _target(self, fitted: FittedPulses, shown: bool, even: bool) -> Finding:
+    def _target(self, fitted: FittedPulses, shown: bool, even: bool) -> Checked:
         pattern = fitted.pattern
         scale = 2.0 * math.pi / pattern.teeth
         errors = np.nan_to_num(pattern.errors * scale, nan=0.0)
         if even:
-            return Finding([0.0] * pattern.present, errors.tolist(), 'rad', (), 'the lines of the '
+            return Checked([0.0] * pattern.present, errors.tolist(), 'rad', (), 'the lines of the '
                            'vibration are sharper between even marks: the speed changes with the '
                            'revolution')
-        return Finding(
+        return Checked(
             (pattern.marks * scale).tolist(), errors.tolist() if pattern.teeth > 1 else None,
             'rad', (), 'mean place of each mark over the revolutions, late positive; a ripple of '
             'the speed with the revolution looks the same' if shown else '')
 
     # --- clock and jitter ---
 
-    def _clock(self, clock: Clock, times: FloatArray) -> Finding:
+    def _clock(self, clock: Clock, times: FloatArray) -> Checked:
         recording = self._recording
         if self._from_waveform:
-            return Finding(recording.tach_rate, None, 'Hz', (), 'sampling rate of the tach '
+            return Checked(recording.tach_rate, None, 'Hz', (), 'sampling rate of the tach '
                            'waveform, between whose samples pulses are interpolated')
         if not clock.rate:
             stated = recording.tach_rate
-            return Finding(stated, None, 'Hz', (), 'stated by the recording' if stated else
+            return Checked(stated, None, 'Hz', (), 'stated by the recording' if stated else
                            'no grid in the pulse times: they are not rounded to a clock')
         if is_decimal(clock.rate):
-            return Finding(clock.rate, clock.standard_error, 'Hz', (), 'all pulse times are '
+            return Checked(clock.rate, clock.standard_error, 'Hz', (), 'all pulse times are '
                            'multiples of its period, which may be their last written decimal')
-        return Finding(clock.rate, clock.standard_error, 'Hz', (),
+        return Checked(clock.rate, clock.standard_error, 'Hz', (),
                        'all pulse times are multiples of its period')
 
     def _averaged(self, samples: FloatArray, times: FloatArray, fitted: FittedPulses,
-                  ratio: Finding, clock: Clock) -> dict[bool, tuple[Average, ...]]:
+                  ratio: Checked, clock: Clock) -> dict[bool, tuple[Average, ...]]:
         """Return averages with corrected jitter (True), and short ones at their speed (False)."""
         measured = measure_jitter(fitted.true, fitted.numbers)
         size = measured.std if measured else fitted.scatter
@@ -366,14 +366,14 @@ class _Check:
             keyphasor_rate=1.0 / expected, correct_jitter=correct)
             for correct, count in cycles.items()}
 
-    def _jitter(self, fitted: FittedPulses, averages: Sequence[Average]) -> dict[str, Finding]:
+    def _jitter(self, fitted: FittedPulses, averages: Sequence[Average]) -> dict[str, Checked]:
         alone = measure_jitter(fitted.true, fitted.numbers)
         recovered = recovered_jitter(averages)
         if alone is None and recovered is None:
             by = (f'the motion makes all of the scatter, {1e6 * fitted.scatter:.2g} us: a '
                   'vibration with strong orders decides')
-            return {'jitter_std': Finding(None, None, 's', (), by),
-                    'jitter_correlation': Finding(None, None, '1', (), by)}
+            return {'jitter_std': Checked(None, None, 's', (), by),
+                    'jitter_correlation': Checked(None, None, '1', (), by)}
         best, by = alone, 'scatter of the pulses beside their neighbours'
         if recovered is not None:
             apart = 0.0 if alone is None else (recovered.std - alone.std) / math.hypot(
@@ -384,20 +384,20 @@ class _Check:
                 by += (f'; the pulses alone show {1e6 * alone.std:.3g} us, so that the rest is '
                        'slow, or the vibration wanders against the tach shaft')
         assert best is not None
-        return {'jitter_std': Finding(best.std, best.std_error, 's', (), by),
-                'jitter_correlation': Finding(
+        return {'jitter_std': Checked(best.std, best.std_error, 's', (), by),
+                'jitter_correlation': Checked(
                     None, None, '1', (), 'motion hides it: vibration with strong orders decides')
-                if math.isnan(best.correlation) else Finding(
+                if math.isnan(best.correlation) else Checked(
                     best.correlation, best.correlation_error, '1', (), by)}
 
     # --- speed and orders ---
 
-    def _speed(self, fitted: FittedPulses) -> Finding:
+    def _speed(self, fitted: FittedPulses) -> Checked:
         speed = fitted.speed
-        return Finding({'minimum': float(speed.min()), 'mean': fitted.mean_speed,
+        return Checked({'minimum': float(speed.min()), 'mean': fitted.mean_speed,
                         'maximum': float(speed.max())}, None, 'Hz', (), 'times of revolutions')
 
-    def _ratio(self, lines: Lines | None) -> tuple[Finding, Finding]:
+    def _ratio(self, lines: ToothLines | None) -> tuple[Checked, Checked]:
         stated = self._recording.ratio
         if lines is None or not lines.places.size:
             silent = self._recording.samples < _FEWEST_SAMPLES
@@ -408,8 +408,8 @@ class _Check:
                     'no_orders', 'no order of the tach shaft stands above the noise of the '
                     'vibration: check that tach and vibration are of the same machine and time, '
                     'and sample_rate')
-            return (Finding(stated if stated != 1.0 else None, None, '1', (), 'stated' if stated
-                            != 1.0 else reason), Finding(None, None, '1', (), reason))
+            return (Checked(stated if stated != 1.0 else None, None, '1', (), 'stated' if stated
+                            != 1.0 else reason), Checked(None, None, '1', (), reason))
         if stated != 1.0:
             best, probability, others = stated, 1.0, []
             by = 'stated by the recording'
@@ -440,12 +440,12 @@ class _Check:
             self._warn(
                 'orders_weak', 'stated orders that do not stand above the noise: '
                 + ', '.join(f'{g:g}' for g in missing[:8]))
-        return (Finding(best, lines.step * 0.1 if best != 1.0 and stated == 1.0 else None, '1',
+        return (Checked(best, lines.step * 0.1 if best != 1.0 and stated == 1.0 else None, '1',
                         tuple((ratio, round(value, 4)) for ratio, value in others
                               if value > _LISTED), by),
-                Finding(listed or None, None, '1', (), 'lines of the vibration over the angle'))
+                Checked(listed or None, None, '1', (), 'lines of the vibration over the angle'))
 
-    def _ranked(self, lines: Lines) -> list[tuple[float, float]]:
+    def _ranked(self, lines: ToothLines) -> list[tuple[float, float]]:
         """Return the ratios that fit, best first, each with its probability."""
         ranked = ratio_evidence(lines, self._teeth)
         _, own = on_orders(lines, 1.0)
@@ -458,13 +458,13 @@ class _Check:
         return [(1.0, 1.0 - _ANOTHER), *((ratio, _ANOTHER * value / total)
                                          for ratio, value in others)]
 
-    def _delay(self, averages: Sequence[Average], ratio: Finding) -> Finding:
+    def _delay(self, averages: Sequence[Average], ratio: Checked) -> Checked:
         if not averages:
-            return Finding(None, None, 's', (), 'no averages of the vibration')
+            return Checked(None, None, 's', (), 'no averages of the vibration')
         delay, why = path_delay(averages, float(ratio.value or 1.0))
         if delay is None:
-            return Finding(None, None, 's', (), why)
-        return Finding(delay.delay, delay.standard_error, 's', (),
+            return Checked(None, None, 's', (), why)
+        return Checked(delay.delay, delay.standard_error, 's', (),
                        'phases of the orders turn alike with the speed')
 
 
@@ -480,8 +480,8 @@ def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
             'its threshold, its cable and the distance of the sensor')
 
 
-def _counted(times: FloatArray, by: str) -> Finding:
-    return Finding({'count': int(times.size), 'times': times.tolist()}, None, '1', (), by)
+def _counted(times: FloatArray, by: str) -> Checked:
+    return Checked({'count': int(times.size), 'times': times.tolist()}, None, '1', (), by)
 
 
 def _normalised(log: dict[int, float]) -> dict[int, float]:

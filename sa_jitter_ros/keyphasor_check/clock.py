@@ -22,14 +22,14 @@ _FEWEST = 12
 _DECIMALS = 1e6  # Hz; a power of ten from there on may be a decimal
 
 
-def clock_of(times: FloatArray, *, largest: float = 0.0) -> Clock:
+def find_clock(times: FloatArray, *, largest: float = 0.0) -> Clock:
     """
     Return the clock whose ticks all pulse `times` (n,) in s are; its rate is 0 where none is.
 
     `largest` is the largest time in s before any shift, which decides how times are rounded.
 
     >>> times = np.ceil(np.linspace(1.0, 3.0, 200) ** 2 * 51200.0) / 51200.0
-    >>> round(clock_of(times).rate, 3)
+    >>> round(find_clock(times).rate, 3)
     51200.0
     """
     times = np.unique(times[:_MOST])

@@ -20,7 +20,7 @@ from sa_jitter_ros.effects.library import predict
 from sa_jitter_ros.errors import SaJitterError
 from sa_jitter_ros.keyphasor_check.clock import is_decimal
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
-from sa_jitter_ros.keyphasor_check.result import Finding, Warn
+from sa_jitter_ros.keyphasor_check.result import Checked, Warn
 from sa_jitter_ros.keyphasor_check.teeth import number_pulses
 from sa_jitter_ros.keyphasor_check.wheel import patterns
 
@@ -45,7 +45,7 @@ _MOST_PULSES = 5000
 _CLEAR_PATTERN, _CERTAIN_PATTERN = 10.0, 40.0
 
 
-def costs(findings: Mapping[str, Finding], fitted: FittedPulses, times: FloatArray,
+def costs(findings: Mapping[str, Checked], fitted: FittedPulses, times: FloatArray,
           orders: Sequence[float], from_marks: Losses | None) -> list[Warn]:
     """
     Return the warnings that findings call for, with the loss in percent at each order.
@@ -100,7 +100,7 @@ def _of_marks(fitted: FittedPulses, ratio: float, orders: Sequence[float]) -> li
         _percent(orders, loss))]
 
 
-def _of_jitter(findings: Mapping[str, Finding], fitted: FittedPulses, ratio: float,
+def _of_jitter(findings: Mapping[str, Checked], fitted: FittedPulses, ratio: float,
                orders: Sequence[float]) -> list[Warn]:
     speed = findings['speed'].value['mean']
     clock, memory = findings['clock_rate'], findings['jitter_correlation']

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.keyphasor_check.lines import Lines
+from sa_jitter_ros.keyphasor_check.lines import ToothLines
 from sa_jitter_ros.keyphasor_check.result import Warn
 from sa_jitter_ros.machine import Machine
 
@@ -29,7 +29,7 @@ _MISCOUNTED = (-3, -2, -1, 1, 2, 3)  # teeth
 _LINES, _CLEAR = 2, 3.0
 
 
-def contradictions(lines: Lines | None, machine: Machine) -> list[Warn]:
+def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
     """
     Return what the lines of the vibration, in orders of the tach shaft, say against a machine.
 
@@ -84,16 +84,16 @@ def _variants(machine: Machine) -> Iterator[tuple[str, int, int, Machine]]:
                     yield f'{kind}.{name}.{key}', value, other, variant
 
 
-def _fitting(lines: Lines, machine: Machine) -> NDArray[np.bool_]:
+def _fitting(lines: ToothLines, machine: Machine) -> NDArray[np.bool_]:
     """Return which lines (n,) are at a mesh or a sideband of a machine."""
     return _near(lines, np.array([place for name, place in machine.places().items()
                                   if name.startswith('mesh ')]))
 
 
-def _near(lines: Lines, places: FloatArray) -> NDArray[np.bool_]:
+def _near(lines: ToothLines, places: FloatArray) -> NDArray[np.bool_]:
     distance = np.abs(lines.places[:, None] - places).min(axis=1)
     return np.asarray(distance < _NEAR * lines.step)
 
 
-def _weight(lines: Lines, chosen: NDArray[np.bool_]) -> float:
+def _weight(lines: ToothLines, chosen: NDArray[np.bool_]) -> float:
     return float(np.log(lines.sizes[chosen]).sum())

@@ -58,7 +58,7 @@ _SEVERAL_MARKS, _EVEN, _MOST_TURNS, _MOST_ORDERS, _SHARPER = 4, 1e-4, 200, 200, 
 
 
 @dataclass(frozen=True)
-class Lines:
+class ToothLines:
     """
     Lines of the vibration: `places` (n,) in cycles a tooth, ascending, and their `sizes` (n,).
 
@@ -81,13 +81,13 @@ class Lines:
         count = np.count_nonzero((self.places > least) & (self.places < most))
         return min(1.0, _LOBE * self.step * count / (most - least))
 
-    def scaled(self, factor: float) -> 'Lines':
+    def scaled(self, factor: float) -> 'ToothLines':
         """Return the lines with places in cycles of something `factor` teeth long."""
-        return Lines(self.places * factor, self.sizes, self.levels, self.step * factor)
+        return ToothLines(self.places * factor, self.sizes, self.levels, self.step * factor)
 
 
 def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray,
-               turned: FloatArray, *, weak: bool = False) -> Lines | None:
+               turned: FloatArray, *, weak: bool = False) -> ToothLines | None:
     """
     Return the lines in `samples` (sample, channel) over the angle, also `weak` ones if asked.
 
@@ -121,7 +121,7 @@ def find_lines(samples: FloatArray, start: float, rate: float, times: FloatArray
                            for k in (-1, 0, 1))
     bend = left - 2.0 * middle + right
     offset = np.where(bend < 0.0, 0.5 * (left - right) / np.minimum(bend, -1e-12), 0.0)
-    return Lines((found + np.clip(offset, -0.5, 0.5)) * step, size[found], level[found], step)
+    return ToothLines((found + np.clip(offset, -0.5, 0.5)) * step, size[found], level[found], step)
 
 
 def _spectrum(samples: FloatArray, places: FloatArray, turned: FloatArray) -> FloatArray:
@@ -145,7 +145,7 @@ def _background(spectrum: FloatArray) -> FloatArray:
                      for column in medians.T]).T
 
 
-def marks_evidence(lines: Lines | None, counts: Sequence[int]) -> dict[int, float]:
+def marks_evidence(lines: ToothLines | None, counts: Sequence[int]) -> dict[int, float]:
     """
     Return the logarithm of the likelihood of each number of marks in a revolution.
 
@@ -177,7 +177,7 @@ def usual_marks(count: int) -> float:
     return -math.log(count) - (0.0 if is_usual(count) else _UNUSUAL)
 
 
-def _families(lines: Lines) -> list[list[int]]:
+def _families(lines: ToothLines) -> list[list[int]]:
     """Return the lines in groups of one line and its multiples."""
     left, families = list(range(lines.places.size)), []
     while left:
@@ -196,7 +196,7 @@ def _families(lines: Lines) -> list[list[int]]:
     return families
 
 
-def _says(lines: Lines, family: list[int], count: int) -> tuple[float, bool]:
+def _says(lines: ToothLines, family: list[int], count: int) -> tuple[float, bool]:
     """
     Return the log likelihood that a family lies on multiples of 1/count, over any other place.
 
@@ -218,14 +218,14 @@ def _says(lines: Lines, family: list[int], count: int) -> tuple[float, bool]:
     return float(weight @ one) if on[0] else 0.0, whole or once
 
 
-def on_orders(lines: Lines, ratio: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+def on_orders(lines: ToothLines, ratio: float) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return the orders (n,) of lines, in cycles a revolution, of a shaft, and which fit."""
     orders = np.rint(lines.places / ratio)
     near = np.abs(lines.places - orders * ratio) < _WIDTH * lines.step
     return orders, near & (orders > 0.0)
 
 
-def ratio_evidence(lines: Lines, teeth: Sequence[int] = ()) -> list[tuple[float, float]]:
+def ratio_evidence(lines: ToothLines, teeth: Sequence[int] = ()) -> list[tuple[float, float]]:
     """
     Return ratios of a shaft whose orders the lines are, with their probabilities, best first.
 
@@ -262,13 +262,13 @@ def ratio_evidence(lines: Lines, teeth: Sequence[int] = ()) -> list[tuple[float,
     return _normalised(log, lines.step)
 
 
-def _per_line(lines: Lines, ratio: float) -> float:
+def _per_line(lines: ToothLines, ratio: float) -> float:
     """Return what a line on an order of a shaft says for it: little where orders are dense."""
     chance = min(1.0, 2.0 * _WIDTH * lines.step / ratio)
     return math.log(1.0 - _FOLLOWS + _FOLLOWS / chance)
 
 
-def _fine(lines: Lines, ratio: float, strong: NDArray[np.intp]) -> float:
+def _fine(lines: ToothLines, ratio: float, strong: NDArray[np.intp]) -> float:
     """Return a ratio adjusted to the lines that are its multiples."""
     for _ in range(3):
         orders = np.rint(lines.places[strong] / ratio)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
 from sa_jitter_ros.parameter_file import section_text
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
 # close_loop compares no fewer cycles; cycles from mark to mark are more, and corrected together
 _LEAST_CYCLES, _MOST_CYCLES, _AVERAGES, _MOST_FROM_MARKS = 5, 100, 8, 400
@@ -61,8 +61,8 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
     if tick > _COARSE * pitch:  # intervals scatter by a tick to either side
         nodes['synchronous_averager']['interval_tolerance'] = min(
             _WIDEST, _TICKS * tick / pitch)
-    target = TargetGeometry(np.array(check.findings['marks'].value),
-                            np.array(check.findings['marks'].standard_error or 0.0))
+    target = MarkOffsets(np.array(check.findings['marks'].value),
+                         np.array(check.findings['marks'].standard_error or 0.0))
     turn = np.abs(target.angles).max() * common[f'{_SHAFT}.ratio'] * max(found['orders'] or [1.0])
     if target.standard_errors.all() and target.significant and turn > _SHOWS:
         nodes['synchronous_averager'] |= {

@@ -20,8 +20,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from sa_jitter_ros.keyphasor_check.teeth import joined, nearest, NumberedPulses
-from sa_jitter_ros.keyphasor_check.wheel import Pattern, pattern_of
+from sa_jitter_ros.keyphasor_check.teeth import joined_parts, nearest_pulses, NumberedPulses
+from sa_jitter_ros.keyphasor_check.wheel import Marking, pattern_of
 from sa_jitter_ros.pulses.target_geometry import measured_geometry, motion_of
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +48,7 @@ class FittedPulses:
     which a mark has no pulse. `speed` (n - 1,) is that of the tach shaft in Hz between pulses.
     """
 
-    pattern: Pattern
+    pattern: Marking
     true: FloatArray
     numbers: IntArray
     breaks: IntArray
@@ -144,7 +144,7 @@ def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> Fitt
             aligned = _aligned(part, pattern)
             parts[k] = _fitted(aligned, pattern, tick)[1] if (
                 part.times.size >= _NEIGHBOURS) else aligned
-    pulses = joined(parts, teeth)
+    pulses = joined_parts(parts, teeth)
     late = pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
     true = pulses.times - late
     wanted = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
@@ -159,8 +159,8 @@ def fit_pulses(pulses: NumberedPulses, teeth: int, *, tick: float = 0.0) -> Fitt
                         np.asarray(lost), pulses.times)
 
 
-def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
-            ) -> tuple[Pattern, NumberedPulses]:
+def _fitted(pulses: NumberedPulses, pattern: Marking, tick: float
+            ) -> tuple[Marking, NumberedPulses]:
     """Return the pattern with its marks measured, and the pulses on it."""
     for _ in range(_ROUNDS):
         on_mark = ~pattern.missing[pattern.tooth(pulses.numbers)]
@@ -175,7 +175,7 @@ def _fitted(pulses: NumberedPulses, pattern: Pattern, tick: float
     return pattern, pulses
 
 
-def _aligned(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
+def _aligned(pulses: NumberedPulses, pattern: Marking) -> NumberedPulses:
     """Return pulses behind a standstill with numbers that fit the pattern in front of it."""
     late = np.where(pattern.missing, np.inf, pattern.late())
     away = [np.abs(pulses.places - late[pattern.tooth(pulses.numbers + shift)])
@@ -184,7 +184,7 @@ def _aligned(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     return replace(pulses, numbers=pulses.numbers + int(np.argmin(costs)))
 
 
-def _measured(pulses: NumberedPulses, pattern: Pattern) -> tuple[NumberedPulses, Pattern]:
+def _measured(pulses: NumberedPulses, pattern: Marking) -> tuple[NumberedPulses, Marking]:
     """Return the pattern with the marks where the pulses show them, and the pitch there."""
     teeth = np.flatnonzero(~pattern.missing)
     found = measured_geometry(pulses.times, pulses.numbers - pattern.origin, teeth, pattern.teeth)
@@ -196,13 +196,13 @@ def _measured(pulses: NumberedPulses, pattern: Pattern) -> tuple[NumberedPulses,
     return replace(pulses, pitch=pitch[pulses.numbers - pulses.numbers[0]]), pattern
 
 
-def _smooth(pulses: NumberedPulses, pattern: Pattern) -> FloatArray:
+def _smooth(pulses: NumberedPulses, pattern: Marking) -> FloatArray:
     """Return when the teeth from the first to the last number (m,) would pass if even, in s."""
     true = pulses.times - pattern.late()[pattern.tooth(pulses.numbers)] * pulses.pitch
     return motion_of(true, pulses.numbers - pulses.numbers[0], pattern.teeth)
 
 
-def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
+def _chosen_again(pulses: NumberedPulses, pattern: Marking) -> NumberedPulses:
     """Return the pulses and strays that stand nearest to the marks, which are known by now."""
     grid = np.arange(pulses.numbers[0], pulses.numbers[-1] + 1)
     late = pattern.late()[pattern.tooth(grid)]
@@ -213,7 +213,7 @@ def _chosen_again(pulses: NumberedPulses, pattern: Pattern) -> NumberedPulses:
     after = np.clip(np.searchsorted(expected, every), 1, marks.size - 1)
     near = after - (every - expected[after - 1] < expected[after] - every)
     away = np.abs(every - expected[near]) / pitch[marks[near]]
-    kept = nearest(near, away)
+    kept = nearest_pulses(near, away)
     # Where the speed is not known well, as at the ends and beside gaps, pulses keep their number.
     fixed = np.isin(every, pulses.times) & (
         (away > _NEAR) | (near < pattern.teeth) | (near >= marks.size - pattern.teeth))

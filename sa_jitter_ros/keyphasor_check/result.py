@@ -14,14 +14,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sa_jitter_ros.keyphasor_check.lines import Lines
+from sa_jitter_ros.keyphasor_check.lines import ToothLines
 from sa_jitter_ros.keyphasor_check.marks import FittedPulses
 
 _SHOWN = 4  # numbers, orders, or alternatives in a line of the summary
 
 
 @dataclass(frozen=True)
-class Finding:
+class Checked:
     """
     A value (None: unknown) with its standard error, and what decided it or would decide it.
 
@@ -55,10 +55,10 @@ class KeyphasorCheck:
     from mark to mark are proposed.
     """
 
-    findings: Mapping[str, Finding]
+    findings: Mapping[str, Checked]
     warnings: tuple[Warn, ...]
     fitted: FittedPulses
-    lines: Lines | None
+    lines: ToothLines | None
     sample_rate: float
     from_waveform: bool = False
     by_marks: bool = False
@@ -88,7 +88,7 @@ class KeyphasorCheck:
         return '\n'.join(lines)
 
 
-def _shown(item: Finding) -> str:
+def _shown(item: Checked) -> str:
     """Return a finding in one line."""
     value = item.value
     if value is None:

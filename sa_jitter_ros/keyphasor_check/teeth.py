@@ -96,7 +96,7 @@ class NumberedPulses:
         return parts
 
 
-def joined(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
+def joined_parts(parts: Sequence[NumberedPulses], teeth: int) -> NumberedPulses:
     """Return parts as one; the count goes on from part to part by whole targets of `teeth`."""
     numbers = [parts[0].numbers]
     for part in parts[1:]:
@@ -159,7 +159,7 @@ def _numbered(times: FloatArray, window: int, scale: float) -> NumberedPulses:
     strays = np.empty(0)
     for step in range(_PASSES):
         numbers, places, breaks = _places(times, pitch, silent, window)
-        kept = nearest(numbers, np.abs(places))
+        kept = nearest_pulses(numbers, np.abs(places))
         far = np.abs(places) > _FAR
         if np.mean(far) < 0.5:
             kept &= ~far
@@ -233,7 +233,7 @@ def _smooth(values: NDArray[Any], window: int) -> NDArray[Any]:
     return np.asarray(np.convolve(values, weight)[half:half + values.size])
 
 
-def nearest(numbers: IntArray, away: FloatArray) -> BoolArray:
+def nearest_pulses(numbers: IntArray, away: FloatArray) -> BoolArray:
     """Return which pulses (n,), so far `away`, are nearest among those of the same number."""
     order = np.lexsort((away, numbers))
     first = np.append(True, np.diff(numbers[order]) != 0)

@@ -44,7 +44,7 @@ _CLEAR, _MOST_PATTERNS = 3.0, 4
 
 
 @dataclass(frozen=True)
-class Pattern:
+class Marking:
     """
     A target of `teeth` positions.
 
@@ -77,7 +77,7 @@ class Pattern:
         return full
 
 
-def patterns(pulses: NumberedPulses) -> list[Pattern]:
+def patterns(pulses: NumberedPulses) -> list[Marking]:
     """
     Return the patterns that the pulses support better than an even target, the best first.
 
@@ -89,7 +89,7 @@ def patterns(pulses: NumberedPulses) -> list[Pattern]:
     most = min(_MOST_TEETH, span // _FEWEST_REVOLUTIONS)
     even = _evidence(numbers, places, 1)
     gains = np.array([_evidence(numbers, places, n) - even for n in range(2, most + 1)])
-    found: list[Pattern] = []
+    found: list[Marking] = []
     for index in np.argsort(-gains):
         teeth, gain = int(index) + 2, float(gains[index])
         if gain <= _CLEAR or len(found) == _MOST_PATTERNS:
@@ -99,7 +99,7 @@ def patterns(pulses: NumberedPulses) -> list[Pattern]:
     return found
 
 
-def _once(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
+def _once(pulses: NumberedPulses, pattern: Marking) -> Marking:
     """
     Return the pattern of a wheel whose gaps repeat as one of a single repetition.
 
@@ -112,7 +112,7 @@ def _once(pulses: NumberedPulses, pattern: Pattern) -> Pattern:
     return pattern
 
 
-def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Pattern:
+def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Marking:
     """Return the pattern of a target of so many teeth, the errors of its marks not known yet."""
     part = _longest(pulses)
     numbers, places = pulses.numbers[part], pulses.places[part]
@@ -125,7 +125,7 @@ def pattern_of(pulses: NumberedPulses, teeth: int, evidence: float = 0.0) -> Pat
     late = np.array([np.median(places[classes == (tooth + origin) % teeth])
                      for tooth in np.flatnonzero(~missing)])
     # Where teeth are missing, those that are there need not have the mean place 0.
-    return Pattern(teeth, missing, late - late.mean(), np.full(late.size, np.nan), origin,
+    return Marking(teeth, missing, late - late.mean(), np.full(late.size, np.nan), origin,
                    evidence)
 
 

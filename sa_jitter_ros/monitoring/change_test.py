@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.monitoring.evidence import Evidence, SIZES, threshold
+from sa_jitter_ros.monitoring.evidence import ChangeEvidence, SIZES, threshold
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 
 FloatArray = NDArray[np.float64]
@@ -105,7 +105,7 @@ class ChangeTest:
         if learning < LEAST_LEARNED:
             raise ParameterError(f'learning is {learning} values: give at least {LEAST_LEARNED}')
         self.shape, self.learning, self.memory = shape, learning, memory
-        self.evidence = Evidence(shape)
+        self.evidence = ChangeEvidence(shape)
         self.bins: dict[int, SpeedBin] = {}
         self.active: BoolArray = np.zeros(shape, np.bool_)
         #: Index in `SIZES` of an active change, and mark of the value with which it began.

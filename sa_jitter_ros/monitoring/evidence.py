@@ -64,7 +64,7 @@ def threshold(scores: float) -> float:
     return scores * overshoot()
 
 
-class Evidence:
+class ChangeEvidence:
     """
     Evidence of changes of quantities, of one or more units that are judged apart.
 

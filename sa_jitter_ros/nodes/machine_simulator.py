@@ -91,7 +91,7 @@ EFFECT_DEFAULTS = {
 }
 
 
-def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
+def simulated_shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     """Return the parameters of one shaft."""
     return (
         Parameter(f'{shaft}.ratio', 1.0, 'speed of this shaft / speed of the tach shaft',
@@ -107,7 +107,7 @@ def shaft_parameters(shaft: str) -> tuple[Parameter, ...]:
     )
 
 
-def effects_of(values: Values) -> tuple[Effect, ...]:
+def simulated_effects(values: Values) -> tuple[Effect, ...]:
     """Return declared jitter and noise and the enabled effects; raises `ParameterError`."""
     options = {effect.name: dict(effect.values) for effect in enabled_effects(values)}
     declared: list[Effect] = [AdditiveNoise(values['noise_std'], 'declared_noise')]
@@ -154,7 +154,7 @@ def machine_of(values: Values) -> Gearbox:
             pulses_per_trigger=values['pulses_per_trigger'] or None,
             rate=values['waveform_rate'], waveform=values['waveform'], high=5.0,
             rise_time=values['waveform_rise_time'], noise_std=values['waveform_noise_std']),
-        faults=faults, effects=effects_of(values), seed=seed)
+        faults=faults, effects=simulated_effects(values), seed=seed)
 
 
 class MachineSimulator(PlaybackNode):
@@ -166,7 +166,7 @@ class MachineSimulator(PlaybackNode):
         shafts = self.parameters.values()['shafts']
         require_shaft_names('shafts', shafts)
         for shaft in shafts:
-            self.parameters.declare(shaft_parameters(shaft))
+            self.parameters.declare(simulated_shaft_parameters(shaft))
         named = self.parameters.declare_channels()
         self._values = values = self.parameters.values()
         self.machine = machine_of(values)

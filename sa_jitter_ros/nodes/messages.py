@@ -28,10 +28,10 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging import results
 from sa_jitter_ros.errors import MessageError, ParameterError
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings import message_layouts
 from sa_jitter_ros.recordings.message_layouts import (
-    decode_array, FLOAT32, FLOAT64, IMU, INDEX_BASE, TIME_REFERENCE, whole)
+    decode_array, FLOAT32, FLOAT64, IMU, INDEX_BASE, TIME_REFERENCE, whole_number)
 from sa_jitter_ros.samples import SampleBlock
 from sensor_msgs.msg import Imu, TimeReference
 from std_msgs.msg import Float32MultiArray, Float64MultiArray, MultiArrayDimension
@@ -219,24 +219,25 @@ def decode_average(kind: str, message: Float64MultiArray) -> AverageMessage:
         names = _AVERAGE_FIELDS[kind]
     start, end, sequence, cycles, fundamental, speed, discarded = header
     return AverageMessage(
-        AverageHeader(start, end, whole('sequence', sequence), whole('trigger cycles', cycles),
-                      whole('fundamental cycles', fundamental), speed,
-                      0 if math.isnan(discarded) else whole('discarded cycles', discarded)),
+        AverageHeader(start, end, whole_number('sequence', sequence),
+                      whole_number('trigger cycles', cycles),
+                      whole_number('fundamental cycles', fundamental), speed,
+                      0 if math.isnan(discarded) else whole_number('discarded cycles', discarded)),
         values, names)
 
 
-def encode_geometry(geometry: TargetGeometry) -> Float64MultiArray:
+def encode_geometry(geometry: MarkOffsets) -> Float64MultiArray:
     """Encode where the marks of a target stand."""
     return encode_array(
         np.stack((geometry.angles, geometry.standard_errors), axis=1),
         ('mark', f'field:{",".join(GEOMETRY_FIELDS)}'), (geometry.revolutions,))
 
 
-def decode_geometry(message: Float64MultiArray) -> TargetGeometry:
+def decode_geometry(message: Float64MultiArray) -> MarkOffsets:
     """Decode where the marks of a target stand."""
     header, values, names = _decode_result(message, ('mark', 'field'), 1)
     angles, errors = _with_fields(values, names, GEOMETRY_FIELDS).T
-    return TargetGeometry(angles, errors, header[0])
+    return MarkOffsets(angles, errors, header[0])
 
 
 def encode_prediction(prediction: PredictionMessage) -> Float64MultiArray:
@@ -250,7 +251,7 @@ def decode_prediction(message: Float64MultiArray) -> PredictionMessage:
     header, values, names = _decode_result(message, ('order', 'field'), 6)
     speed, rate, cycles, ratio, pulse_error, noise = header
     return PredictionMessage(_with_fields(values, names, PREDICTION_FIELDS), speed, rate,
-                             whole('trigger cycles', cycles), ratio, pulse_error, noise)
+                             whole_number('trigger cycles', cycles), ratio, pulse_error, noise)
 
 
 def encode_residual(residual: ResidualMessage) -> Float64MultiArray:
@@ -264,4 +265,4 @@ def decode_residual(message: Float64MultiArray) -> ResidualMessage:
     header, values, names = _decode_result(message, ('order', 'field'), 4)
     count, chi2, p_value, rms = header
     return ResidualMessage(_with_fields(values, names, RESIDUAL_FIELDS),
-                           whole('acquisitions', count), chi2, p_value, rms)
+                           whole_number('acquisitions', count), chi2, p_value, rms)

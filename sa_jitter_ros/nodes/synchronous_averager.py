@@ -31,7 +31,7 @@ from sa_jitter_ros.nodes.messages import (
     decode_pulse_array, decode_pulse_reference, encode_geometry, known_type, PULSE_TYPES)
 from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from std_msgs.msg import Float64, Float64MultiArray
 
 FloatArray = NDArray[np.float64]
@@ -69,7 +69,7 @@ class SynchronousAverager(MonitoringNode):
         pulse_type = PULSE_TYPES[known_type('tach_type', values['tach_type'], PULSE_TYPES)]
         self._speed = self.create_output(Float64, 'shaft_speed')
         self._target = self.create_output(Float64MultiArray, 'target_geometry', LATCHED_QOS)
-        self._geometry: TargetGeometry | None = None  # the latest that was published
+        self._geometry: MarkOffsets | None = None  # the latest that was published
         self.create_input(self._samples.message_type, 'vibration', self._on_vibration)
         self._tach = self.create_input(pulse_type, 'tach_pulse',
                                        self._on_pulse_array if pulse_type is Float64MultiArray

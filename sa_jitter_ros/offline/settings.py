@@ -122,7 +122,7 @@ def _specifications(values: Mapping[str, Any]) -> dict[str, Parameter]:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Suggestion:
     """
     What the first seconds of a recording suggest.
 
@@ -195,7 +195,7 @@ def detector_values(machine: MachineFile) -> Values:
     return values
 
 
-def choose(recording: Recording) -> Choice:
+def choose(recording: Recording) -> Suggestion:
     """
     Return settings for the averages of a recording, from its first seconds.
 
@@ -218,7 +218,7 @@ def choose(recording: Recording) -> Choice:
                              'waveform')
     period = float(np.median(cycles))
     trigger_cycles = int(np.clip(recording.duration / period // _AVERAGES, 2, _MOST_CYCLES))
-    return Choice(
+    return Suggestion(
         keyphasor.revolutions_per_trigger / period, trigger_cycles,
         recording.orders or _strongest_orders(recording, samples, pulses, trigger_cycles))
 

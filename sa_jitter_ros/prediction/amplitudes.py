@@ -39,7 +39,7 @@ from sa_jitter_ros.prediction.moments import (
 from sa_jitter_ros.prediction.parts import Parts
 from sa_jitter_ros.prediction.sampled_distribution import (
     affordable_draws, can_be_sampled, distribution_of, drawn_averages, LONGEST, moments_of,
-    MOST_PHASORS, places, SampledDistribution)
+    MOST_PHASORS, number_of_places, SampledDistribution)
 from sa_jitter_ros.prediction.scenario_moments import scenario_moments
 from sa_jitter_ros.pulses.angle_law import LINEAR_LAW
 
@@ -244,7 +244,7 @@ def _few_independent(model: DeclaredModel, jitters: Sequence[PulseErrorDistribut
     """
     linear = model.angle_law == LINEAR_LAW.name
     if affordable_draws(len(model.orders), model.trigger_cycles,
-                        1 if linear else places(spread)) < _ENOUGH:
+                        1 if linear else number_of_places(spread)) < _ENOUGH:
         return _FEW_CYCLES
     few = float(_FEW_INDEPENDENT if linear else _FEW_BENT)
     for item in jitters:

@@ -28,7 +28,7 @@ from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.parameters import listed, number, numbers, unwrapped
 from sa_jitter_ros.prediction.angle_error import IndependentPulseJitter
 from sa_jitter_ros.prediction.comb import Leakage, leakage
-from sa_jitter_ros.prediction.influence import Gain
+from sa_jitter_ros.prediction.influence import KnownGain
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.prediction.moments import cycle_moments, require_orders
 from sa_jitter_ros.prediction.prediction import predict
@@ -277,7 +277,7 @@ def detection_probability(
     low, high = np.hsplit(unchanged.ppf([false_alarm_rate, 1.0 - false_alarm_rate]), 2)
     detected = []
     for ratio in ratios:
-        changed = predict(model, [Gain(ratio)])
+        changed = predict(model, [KnownGain(ratio)])
         detected.append(1.0 - changed.cdf(high) if ratio >= 1.0 else changed.cdf(low))
     return np.hstack(detected)
 

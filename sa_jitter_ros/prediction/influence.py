@@ -36,7 +36,7 @@ _SMOOTH = 25  # pulses over which a speed is taken
 
 
 @dataclass(frozen=True)
-class Pulses:
+class AveragePulses:
     """
     The measured trigger pulses of one average, or with them those beside that its angle law reads.
 
@@ -73,7 +73,7 @@ class Pulses:
         period = trigger_periods(np.interp(all_of_them, index, self.times[measured]))
         return np.asarray(np.interp(self.index, all_of_them, period.mean() / period))
 
-    def without(self, before: int, after: int) -> 'Pulses':
+    def without(self, before: int, after: int) -> 'AveragePulses':
         """Return all but some pulses at either end."""
         kept = slice(before, len(self.times) - after)
         cycles = slice(before, kept.stop - 1)
@@ -119,7 +119,7 @@ class Influence(Protocol):
         """Return the moments over all scenarios with random `processes`, where they are known."""
         return None
 
-    def pattern(self, model: DeclaredModel, pulses: Pulses) -> Array | None:
+    def pattern(self, model: DeclaredModel, pulses: AveragePulses) -> Array | None:
         """Return the pulse errors (N_t + 1,) in s of one average whose pulses were measured."""
         return None
 
@@ -145,14 +145,15 @@ class Influence(Protocol):
 
 
 @dataclass(frozen=True)
-class Gain(Influence):
+class KnownGain(Influence):
     """
     A known change of the components: `factor`, one or (order,), complex or real.
 
     >>> from sa_jitter_ros.prediction.prediction import predict
     >>> model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=40,
     ...                       orders=(23.0, 46.0))
-    >>> (predict(model, [Gain(1.1)]).mean_attenuation / predict(model).mean_attenuation).round(3)
+    >>> with_gain, without = predict(model, [KnownGain(1.1)]), predict(model)
+    >>> (with_gain.mean_attenuation / without.mean_attenuation).round(3)
     array([1.1, 1.1])
     """
 
@@ -190,7 +191,7 @@ def random_processes(model: DeclaredModel, influences: Sequence[Influence]
     return (*declared, *(process for item in influences for process in item.processes(model)))
 
 
-def known_errors(model: DeclaredModel, influences: Sequence[Influence], pulses: Pulses
+def known_errors(model: DeclaredModel, influences: Sequence[Influence], pulses: AveragePulses
                  ) -> Array | None:
     """Return what influences know of the errors of `pulses` in s, None for nothing."""
     found = [errors for errors in (item.pattern(model, pulses) for item in influences)

@@ -185,7 +185,7 @@ def drawn_averages(
     bare = weights is LINEAR and not inside
     rough = known is not None or each is not None
     chords = spread > _CHORDS and not any(hasattr(item, 'draw_gain') for item in inside)
-    u, w = unit_nodes(1 if bare else places(spread, rough))
+    u, w = unit_nodes(1 if bare else number_of_places(spread, rough))
     if chords and not bare:
         u = np.linspace(0.0, 1.0, u.size)
     count = _IN_EACH if each is not None else affordable_draws(
@@ -225,7 +225,7 @@ def drawn_averages(
     return found, noise[0] + 1j * noise[1]
 
 
-def places(spread: float, rough: bool = False) -> int:
+def number_of_places(spread: float, rough: bool = False) -> int:
     """Return at how many places in a cycle to draw errors of so many cycles of the order."""
     fewest = 2 * _PLACES if rough else _PLACES
     return min(math.ceil(fewest + _PLACES_PER_TURN * spread), _MOST_PLACES)

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.clock_grid import clock_tick, LONGEST_TICK
 from sa_jitter_ros.pulses.pulse_chain import robust_square
-from sa_jitter_ros.pulses.pulse_paths import CERTAIN, OTHER, Prediction, REACH
+from sa_jitter_ros.pulses.pulse_paths import CERTAIN, LevelPrediction, OTHER, REACH
 
 FloatArray = NDArray[np.float64]
 
@@ -109,7 +109,7 @@ class IntervalModel:
         self._variance = np.full(len(_WEIGHTS), scatter**2)
         self._count = float(count)
         #: so many intervals tell the scatter, at least one
-        self.told = max(self._count, 1.0)
+        self.degrees = max(self._count, 1.0)
         self._chosen = 0
         self._settling = REACH
         self._intervals = deque(intervals, maxlen=self._window)
@@ -175,13 +175,13 @@ class IntervalModel:
         return self._chosen
 
     @property
-    def predictions(self) -> list[Prediction]:
+    def predictions(self) -> list[LevelPrediction]:
         """Return the predictions, each with how unlikely it is to be the best one."""
         variance = np.maximum(self._variance, (self._floor / _WIDTH)**2)
         prices = np.minimum(OTHER, 0.5 * self._count * np.log(variance / variance.min()))
         if self._settling:
             prices[:] = 0.0
-        return [Prediction(float(price), weights in _LINES, weights)
+        return [LevelPrediction(float(price), weights in _LINES, weights)
                 for price, weights in zip(prices, _WEIGHTS)]
 
     @property
@@ -220,7 +220,7 @@ class IntervalModel:
         if len(self._refused) >= _SEVERAL:
             scatter = _WIDER * max(size for _, size in self._refused) / _WIDTH
             self._variance = np.maximum(self._variance, scatter**2)
-            self.told = CERTAIN  # it is wide on purpose
+            self.degrees = CERTAIN  # it is wide on purpose
             self._refused = []
             self._set_tolerance()
 
@@ -260,7 +260,7 @@ class IntervalModel:
         off = np.expm1(every[REACH:] - _ALL_WEIGHTS @ every[self._before])
         square = robust_square(np.minimum(off * off, self.tolerance**2))
         self._variance += weight * (square - self._variance)
-        self._count = self.told = min(self._count + self.block, _MEMORY)
+        self._count = self.degrees = min(self._count + self.block, _MEMORY)
         self._chosen = int(np.argmin(self._variance))
         del self._levels[:-REACH]
         if self._tick:  # the smallest so far; others may show that it is a fraction of that

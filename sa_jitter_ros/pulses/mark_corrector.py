@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.pulses.target_geometry import (
-    alignment, combined, matches, measured_geometry, TargetGeometry, turned)
+    combined, MarkOffsets, matches, measured_geometry, turned, turned_by)
 from sa_jitter_ros.pulses.trigger_counter import TriggerCounter, TriggerPulses
 
 FloatArray = NDArray[np.float64]
@@ -89,11 +89,11 @@ class MarkCorrector:
                  given: Sequence[float] | None = None) -> None:
         self._counter, self._count = counter, count
         self._learns = given is None
-        self._known: TargetGeometry | None = None  # the latest that was not refused
+        self._known: MarkOffsets | None = None  # the latest that was not refused
         if given is not None:
             angles = np.array(given, np.float64)
-            self._known = TargetGeometry(angles - angles.mean(), np.zeros(angles.size))
-        self.geometry: TargetGeometry | None = None
+            self._known = MarkOffsets(angles - angles.mean(), np.zeros(angles.size))
+        self.geometry: MarkOffsets | None = None
         self.teeth: IntArray = np.empty(0, np.int64)
         self.refused = 0
         self.messages: list[str] = []
@@ -214,7 +214,7 @@ class MarkCorrector:
         reason = f'{(numbers[-1] - numbers[0]) / self._count:.3g} revolutions are too few'
         if self._waits and self._known is not None:
             if found is not None:
-                turn, reason = alignment(self._known, found,
+                turn, reason = turned_by(self._known, found,
                                          np.arange(teeth.size) if even else np.zeros(1, int))
             if not reason:
                 self._shift = turn
@@ -242,7 +242,7 @@ class MarkCorrector:
         if self.geometry is None:
             self._wanted = float(_TRIED[0])
 
-    def _use(self, geometry: TargetGeometry | None, teeth: IntArray) -> None:
+    def _use(self, geometry: MarkOffsets | None, teeth: IntArray) -> None:
         """Subtract these angles of the teeth (mark,) from the next pulses on."""
         self.geometry = geometry
         self._counter.know_marks(None if geometry is None else self.refused)
@@ -251,7 +251,7 @@ class MarkCorrector:
             self._known, self.teeth = geometry, teeth
             self._marks[teeth] = geometry.angles
 
-    def _refuse(self, reason: str, found: TargetGeometry | None, teeth: IntArray, time: float
+    def _refuse(self, reason: str, found: MarkOffsets | None, teeth: IntArray, time: float
                 ) -> None:
         """Subtract what was known before no longer, but what was `found`, if anything."""
         self.refused += 1

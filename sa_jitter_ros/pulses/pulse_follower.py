@@ -186,7 +186,7 @@ class PulseFollower:
             self._lock.steps.tolist(), self._lock.widths.tolist(), self._model.scatter,
             np.maximum(self._lock.believed, self._options.tolerance).tolist(),
             self._options.maximum_missing, self._model.expected, self._model.predictions,
-            self._model.tick, self._model.told)
+            self._model.tick, self._model.degrees)
 
     def _decide(self, final: bool) -> bool:
         """Judge the first waiting pulse, which is doubtful; False if the next one is needed."""

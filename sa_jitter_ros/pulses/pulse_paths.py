@@ -43,7 +43,7 @@ _SLOWED = 4  # intervals that show that a shaft slows down
 _STOPS = 0.05  # of the speed, or of its square, that must be left
 
 
-class Prediction(NamedTuple):
+class LevelPrediction(NamedTuple):
     """
     The next level as a sum of the latest ones, with these `weights`.
 
@@ -56,7 +56,7 @@ class Prediction(NamedTuple):
 
 
 #: before any is known to be better
-SIMPLE = (Prediction(0.0, False, (1.0,)), Prediction(0.0, True, (-1.0, 2.0)))
+SIMPLE = (LevelPrediction(0.0, False, (1.0,)), LevelPrediction(0.0, True, (-1.0, 2.0)))
 
 
 class Step(NamedTuple):
@@ -112,7 +112,7 @@ class PathRules:
     is known of uneven marks. `scatter` is that of the intervals, relative to 1; deviations within
     `given` (slot,) are believed. Up to `maximum_missing` pulses may be missing. `expected` is the
     level that earlier intervals predict (None: not known), and the clock moves a pulse by up to a
-    `tick` of the interval. As many intervals as `told` show the scatter (Student's t: of a few,
+    `tick` of the interval. As many intervals as `degrees` show the scatter (Student's t: of a few,
     it may be too small). A stray costs `stray`, any interval `each`; `most` paths are kept.
     """
 
@@ -122,9 +122,9 @@ class PathRules:
     given: Sequence[float]
     maximum_missing: int
     expected: float | None
-    predictions: Sequence[Prediction] = SIMPLE
+    predictions: Sequence[LevelPrediction] = SIMPLE
     tick: float = 0.0
-    told: float = CERTAIN
+    degrees: float = CERTAIN
     stray: float = STRAY
     each: float = 0.0
     most: int = _MOST_PATHS
@@ -211,7 +211,7 @@ class PathRules:
             if slopes and mark > 1:
                 apart = min(apart, apart - half * (each - path.recent[-1]), key=abs)
             beyond = max(abs(apart) - tick, 0.0) / self.scatter
-            cost += 0.5 * (self.told + 1.0) * math.log1p(beyond * beyond / self.told)
+            cost += 0.5 * (self.degrees + 1.0) * math.log1p(beyond * beyond / self.degrees)
             if cost < best:
                 best, off, using = cost, apart, number
         off = math.expm1(off)

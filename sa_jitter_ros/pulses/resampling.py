@@ -112,7 +112,7 @@ def margin(method: str, *, cutoff: float = 1.0) -> int:
     return math.ceil(half / stretch)
 
 
-def gain(method: str, frequency: FloatArray) -> FloatArray:
+def interpolator_gain(method: str, frequency: FloatArray) -> FloatArray:
     """
     Return the gain of an interpolator at `frequency` in units of the sampling rate.
 
@@ -120,7 +120,7 @@ def gain(method: str, frequency: FloatArray) -> FloatArray:
     the cubic spline.
 
     >>> for method in METHODS:
-    ...     print(method, gain(method, np.array([0.1, 0.25])).round(3))
+    ...     print(method, interpolator_gain(method, np.array([0.1, 0.25])).round(3))
     band_limited [1. 1.]
     linear [0.968 0.811]
     cubic [0.998 0.939]
@@ -147,7 +147,8 @@ def _table_of_gains(method: str) -> tuple[FloatArray, FloatArray]:
     """Return frequencies up to half the sampling rate, and the gains there."""
     grid: FloatArray = np.linspace(0.0, 0.5, _GAIN_STEPS + 1)
     nodes = chebyshev.chebpts1(_GAIN_DEGREE + 1)
-    through = chebyshev.chebfit(nodes, gain(method, 0.25 * (nodes + 1.0)), _GAIN_DEGREE)
+    through = chebyshev.chebfit(
+        nodes, interpolator_gain(method, 0.25 * (nodes + 1.0)), _GAIN_DEGREE)
     return grid, np.asarray(chebyshev.chebval(4.0 * grid - 1.0, through), np.float64)
 
 

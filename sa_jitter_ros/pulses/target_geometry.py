@@ -38,7 +38,7 @@ _ALIKE = 0.1  # share of its angles by which a pattern may differ beside standar
 
 
 @dataclass(frozen=True)
-class TargetGeometry:
+class MarkOffsets:
     """
     How far each mark of a target is off its even place.
 
@@ -83,7 +83,7 @@ class TargetGeometry:
 
 
 def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, count: int
-                      ) -> TargetGeometry | None:
+                      ) -> MarkOffsets | None:
     """
     Return where the marks of a target stand, None for pulses of too few revolutions.
 
@@ -118,7 +118,7 @@ def measured_geometry(times: FloatArray, numbers: IntArray, teeth: IntArray, cou
         late = np.nanmean(table, axis=0)
         late -= late.mean()
     scale = 2.0 * np.pi / count
-    return TargetGeometry(late * scale, _standard_errors(table) * scale, float(seen.mean()))
+    return MarkOffsets(late * scale, _standard_errors(table) * scale, float(seen.mean()))
 
 
 def motion_of(times: FloatArray, place: IntArray, count: int) -> FloatArray:
@@ -135,7 +135,7 @@ def motion_of(times: FloatArray, place: IntArray, count: int) -> FloatArray:
     return np.asarray(2.0 * once - _over_revolution(once, count) + straight)
 
 
-def combined(before: TargetGeometry, latest: TargetGeometry, most: float) -> TargetGeometry:
+def combined(before: MarkOffsets, latest: MarkOffsets, most: float) -> MarkOffsets:
     """Return the mean of both by their revolutions, of those before at most `most`."""
     weight = latest.revolutions / (latest.revolutions + min(before.revolutions, most))
     return replace(
@@ -145,16 +145,16 @@ def combined(before: TargetGeometry, latest: TargetGeometry, most: float) -> Tar
         revolutions=min(before.revolutions, most) + latest.revolutions)
 
 
-def alignment(known: TargetGeometry, measured: TargetGeometry, turns: IntArray
+def turned_by(known: MarkOffsets, measured: MarkOffsets, turns: IntArray
               ) -> tuple[int, str]:
     """
     Return by how many marks the measured geometry is turned against the known one, and ''.
 
     Of the possible `turns` (k,) in marks one has to be clear. Else the text says why none is.
 
-    >>> known = TargetGeometry(np.array([0.02, 0.0, -0.02]), np.full(3, 1e-4), 50)
-    >>> measured = TargetGeometry(np.array([0.0, -0.02, 0.02]), np.full(3, 2e-4), 5)
-    >>> alignment(known, measured, np.arange(3))
+    >>> known = MarkOffsets(np.array([0.02, 0.0, -0.02]), np.full(3, 1e-4), 50)
+    >>> measured = MarkOffsets(np.array([0.0, -0.02, 0.02]), np.full(3, 2e-4), 5)
+    >>> turned_by(known, measured, np.arange(3))
     (1, '')
     """
     every = [turned(known, int(turn)) for turn in turns]
@@ -173,13 +173,13 @@ def alignment(known: TargetGeometry, measured: TargetGeometry, turns: IntArray
     return int(turns[best]), ''
 
 
-def turned(geometry: TargetGeometry, turn: int) -> TargetGeometry:
+def turned(geometry: MarkOffsets, turn: int) -> MarkOffsets:
     """Return the geometry whose mark 0 is number `turn` of this one."""
     return replace(geometry, angles=np.roll(geometry.angles, -turn),
                    standard_errors=np.roll(geometry.standard_errors, -turn))
 
 
-def matches(known: TargetGeometry, measured: TargetGeometry, turn: int = 0) -> bool:
+def matches(known: MarkOffsets, measured: MarkOffsets, turn: int = 0) -> bool:
     """Return whether the measured angles are the known ones, turned by so many marks."""
     known = turned(known, turn)
     variance = (measured.standard_errors**2 + known.standard_errors**2

@@ -34,7 +34,7 @@ from sa_jitter_ros.pulses.mark_corrector import MarkCorrector
 from sa_jitter_ros.pulses.pulse_follower import JudgeOptions
 from sa_jitter_ros.pulses.pulse_judge import PulseJudge
 from sa_jitter_ros.pulses.target import EvenTarget, Target, ToothedWheel
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.pulses.trigger_counter import PulseSink, TriggerCounter, TriggerPulses
 
 __all__ = ['GeometryMode', 'MissingPulses', 'PulseCounts', 'PulseValidator', 'TriggerPulses']
@@ -203,7 +203,7 @@ class PulseValidator:
         return self._corrector is not None
 
     @property
-    def geometry(self) -> TargetGeometry | None:
+    def geometry(self) -> MarkOffsets | None:
         """Return what is taken from the pulses of each mark, None for nothing."""
         return None if self._corrector is None else self._corrector.geometry
 

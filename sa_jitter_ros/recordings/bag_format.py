@@ -68,7 +68,7 @@ class BagSource:
 
     def blocks(self, samples_per_block: int) -> Iterator[FloatArray]:
         """Iterate over `channel` x `sample` blocks."""
-        run = _Run(self.topic)
+        run = _BlockRun(self.topic)
         with recording_errors(self.path), _reader(self.path) as reader:
             messages = _blocks(reader, self.topic, self.sample_rate)
             yield from rechunk(run.continuous(messages), samples_per_block)
@@ -135,7 +135,7 @@ def open_bag(path: Path, *, channel_map: ChannelMap, sample_rate: float | None,
             remarks=(*extent.remarks, *(tach_extent.remarks if tach_extent else ()), *remarks)))
 
 
-class _Run:
+class _BlockRun:
     """Makes a continuous stream of the blocks of one run; counts lost and repeated samples."""
 
     def __init__(self, topic: str) -> None:
@@ -219,7 +219,7 @@ def _type_of(reader: Any, topic: str) -> str:
 
 def _measure(reader: Any, topic: str, sample_rate: float | None) -> _Extent:
     """Read a topic once and return the extent of its samples."""
-    run = _Run(topic)
+    run = _BlockRun(topic)
     for _ in run.continuous(_blocks(reader, topic, sample_rate)):
         pass
     if run.first is None:

@@ -193,10 +193,10 @@ def _numbers(row: Sequence[str], delimiter: str) -> frozenset[int]:
     if len(row) < 2 and delimiter != ',':
         return frozenset()
     return frozenset(column for column, text in enumerate(row)
-                     if is_number(text if delimiter == ',' else text.replace(',', '.')))
+                     if reads_as_number(text if delimiter == ',' else text.replace(',', '.')))
 
 
-def is_number(text: str) -> bool:
+def reads_as_number(text: str) -> bool:
     """Return whether a text is a number."""
     try:
         float(text)
@@ -235,8 +235,8 @@ def _is_text(row: Sequence[str], pattern: frozenset[int]) -> bool:
     texts = [row[column] if column < len(row) else '' for column in pattern]
     if len(row) < min(2, len(pattern)):
         return False
-    return any(text and not is_number(text.replace(',', '.')) for text in texts) and all(
-        text.isdecimal() or not is_number(text.replace(',', '.')) for text in texts)
+    return any(text and not reads_as_number(text.replace(',', '.')) for text in texts) and all(
+        text.isdecimal() or not reads_as_number(text.replace(',', '.')) for text in texts)
 
 
 def _header(table: Sequence[Sequence[str]], above: Sequence[int], pattern: frozenset[int]

@@ -90,7 +90,7 @@ def decode_array(message: Any, labels: tuple[str, ...], header_size: int | None
     return data[:header_size].astype(np.float64), data[offset:].reshape(shape), names
 
 
-def whole(name: str, value: float) -> int:
+def whole_number(name: str, value: float) -> int:
     """Return a count that a message contains as a float; raises `MessageError`."""
     if not (math.isfinite(value) and 0.0 <= value <= 2.0**53 and value == math.floor(value)):
         raise MessageError(f'{name} is {value}: send a whole number >= 0')
@@ -292,7 +292,7 @@ class SampleDecoder:
                                'positive rate')
         check_rate('sampling rate in the header', rate, MessageError)
         return SampleBlock(samples, time, rate,
-                           whole('index of the first sample', float(header[2])))
+                           whole_number('index of the first sample', float(header[2])))
 
     def _float32(self, message: Any) -> SampleBlock:
         if message.layout.data_offset == 0:
@@ -301,8 +301,8 @@ class SampleDecoder:
             raise MessageError('data_offset 3 received, 2 expected: the header of '
                                'Float64MultiArray has 3 elements, that of Float32MultiArray 2')
         header, samples = _samples(message, 2)
-        high, low = (whole('index of the first sample', float(item)) for item in header)
-        index = whole('index of the first sample', high * INDEX_BASE + low)
+        high, low = (whole_number('index of the first sample', float(item)) for item in header)
+        index = whole_number('index of the first sample', high * INDEX_BASE + low)
         rate = self._known_rate()
         return SampleBlock(samples, self._start_time + index / rate, rate, index)
 

@@ -23,7 +23,7 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.parameters import unwrapped
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, pulses_in_blocks
 from sa_jitter_ros.recordings.limits import check_rate, check_samples, check_times
-from sa_jitter_ros.samples import SampleBlock, unresolved
+from sa_jitter_ros.samples import SampleBlock, unresolved_times
 
 FloatArray = NDArray[np.float64]
 
@@ -171,7 +171,7 @@ class Recording:
         if not math.isfinite(self.start_time):
             raise RecordingError(f'start_time {self.start_time}: must be a finite time in s')
         check_times('start_time', self.start_time, RecordingError)
-        if why := unresolved(self.start_time, self.sample_rate):
+        if why := unresolved_times(self.start_time, self.sample_rate):
             raise RecordingError(f'start_time: {why}')
         if self.tach is not None and self.tach_rate is None:
             raise RecordingError('a tach waveform without tach_rate: add its rate in Hz')

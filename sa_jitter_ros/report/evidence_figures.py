@@ -22,7 +22,8 @@ from sa_jitter_ros.effects.effect import Effect
 from sa_jitter_ros.effects.evidence import Evidence
 from sa_jitter_ros.prediction.prediction import predict
 from sa_jitter_ros.pulses.angle_law import LINEAR
-from sa_jitter_ros.report.expected_errors import cycle_places, lags_of, Version, versions_of, whole
+from sa_jitter_ros.report.expected_errors import (
+    cycle_places, lags_of, Version, versions_of, with_explained_errors)
 from sa_jitter_ros.report.plotting import add_legend, AFTER, BEFORE, MEASURED, panels
 
 Array = NDArray[Any]
@@ -35,7 +36,7 @@ _FINEST = 1e-6  # half the range of a histogram of relative intervals that are a
 
 def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the pulse errors over time, their distribution, autocorrelation, clock and origin."""
-    evidence, versions = whole(evidence), versions_of(evidence, effects)
+    evidence, versions = with_explained_errors(evidence), versions_of(evidence, effects)
     figure, axes = panels(8)
     _over_time(axes[0], evidence, versions[-1])
     _distribution(axes[1], evidence, versions)
@@ -50,7 +51,7 @@ def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
 
 def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
-    evidence, versions = whole(evidence), versions_of(evidence, effects)
+    evidence, versions = with_explained_errors(evidence), versions_of(evidence, effects)
     figure, axes = panels(3)
     _profile(axes[0], evidence, versions)
     _dependence_on_cycles(axes[1], evidence, versions)

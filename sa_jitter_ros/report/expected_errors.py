@@ -64,7 +64,7 @@ def versions_of(evidence: Evidence, effects: Sequence[Effect]) -> list[Version]:
     return found
 
 
-def whole(evidence: Evidence) -> Evidence:
+def with_explained_errors(evidence: Evidence) -> Evidence:
     """Return the evidence with the errors that the declared effects explain."""
     return replace(evidence, errors=evidence.errors + _patterns(evidence, evidence.explained))
 
