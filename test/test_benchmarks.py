@@ -344,3 +344,10 @@ def test_months_of_averages_are_simulated(benchmark):
     quick = [days for kind, growth, days, known in faults
              if kind == 'order, noise 1 %' and growth > 0.1]
     assert all(days < 5.0 for days in quick)
+
+
+@pytest.mark.machines
+def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys):
+    """Of the second one a reference keyphasor is better than the vibration, in parts of it."""
+    assert benchmark('damaged_recordings').main(['--first', '461', '--count', '2']) == 0
+    assert 'wrong' not in capsys.readouterr().out

@@ -425,3 +425,13 @@ def test_the_vibration_tells_uneven_marks_from_a_speed_that_ripples(ripple, late
     else:
         assert np.ptp(marks) > 1.5 * np.radians(late)
         assert 'target_angles' in averager
+
+
+def test_a_speed_that_scatters_from_mark_to_mark_is_no_fault_of_the_keyphasor(shared_data):
+    """Of an encoder on a motor whose speed scatters by a third, all pulses are true."""
+    found = check_keyphasor(read(shared_data / 'encoder_motor_slow.npz'))
+    for name in ('missing', 'spurious'):
+        assert found.findings[name].value['count'] == 0
+        assert 'the speed scatters so much' in found.findings[name].decided_by
+    assert found.findings['jitter_std'].value is None
+    assert not {'missing', 'spurious', 'jitter'} & {item.code for item in found.warnings}

@@ -112,9 +112,7 @@ RECORDINGS = [
       for name in ('weight', 'weight_5', 'without_weight') for k in (0, 6)),
     *((f'turbine_201303{day}', {}) for day in (16, 26, 31)),
     *((f'turbine_201304{day}', {}) for day in ('05', 15)), ('uia_bearing_rig_1', {}),
-    pytest.param('encoder_motor_slow', {}, marks=pytest.mark.xfail(
-        strict=False, reason='its speed scatters by a quarter from mark to mark, which '
-        'check_keyphasor takes for jitter that no prediction has'))]
+    ('encoder_motor_slow', {})]
 
 
 def cut(recording, seconds):

@@ -251,7 +251,9 @@ class States:
         size = float(np.sqrt(np.mean(self.change**2)))
         if move:
             most = _MOST_TURNS / (self.orders[:self.declared].max() * self.frequency)
-            part = min(1.0, most / max(size, 1e-300))
+            nearer = np.diff(self.change) / np.diff(self.times - self.states[:, 0])
+            part = min(1.0, most / max(size, 1e-300),
+                       0.5 / max(float(nearer.max()), 1e-300))  # pulses keep their order
             self.states = self.states + part * change
             self.trend += part * trend
             self._take_out_mean_bend()

@@ -118,6 +118,10 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
         return [_of_average(observation, observation.acquisitions[a], unit, grid, clock.rate)
                 for a in chosen]
     grids = [_grid(recovery.times, clock) for recovery in observation.recoveries]
+    # where the vibration resolves the errors, it shows more than the reference keyphasor does
+    resolved = np.median(np.concatenate([
+        item.bridged_standard_errors[item.number] for item in observation.recoveries]))
+    reference = None if resolved < _RESOLVED * unit else observation.pulses.reference
     for number, first, last in _runs(observation, chosen):
         recovery = observation.recoveries[number]
         start, stop = recovery.number[first], recovery.number[last] + 1
@@ -125,7 +129,8 @@ def stretches(observation: Observation, chosen: Sequence[int], clock: Clock) -> 
             here = slice(max(part.start, start), min(part.stop, stop))
             if here.stop - here.start < 3:
                 continue
-            stretch = _stretch(observation, recovery, part, here, grids[number], clock.rate, unit)
+            stretch = _stretch(model, recovery, part, here, grids[number], clock.rate, unit,
+                               reference)
             sidebands, bends = _sidebands(fit, model)
             shown, most, p_value = _bends_of_motion(stretch.setting.times, sidebands)
             # faster ones are no acceleration of the band
@@ -235,14 +240,14 @@ def _runs(observation: Observation, chosen: Sequence[int]) -> list[tuple[int, in
     return runs
 
 
-def _stretch(observation: Observation, recovery: RecordRecovery, part: slice, here: slice,
-             imposed: Array | None, rate: float, unit: float) -> Stretch:
+def _stretch(model: DeclaredModel, recovery: RecordRecovery, part: slice, here: slice,
+             imposed: Array | None, rate: float, unit: float, reference: Array | None) -> Stretch:
     """
     Return the pulses `here` of a `part` of a recording that is unbroken, missing ones too.
 
-    `imposed` are the errors that a clock of some `rate` imposes on the measured pulses.
+    `imposed` are the errors that a clock of some `rate` imposes on the measured pulses. With the
+    times of a `reference` the errors are those against it.
     """
-    model = observation.model
     bridged, errors = recovery.bridged[here], recovery.bridged_errors[here]
     measured = np.zeros(recovery.bridged.size, np.bool_)
     measured[recovery.number] = True
@@ -252,10 +257,8 @@ def _stretch(observation: Observation, recovery: RecordRecovery, part: slice, he
     error_std = float(np.median(recovery.bridged_standard_errors[here][measured]))
     prior = expected[0]
     bend_std, bend_prior = recovery.ripple_standard_error, expected[1]
-    # where the vibration resolves the errors, it shows more than the reference keyphasor does
-    referenced = observation.pulses.reference is not None and not error_std < _RESOLVED * unit
-    if referenced and observation.pulses.reference is not None:
-        better = observation.pulses.reference[here]
+    if reference is not None:
+        better = reference[here]
         known = np.isfinite(better)
         measured = measured & known
         errors = np.where(known, bridged - better, 0.0)
@@ -270,7 +273,7 @@ def _stretch(observation: Observation, recovery: RecordRecovery, part: slice, he
     setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
                       float(recovery.bridged[0]), recovery.bridged[part], grid, rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
-                   bend_std, bend_prior, referenced)
+                   bend_std, bend_prior, reference is not None)
 
 
 def _grid(times: Array, clock: Clock) -> Array | None:

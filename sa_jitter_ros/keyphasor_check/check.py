@@ -38,7 +38,9 @@ from sa_jitter_ros.keyphasor_check.vibration import averages_of, path_delay, rec
 from sa_jitter_ros.keyphasor_check.wheel import Marking, patterns
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.pulses.detection import KeyphasorDetector, spikes_text
+from sa_jitter_ros.pulses.pulse_judge import HIDDEN
 from sa_jitter_ros.pulses.unit_check import find_mistakes, other_span, rate_factor
+from sa_jitter_ros.pulses.validation import PulseValidator
 from sa_jitter_ros.recordings.channel_check import bad_channels
 from sa_jitter_ros.recordings.recording import Recording
 
@@ -134,14 +136,13 @@ class _Check:
             marks = self._at_both_rates(marks, numbered, found, lines, find_lines(
                 samples.T, self._start, self._other_rate, *turned))
         count = int(marks.value)
-        fitted = fit_pulses(numbered, count, tick=tick)
-        if count == 1:
-            fitted = first
+        fitted = first if count == 1 else fit_pulses(numbered, count, tick=tick)
         even = samples is not None and speed_ripples(samples, self._start, self._rate, fitted)
         if even and samples is not None:
             fitted = fitted.with_even_marks()
             lines = find_lines(samples.T, self._start, self._rate, fitted.true,
                                fitted.numbers.astype(np.float64))
+        fitted, hidden = _without_hidden(fitted, times, count)
         _require_wheel(fitted, numbered)
         per_revolution = None if lines is None else lines.scaled(float(count))
         ratio, orders = self._ratio(per_revolution)
@@ -156,9 +157,9 @@ class _Check:
                 decided_by='teeth without a pulse in every revolution' if decided else ''),
             'marks': self._target(fitted, decided, even),
             'clock_rate': self._clock(clock, times),
-            **self._jitter(fitted, averages.get(True, ())),
-            'missing': _counted(fitted.lost, 'marks without a pulse'),
-            'spurious': _counted(fitted.strays, 'pulses that stand beside every mark'),
+            **self._jitter(fitted, averages.get(True, ()), hidden),
+            'missing': _counted(fitted.lost, hidden or 'marks without a pulse'),
+            'spurious': _counted(fitted.strays, hidden or 'pulses that stand beside every mark'),
             'speed': self._speed(fitted),
             'ratio': ratio, 'orders': orders,
             'path_delay': self._delay(averages.get(False, ()), ratio)}
@@ -366,8 +367,9 @@ class _Check:
             keyphasor_rate=1.0 / expected, correct_jitter=correct)
             for correct, count in cycles.items()}
 
-    def _jitter(self, fitted: FittedPulses, averages: Sequence[Average]) -> dict[str, Checked]:
-        alone = measure_jitter(fitted.true, fitted.numbers)
+    def _jitter(self, fitted: FittedPulses, averages: Sequence[Average], hidden: str
+                ) -> dict[str, Checked]:
+        alone = None if hidden else measure_jitter(fitted.true, fitted.numbers)
         recovered = recovered_jitter(averages)
         if alone is None and recovered is None:
             by = (f'the motion makes all of the scatter, {1e6 * fitted.scatter:.2g} us: a '
@@ -478,6 +480,16 @@ def _require_wheel(fitted: FittedPulses, numbered: NumberedPulses) -> None:
             f'have no pulse, {strays} pulses stand beside them, and the others {off:.0%} of the '
             'distance of marks away, as pulses at random do; look at the waveform of the tach, '
             'its threshold, its cable and the distance of the sensor')
+
+
+def _without_hidden(fitted: FittedPulses, times: FloatArray, count: int
+                    ) -> tuple[FittedPulses, str]:
+    """Take no speed for strays and lost pulses; the text says if it hides them, else ''."""
+    validator = PulseValidator(pulses_per_revolution=count, pulses_per_trigger=1)
+    validator.update(times)
+    if not validator.hides_missing:
+        return fitted, ''
+    return replace(fitted, strays=times[:0], lost=times[:0]), HIDDEN
 
 
 def _counted(times: FloatArray, by: str) -> Checked:

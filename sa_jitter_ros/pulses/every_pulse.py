@@ -28,7 +28,7 @@ class EveryPulse:
     def __init__(self, counter: PulseSink, options: JudgeOptions) -> None:
         self._counter, self._least = counter, options.minimum_interval
         self.verdicts = Verdicts()
-        self.waiting = 0
+        self.waiting, self.hides_missing = 0, True  # nothing is looked for
         self.forget()
 
     def forget(self) -> None:

@@ -26,6 +26,10 @@ from sa_jitter_ros.pulses.verdicts import Verdicts
 _SAME_SCATTER = 2.0  # ratio up to which the scatter before a gap is that after it
 _KNOWN_WELL = 16  # intervals that tell the scatter better than the first ones behind a gap
 
+#: What is said of a speed that hides them.
+HIDDEN = ('the speed scatters so much from one pulse to the next that a stray or a missing one '
+          'does not show')
+
 
 class PulseJudge:
     """
@@ -58,6 +62,11 @@ class PulseJudge:
     def last(self) -> float:
         """Time (s) of the latest pulse that was not dropped."""
         return self._queue[-1] if self._queue else self.confirmed
+
+    @property
+    def hides_missing(self) -> bool:
+        """Whether the speed scatters so much that strays and missing pulses do not show."""
+        return bool(self._model.hides_missing)
 
     @property
     def waiting(self) -> int:
@@ -134,10 +143,8 @@ class PulseJudge:
                     intervals=lock.intervals.tolist(), unsteady=lock.unsteady)
         follower = PulseFollower(lock, self._queue, model, options=self._options,
                                  sink=self._counter, verdicts=self.verdicts)
-        if model.hides_missing:
-            self.verdicts.say(
-                'the speed scatters so much from one pulse to the next that a stray or a missing '
-                'one does not show: all are taken for true')
+        if self.hides_missing:
+            self.verdicts.say(f'{HIDDEN}: all are taken for true')
         if end is not None:
             follower.report_change(first - end.time, end.level, math.log(lock.interval))
         self._end = None

@@ -198,6 +198,11 @@ class PulseValidator:
         return [(time + self._path_delay, why) for time, why in self._judge.verdicts.rejected]
 
     @property
+    def hides_missing(self) -> bool:
+        """Whether the speed scatters so much that strays and missing pulses do not show."""
+        return self._judge.hides_missing
+
+    @property
     def corrects_marks(self) -> bool:
         """Whether the geometry of the target is taken from the pulses, as far as it is known."""
         return self._corrector is not None
