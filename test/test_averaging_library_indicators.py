@@ -10,12 +10,15 @@
 
 """Condition indicators, gear signals and envelope of the library's averages."""
 
+import copy
+
 import numpy as np
 import pytest
 import sa_jitter_ros as sa
 from sa_jitter_ros.averaging.averager_parameters import gear_settings, PARAMETERS, shaft_parameters
 from sa_jitter_ros.averaging.indicators import condition_indicators, GearSettings, separate
 from sa_jitter_ros.averaging.results import ShaftResults
+from sa_jitter_ros.averaging.shaft_indicators import ShaftIndicators
 
 RATE, SPEED = 8e3, 10.0
 MACHINE = sa.Machine('output', gears={'stage': {
@@ -49,6 +52,35 @@ def test_indicators_are_those_of_the_waveform():
         np.testing.assert_array_equal(item.residual, signals.residual)
         np.testing.assert_array_equal(item.difference, signals.difference)
     assert averages[0].indicators['kurtosis'][0][0] == pytest.approx(1.6, abs=0.1)
+
+
+def test_they_are_made_when_asked_for_in_any_order_and_in_a_stream(monkeypatch):
+    made = []
+    of = ShaftIndicators.of
+    monkeypatch.setattr(ShaftIndicators, 'of', lambda self, item: made.append(
+        item.sequence) or of(self, item))
+    vibration, pulses = rig()
+    options = {'ratio': 2.0, 'trigger_cycles': 40, 'mesh_orders': [19]}
+    ahead, back = (sa.average(vibration, RATE, pulses, **options) for _ in range(2))
+    assert made == []
+    na4 = [item.indicators['na4'][0] for item in ahead]
+    del made[:]
+    copied = copy.deepcopy(back[2])  # asks, and so do those before it
+    assert made == [0, 1, 2]
+    np.testing.assert_array_equal(back[3].indicators['na4'][0], na4[3])
+    np.testing.assert_array_equal(copied.indicators['na4'][0], na4[2])
+    np.testing.assert_array_equal(copied.residual, ahead[2].residual)
+    assert back[3].indicators is back[3].indicators
+    assert made == [0, 1, 2, 3]
+    del made[:]
+    averager = sa.Averager(RATE, **options)
+    parts = [averager.update(block) for block in np.array_split(vibration, 4, axis=1)]
+    found = averager.update(pulse_times=pulses)
+    assert made == []
+    assert not any(parts)
+    averager.update(vibration[:, :10])  # what nobody asked for must not pile up
+    assert made == [0, 1, 2, 3]
+    np.testing.assert_array_equal(found[3].indicators['na4'][0], na4[3])
 
 
 def test_they_are_those_of_the_corrected_average_as_the_topic_has_them():

@@ -12,8 +12,9 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 import math
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,6 +250,16 @@ class Correction:
                 f'RMS, attenuation {listed(self.attenuation.ravel(), 3)})')
 
 
+class Later(Protocol):
+    """What an average makes when it is asked for it."""
+
+    def indicators(self) -> Mapping[str, tuple[FloatArray, FloatArray]]:
+        """Return the condition indicators by name, each with its standard error."""
+
+    def signals(self) -> tuple[FloatArray, FloatArray]:
+        """Return the residual and the difference signal."""
+
+
 @dataclass(frozen=True)
 class Average:
     """
@@ -273,9 +284,8 @@ class Average:
     `amplitudes`. `parts` are the waveforms of parts of the cycles, None unless `keep_parts` was
     set. `correction` is None unless `correct_jitter` was set.
 
-    `indicators` are the condition indicators by name, each with its standard error, (channel,)
-    both; `residual` and `difference` (channel, angle) are the gear signals
-    (`sa_jitter_ros.averaging.indicators`), `envelope` is that of what the average leaves of the
+    `indicators`, `residual` and `difference` are made when they are first asked for
+    (`sa_jitter_ros.averaging.indicators`); `envelope` is that of what the average leaves of the
     vibration, None without bearing orders. All of them are of the corrected average where there is
     one.
 
@@ -316,11 +326,33 @@ class Average:
     parts: WaveformParts | None = None
     correction: Correction | None = None
     envelope: Envelope | None = None
-    indicators: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    residual: FloatArray | None = None
-    difference: FloatArray | None = None
+    later: Later | None = field(default=None, repr=False, compare=False)
     gains: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     refused: Mapping[float, str] = field(default_factory=dict)
+
+    @cached_property
+    def indicators(self) -> Mapping[str, tuple[FloatArray, FloatArray]]:
+        """Return the condition indicators by name, each with its standard error (channel,)."""
+        return {} if self.later is None else self.later.indicators()
+
+    @cached_property
+    def _signals(self) -> tuple[FloatArray | None, FloatArray | None]:
+        return (None, None) if self.later is None else self.later.signals()
+
+    @property
+    def residual(self) -> FloatArray | None:
+        """Return the residual signal (channel, angle)."""
+        return self._signals[0]
+
+    @property
+    def difference(self) -> FloatArray | None:
+        """Return the difference signal (channel, angle)."""
+        return self._signals[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the values for a copy, which does not need the averages before it."""
+        made = {'indicators': self.indicators, '_signals': self._signals}
+        return {**vars(self), **made, 'later': None}
 
     @property
     def gain(self) -> FloatArray:

@@ -159,6 +159,7 @@ class Averager:
         if self._ended:
             raise SignalError('update after flush, which ends the stream: make another Averager')
         samples = None if vibration is None else self._checked(vibration)
+        self._indicators.catch_up()  # a stream must not keep all its averages
         found = []
         if pulse_times is not None:
             times = np.atleast_1d(np.asarray(pulse_times))

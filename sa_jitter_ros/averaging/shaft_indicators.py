@@ -14,13 +14,16 @@ Condition indicators and gear signals of the averages of one shaft, for library,
 They are those of the corrected average where there is one.
 """
 
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.averaging.average import Average, Correction
 from sa_jitter_ros.averaging.indicators import (
-    ConditionIndicators, GearSettings, RunningIndicators, separate)
+    ConditionIndicators, gear_lines, GearSettings, RunningIndicators, separate)
 from sa_jitter_ros.errors import ParameterError, SignalError
 
 FloatArray = NDArray[np.float64]
@@ -43,6 +46,8 @@ class ShaftIndicators:
         self.gear = gear or GearSettings()
         self._running: dict[bool, RunningIndicators] = {}  # by whether they are of corrected
         self.problem = ''  # why the latest average has no condition indicators
+        self._waiting: deque[_Later] = deque()  # averages that nobody has asked yet
+        self._lock = Lock()
 
     def use(self, gear: GearSettings) -> None:
         """Use other mesh orders; the indicators forget earlier averages."""
@@ -56,8 +61,7 @@ class ShaftIndicators:
         None where the waveform of no channel is finite, or where it lacks a mesh order.
         """
         best = best_of(average)
-        self.problem = ''
-        if not np.isfinite(best.waveform).all(axis=1).any():
+        if not self._has(best):
             return None
         corrected = average.correction is not None and average.correction.accepted
         running = self._running.setdefault(corrected, RunningIndicators(self.gear))
@@ -66,21 +70,55 @@ class ShaftIndicators:
         except SignalError:  # the number of channels has changed
             self._running = {corrected: (running := RunningIndicators(self.gear))}
             running.update(best.waveform, best.parts)
-        except ParameterError as error:
-            self.problem = str(error)
-            return None
         return running.get()
 
     def added(self, average: Average) -> Average:
-        """Return the next average with its indicators, gear signals and envelope."""
-        found, best = self.of(average), best_of(average)
-        values = {} if found is None else {
+        """Return the next average, which makes indicators and gear signals when asked for them."""
+        best = best_of(average)
+        self._waiting.append(later := _Later(self, average, self._has(best)))
+        return replace(average, later=later, envelope=average.envelope or best.envelope)
+
+    def catch_up(self, last: '_Later | None' = None) -> None:
+        """Make the indicators of the averages that wait, up to the `last`, in their order."""
+        with self._lock:
+            while self._waiting and (last is None or last.waits):
+                item = self._waiting.popleft()
+                item.found, item.waits = self.of(item.average), False
+
+    def _has(self, best: Average | Correction) -> bool:
+        """Return whether an average has indicators; where not, `problem` may say why."""
+        self.problem = ''
+        if not np.isfinite(best.waveform).all(axis=1).any():
+            return False
+        try:
+            gear_lines(self.gear, best.waveform.shape[-1])
+        except ParameterError as error:
+            self.problem = str(error)
+        return not self.problem
+
+
+class _Later:
+    """What an average makes when it is asked: indicators need those of the averages before it."""
+
+    def __init__(self, source: ShaftIndicators, average: Average, known: bool) -> None:
+        self.average, self.waits = average, True
+        self.found: ConditionIndicators | None = None
+        self._source, self._known = source, known
+
+    def indicators(self) -> Mapping[str, tuple[FloatArray, FloatArray]]:
+        """Return the indicators by name, each with its standard error."""
+        self._source.catch_up(self)
+        found = self.found
+        return {} if found is None else {
             name: (found[name], found.standard_errors[..., place])
             for place, name in enumerate(found.names)}
-        signals = [np.full(best.waveform.shape, np.nan) for _ in range(2)]
-        if found is not None:
-            known = np.isfinite(best.waveform).all(axis=1)
-            parts = separate(best.waveform[known], self.gear)
-            signals[0][known], signals[1][known] = parts.residual, parts.difference
-        return replace(average, indicators=values, residual=signals[0], difference=signals[1],
-                       envelope=average.envelope or best.envelope)
+
+    def signals(self) -> tuple[FloatArray, FloatArray]:
+        """Return residual and difference signal, NaN of channels that have none."""
+        waveform = best_of(self.average).waveform
+        signals = np.full((2, *waveform.shape), np.nan)
+        if self._known:
+            known = np.isfinite(waveform).all(axis=1)
+            parts = separate(waveform[known], self._source.gear)
+            signals[:, known] = parts.residual, parts.difference
+        return signals[0], signals[1]
