@@ -25,7 +25,7 @@ from typing import Any
 from sa_jitter_ros.effects import Effect, enabled_effects
 from sa_jitter_ros.effects.parameters import effect_parameters
 from sa_jitter_ros.errors import ModelError, ParameterError, SaJitterError
-from sa_jitter_ros.machine import following, PREFIX
+from sa_jitter_ros.machine import following, Machine, PREFIX, UNKNOWN
 from sa_jitter_ros.parameter_file import one_line, read_parameters
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, PULSES_PER_REVOLUTION, PULSES_PER_TRIGGER, RATIO, require_shaft_names,
@@ -78,12 +78,14 @@ class Declaration:
     """
     A declared model for each shaft by its name, and the effects that all of them share.
 
-    `unknown` are the names in a parameter file that match no parameter.
+    `unknown` are the names in a parameter file that match no parameter; the `machine` names the
+    orders.
     """
 
     models: Mapping[str, DeclaredModel]
     effects: tuple[Effect, ...]
     unknown: tuple[str, ...] = ()
+    machine: Machine = UNKNOWN
 
     @property
     def model(self) -> DeclaredModel:
@@ -147,7 +149,7 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     except ParameterError as error:
         raise ModelError(str(error)) from error
     try:
-        found = following(values)
+        found, machine = following(values), Machine.among(values)
         values = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
         shafts = SHAFTS.convert((found | values).get(SHAFTS.name, SHAFTS.default))
         known = {item.name: item for item in predictor_parameters(shafts, values)}
@@ -164,4 +166,4 @@ def read_declaration(path: Path, *, sample_rate: float = 0.0) -> Declaration:
     others = ('use_sim_time', HARDWARE_ID.name, STALE_AFTER.name)  # of the node, not of the model
     unknown = sorted(name for name in values if name not in (*known, *others)
                      and not name.startswith('qos_overrides.'))
-    return replace(declaration, unknown=tuple(unknown))
+    return replace(declaration, unknown=tuple(unknown), machine=machine)

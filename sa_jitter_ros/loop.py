@@ -18,7 +18,7 @@ that the declared model lacks if the residual is significant.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, MISSING, replace
 from datetime import datetime, timezone
-from functools import cached_property
+from functools import cached_property, partial
 import math
 import os
 from pathlib import Path
@@ -223,7 +223,7 @@ def close_loop(recordings: Source | Sequence[Source], declared: Declared, *,
                 faults.append(f'{name}: {doubt}')
             try:
                 observations.append(observe(
-                    recording, model,
+                    recording, model, name_of=partial(declaration.machine.name_of, shaft),
                     sources=observations[0].sources.tolist() if observations else ()))
             except SaJitterError as error:
                 reason = _mistake(recording) or str(error).removeprefix(f'{name}: ')

@@ -77,14 +77,24 @@ def number_text(value: Json) -> str:
     return measured_text(value)
 
 
-def order_text(order: float) -> str:
+def order_text(order: float, name: str = '') -> str:
     """
-    Return an order with the digits that tell it from others.
+    Return an order with the digits that tell it from others, behind the name of what makes it.
 
-    >>> order_text(39.047619), order_text(60.0)
-    ('39.0476', '60')
+    >>> order_text(39.047619), order_text(38.0, 'mesh input-output 2x')
+    ('39.0476', 'mesh input-output 2x (38)')
     """
-    return f'{order:.6g}'
+    return f'{name} ({order:.6g})' if name else f'{order:.6g}'
+
+
+def order_words(order: float, name: str = '') -> str:
+    """
+    Return an order in a sentence.
+
+    >>> order_words(60.0), order_words(38.0, 'mesh input-output 2x')
+    ('order 60', 'mesh input-output 2x (38)')
+    """
+    return order_text(order, name) if name else f'order {order_text(order)}'
 
 
 def _unit(values: Sequence[Json], unit: str) -> tuple[float, str]:

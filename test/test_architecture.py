@@ -55,8 +55,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'pulses', 'recordings'},
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop', 'machine',
-        'matplotlib', 'monitoring', 'parameter_file', 'parameters', 'pulses', 'recordings',
-        'samples'},
+        'matplotlib', 'monitoring', 'number_text', 'parameter_file', 'parameters', 'pulses',
+        'recordings', 'samples'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},

@@ -216,7 +216,7 @@ def test_csv_and_changes_show_the_names(tmp_path):
     assert (change.content()['name'], change.content()['order']) == ('mesh input-output 2x', 38.0)
     signals = Signals('rig', (0,), ('a',), ('g',), a_machine())
     assert signals.order('input', 38.0) == 'mesh input-output 2x (38)'
-    assert signals.order('input', 40.0) == 'order 40'
+    assert signals.order('input', 40.0) == '40'
     (tmp_path / 'm.yaml').write_text(
         '/**: {ros__parameters: {machine: {tach_shaft: output, gears: {g: {shaft: input, '
         'teeth: 19, mate_shaft: output, mate_teeth: 61}}}}}\n'

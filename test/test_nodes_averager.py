@@ -50,9 +50,11 @@ def bench(ros_graph):
 
 def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
     summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
-    given = {'gear_box.unit': 'g', 'gear_box.sensitivity': 0.5, 'motor.unit': 'm/s^2'}
+    given = {'channels.gear_box.unit': 'g', 'channels.gear_box.sensitivity': 0.5,
+             'channels.motor.unit': 'm/s^2', 'tach_shaft': 'shaft', 'gears.g.shaft': 'shaft',
+             'gears.g.teeth': 7, 'gears.g.mate_shaft': 'out', 'gears.g.mate_teeth': 14}
     b = bench(hardware_id='rig', overrides=[
-        Parameter(f'machine.channels.{key}', value=value) for key, value in given.items()])
+        Parameter(f'machine.{key}', value=value) for key, value in given.items()])
     b.play(MACHINE, 2.0)
     assert len(summaries) == len(b.amplitudes()) > 2
     average = b.amplitudes()[-1]
@@ -66,9 +68,10 @@ def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
     values = {item.key: item.value for item in status.values}
     assert values.pop('sequence') == str(average.header.sequence)
     assert float(values.pop('trigger_speed_hz')) == pytest.approx(MACHINE.speed, rel=1e-5)
-    assert [*values][:3] == ['1', '7', '23']
-    for row, order in zip(average.values[0], ORDERS):
-        found = re.fullmatch(r'(\S+) \+- (\S+) g, attenuation nan', values[f'{order:g}'])
+    names = ['assembly phase shaft-out', 'mesh shaft-out 1x', '23']
+    assert [*values][:3] == names
+    for row, order, name in zip(average.values[0], ORDERS, names):
+        found = re.fullmatch(r'(\S+) \+- (\S+) g, attenuation nan', values[name])
         assert float(found[1]) == pytest.approx(
             2.0 * abs(MACHINE.components[order][0]), rel=1e-3)  # volts over 0.5 V per g
         assert float(found[2]) == pytest.approx(1.96 * row[8], rel=0.06)

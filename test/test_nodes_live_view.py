@@ -196,7 +196,7 @@ def test_snapshot_holds_what_was_published(bench):
         'shaft/raw_trend', 'shaft/corrected_trend', 'prediction', 'residual', 'missing_effect',
         'change', 'shaft_speed', '/diagnostics'}
     assert parts['settings'] == {'shafts': ['shaft'], 'vibration_unit': 'g',
-                                 'channel_names': ['casing', 'shaft end']}
+                                 'channel_names': ['casing', 'shaft end'], 'order_names': {}}
     assert parts['shaft/synchronous_average']['header'] == vars(header())
     for kind, factor in (('synchronous_average', 1.0), ('corrected_average', 1.1)):
         np.testing.assert_allclose(parts[f'shaft/{kind}']['channels'], factor * raw, atol=2e-5)
@@ -663,6 +663,20 @@ def text_of(document, name):
     """Return the text in the element with an id."""
     found = re.search(rf'<(\w+) [^>]*id="{name}"[^>]*>(.*?)</\1>', document, re.DOTALL)
     return re.sub(r'<[^>]+>', ' ', found[2]).replace('&nbsp;', ' ')
+
+
+PARTS = {'tach_shaft': 'shaft', 'gears.g.shaft': 'shaft', 'gears.g.teeth': 19,
+         'gears.g.mate_shaft': 'out', 'gears.g.mate_teeth': 38}
+
+
+def test_orders_have_the_names_of_the_parts_that_make_them(bench):
+    b = bench(**{f'machine.{name}': value for name, value in PARTS.items()})
+    publish_all(b)
+    names = dict(b.part('settings')['order_names']['shaft'])
+    assert names['mesh shaft-out 2x'] == 38.0
+    page = shown(b)
+    assert re.search(r'mesh shaft-out 1x \(19\) +0.389', text_of(page, 'orders'))
+    assert 'mesh shaft-out 1x (19): +4.10 ± 0.60 % since' in page  # a trend
 
 
 def test_the_browser_shows_the_numbers(bench):

@@ -153,6 +153,22 @@ def test_each_order_has_its_share_of_the_amplitude(traces, verdict):
     assert ('<th>as found</th>' in page.partition('What to do next')[0]) == (verdict == 'traced')
 
 
+def test_orders_have_the_names_of_the_parts_that_make_them(traces):
+    names = {19.0: 'mesh in-out 1x', 38.0: 'mesh in-out 2x'}
+    trace = replace(traces['blind'], observation=replace(
+        traces['blind'].observation, name_of=names.get))
+    content = report(trace)
+    assert content['order_names'] == [*names.values()]
+    assert {item['name'] for item in content['lines']} == {*names.values()}
+    text = html(content, (), {})
+    assert 'orders mesh in-out 1x (19), mesh in-out 2x (38)' in text
+    assert '<td data-label="order">mesh in-out 2x (38)</td>' in text
+    assert any('of mesh in-out 2x (38). Take corrected' in step for step in next_steps(content))
+    residual, distribution = illustrate(trace)
+    assert residual.figure.axes[-1].get_xticklabels()[1].get_text() == 'mesh in-out 2x (38)'
+    assert distribution.figure.axes[0].get_title() == 'mesh in-out 1x (19), <left>'
+
+
 def test_steps_follow_from_what_was_found(traces):
     content = report(traces['traced'])
     steps = ' '.join(next_steps(content))

@@ -128,7 +128,7 @@ def check_lines(observation: Observation, lines: Lines, variance: Array) -> tupl
     rises = _accelerations(observation)
     ratio = ratio - np.outer(rises, rises @ (ratio - 1.0)) / max(
         float(rises @ rises), np.finfo(np.float64).tiny)
-    return (_turns(ratio, noise, order, run.size - int(run.max()) - 1),
+    return (_turns(observation, ratio, noise, order, run.size - int(run.max()) - 1),
             _turns_in_cycles(observation, lines),
             *_follows(observation, np.abs(ratio), noise),
             *_beside_errors(observation, lines, noise))
@@ -178,7 +178,8 @@ def _errors(observation: Observation) -> Iterator[Array]:
         yield recovery.bridged_errors[start:start + item.bridged.size]
 
 
-def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
+def _turns(observation: Observation, ratio: Array, noise: Array, order: Array, freedom: int
+           ) -> Check:
     """Test whether a line turns by itself, by `freedom` acquisitions beyond the means of runs."""
     freedom = max(freedom - 1, 1)  # of the acceleration
     power = np.sum(ratio.imag**2, axis=0) / freedom
@@ -186,8 +187,8 @@ def _turns(ratio: Array, noise: Array, order: Array, freedom: int) -> Check:
     chance = special.chdtrc(freedom, freedom * power / (noise**2 + _TURN**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
-                 f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
-                 'average to average, relative to the other orders')
+                 f'the phase of {observation.words(order[worst])} changes by {own[worst]:.2g} '
+                 'rad RMS from average to average, relative to the other orders')
 
 
 def _turns_in_cycles(observation: Observation, lines: Lines) -> Check:
@@ -212,8 +213,8 @@ def _turns_in_cycles(observation: Observation, lines: Lines) -> Check:
     chance = special.fdtrc(freedom, freedom, power / (noise + _LOSS**2))
     worst = int(np.argmin(chance))
     return Check(min(1.0, float(chance[worst]) * order.size), LINES, float(own[worst]),
-                 f'the phase of order {order[worst]:g} changes by {own[worst]:.2g} rad RMS from '
-                 'cycle to cycle, relative to the other orders')
+                 f'the phase of {observation.words(order[worst])} changes by {own[worst]:.2g} '
+                 'rad RMS from cycle to cycle, relative to the other orders')
 
 
 def _follows(observation: Observation, size: Array, noise: Array) -> tuple[Check, ...]:
@@ -271,6 +272,6 @@ def _beside_errors(observation: Observation, lines: Lines, noise: Array) -> Iter
             # the share of a parabola over independent values is 2 / (their number - 1) in the mean
             yield Check(min(1.0, float((1.0 - share[0]) ** max(1.0 / apart - 1.0, 0.0))
                             * orders.size), LINES, math.sqrt(float(explained[0])),
-                        f'the amplitude of order {observation.orders[order]:g} follows the pulse '
-                        f'errors: {math.sqrt(float(explained[0])):.2g} of it RMS, as a resonance '
-                        'or a path that changes make it')
+                        f'the amplitude of {observation.words(observation.orders[order])} '
+                        f'follows the pulse errors: {math.sqrt(float(explained[0])):.2g} of it '
+                        'RMS, as a resonance or a path that changes make it')

@@ -38,6 +38,7 @@ from sa_jitter_ros.inference.order_band import FULL_BAND
 from sa_jitter_ros.inference.record_pulses import numbered, record_pulses, RecordPulses
 from sa_jitter_ros.inference.record_recovery import (
     leaking_orders, RecordRecovery, recover_record, RESOLVED)
+from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.prediction.influence import common_turn, mean_period
 from sa_jitter_ros.prediction.model import DeclaredModel
 from sa_jitter_ros.pulses.angle_law import angle_law, AngleLaw, LINEAR_LAW
@@ -49,6 +50,7 @@ BoolArray = NDArray[np.bool_]
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 Progress = Callable[[float], None]
+NameOf = Callable[[float], str]  # of an order
 
 #: Coherence of a line from cycle to cycle, in units of that of noise, from which on it is used.
 CHANCE = 4
@@ -56,6 +58,11 @@ _OTHER_MACHINE = 5.0
 _LOSS = 0.03  # of amplitude by a reference keyphasor, and noise over amplitude of lines for it
 # A ripple with more than this many times the power of its noise is corrected.
 _RIPPLE = 3.0
+
+
+def nameless(order: float) -> str:
+    """Return no name of an order."""
+    return ''
 
 
 @dataclass(frozen=True)
@@ -129,7 +136,8 @@ class Observation:
     `orders` are the declared ones, `sources` these and the undeclared orders that leak into them.
     The amplitudes of an acquisition are those of `sources`. The trigger_speed of `model` is the
     measured mean; `declared_speed` (Hz) is the declared one. `recoveries` are those of the
-    recordings, none on line; `clock_steps` are where their clock steps.
+    recordings, none on line; `clock_steps` are where their clock steps; `name_of` returns the name
+    of what makes an order, '' of an unknown one.
     """
 
     model: DeclaredModel
@@ -144,6 +152,11 @@ class Observation:
     name: str = ''
     recoveries: tuple[RecordRecovery, ...] = ()
     clock_steps: tuple[ClockStep, ...] = ()
+    name_of: NameOf = nameless
+
+    def words(self, order: float) -> str:
+        """Return an order in a sentence."""
+        return order_words(order, self.name_of(order))
 
     @property
     def compared(self) -> tuple[int, ...]:
@@ -175,15 +188,16 @@ class Observation:
 
 
 def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 'band_limited',
-            sources: Sequence[float] = (), progress: Progress | None = None) -> Observation:
+            sources: Sequence[float] = (), name_of: NameOf = nameless,
+            progress: Progress | None = None) -> Observation:
     """
     Observe the acquisitions of a recording.
 
     `sources` are the declared orders, then others that leak into them; without it these are
-    searched for. A reference keyphasor is not used if it is worse than the keyphasor, or if the
-    vibration wanders against it, or the speed ripples between its pulses, so much that the average
-    with it loses amplitude. Raises RecordingError if there is no whole acquisition, ModelError if
-    the declared model does not fit the recording.
+    searched for. `name_of` is that of the observation. A reference keyphasor is not used if it is
+    worse than the keyphasor, or if the vibration wanders against it, or the speed ripples between
+    its pulses, so much that the average with it loses amplitude. Raises RecordingError if there is
+    no whole acquisition, ModelError if the declared model does not fit the recording.
     """
     if recording.samples * recording.channels > MAX_VALUES:
         raise RecordingError(f'{recording.samples} samples of {recording.channels} channels: at '
@@ -237,7 +251,7 @@ def observe(recording: Recording, model: DeclaredModel, *, interpolation: str = 
     return Observation(
         model, tuple(found), np.array(once), orders, recording.channel_names, pulses,
         recording.sample_rate, pulses.reference is not None, declared_speed,
-        recording.description, (recovery,), steps)
+        recording.description, (recovery,), steps, name_of)
 
 
 def together(observations: Sequence[Observation]) -> Observation:

@@ -161,7 +161,7 @@ def unexplained_text(observation: Observation, most: str, harmful: Sequence[Find
     worse = [f'{", ".join(item.name for item in harmful)}: {HARMS}'] if harmful else []
     steps = [steps_text(observation.clock_steps)] if observation.clock_steps else []
     large = [item for item in unsteady if item.large]
-    lines = [unsteady_text(large)] if large else []
+    lines = [unsteady_text(large, observation.words)] if large else []
     return '; '.join(filter(None, (*steps, most, *worse, *lines)))
 
 

@@ -15,7 +15,7 @@ A load that changes, a channel that loses sensitivity and a path that fades do t
 the attenuation hold beside it, those of amplitudes do not.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.inference.expectation import Lines
 from sa_jitter_ros.inference.residual import FALSE_ALARM
-from sa_jitter_ros.number_text import order_text, percent_text
+from sa_jitter_ros.number_text import percent_text
 from scipy import special
 
 Array = NDArray[Any]
@@ -70,10 +70,10 @@ def unsteady_lines(amplitude: Array, known: Array, orders: Array, channels: Sequ
                               float(size[i])) for i in found[np.argsort(-size[found])].tolist())
 
 
-def unsteady_text(lines: Sequence[UnsteadyLine]) -> str:
-    """Return in words which lines vary, the worst first."""
+def unsteady_text(lines: Sequence[UnsteadyLine], words: Callable[[float], str]) -> str:
+    """Return which lines vary, the worst first; `words` names an order in a sentence."""
     worst = lines[0]
     others = len(lines) - 1
     more = f' (and {others} more: see unsteady_lines)' if others else ''
-    return (f'the amplitude of order {order_text(worst.order)} on {worst.channel} varies by '
+    return (f'the amplitude of {words(worst.order)} on {worst.channel} varies by '
             f'{percent_text(worst.scatter)} RMS from average to average{more}')

@@ -58,7 +58,8 @@ class ShaftOutput:
         if not 0.0 <= since < pause and self._summary.get_subscription_count():
             self._summarised = average.end_time
             self._summary.publish(summary_of(
-                self._name, results, channels, self._node.hardware_id))
+                self._name, results, channels, self._node.hardware_id,
+                self._node.parameters.machine))
         self.published += 1
         self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])

@@ -168,7 +168,10 @@ class LiveView(MonitoringNode):
             'shafts': values['shafts'],
             'vibration_unit': values['vibration_unit'] or (
                 units.pop() if len(units) == 1 else ''),
-            'channel_names': values['channel_names'] or [*self._channels]}
+            'channel_names': values['channel_names'] or [*self._channels],
+            'order_names': {
+                shaft: [*machine.gear_orders(shaft).items()] for shaft in values['shafts']
+                if shaft in (machine := self.parameters.machine).shafts}}
         self._board.put('settings', lambda: shown, data=False)
 
     # --- messages ---

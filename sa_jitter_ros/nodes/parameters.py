@@ -30,7 +30,7 @@ from rcl_interfaces.msg import (FloatingPointRange, IntegerRange, ParameterDescr
 from rclpy.node import Node
 import rclpy.parameter
 from sa_jitter_ros.errors import ParameterError, SaJitterError
-from sa_jitter_ros.machine import following, PREFIX
+from sa_jitter_ros.machine import following, Machine, PREFIX
 from sa_jitter_ros.parameter_file import value_of
 from sa_jitter_ros.parameters import Parameter, Values
 from sa_jitter_ros.recordings.channel_units import channel_parameters, Channels, channels_of
@@ -113,6 +113,8 @@ class ParameterSet:
         self._check: Callable[[Values], object] = lambda values: None
         self._apply: Callable[[Values], None] = lambda values: None
         self._following = following(self.given_values)
+        #: The machine by its parts, without any where none are given.
+        self.machine = Machine.among(self.given_values)
         self.declare(specifications)
 
     def declare(self, specifications: Sequence[Parameter]) -> None:

@@ -10,7 +10,8 @@
 
 """Averages as texts that a person reads in any tool: `<shaft>/summary`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 import math
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.number_text import measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
@@ -30,7 +32,7 @@ _HALF = 1.96  # of a 95 % interval, standard errors
 
 
 def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: ChannelScale,
-               hardware_id: str) -> DiagnosticArray:
+               hardware_id: str, machine: Machine) -> DiagnosticArray:
     """Return one status for each channel; `results` are those of `ShaftResults`."""
     table = results['order_amplitude']
     message = DiagnosticArray()
@@ -40,7 +42,7 @@ def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: Chan
         stamp = 0, 0
     message.header.stamp.sec, message.header.stamp.nanosec = stamp
     for channel, (name, unit) in enumerate(zip(channels.names, channels.units)):
-        orders = dict(_orders(table.values[channel], unit))
+        orders = dict(_orders(table.values[channel], unit, partial(machine.name_of, shaft)))
         values = {'sequence': str(table.header.sequence),
                   'trigger_speed_hz': f'{table.header.mean_trigger_speed:.6g}',
                   **orders, **_indicators(results, channel, unit)}
@@ -52,15 +54,17 @@ def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: Chan
     return message
 
 
-def _orders(table: FloatArray, unit: str) -> Iterator[tuple[str, str]]:
-    """Iterate over the strongest orders of a table (order, field) and their texts."""
+def _orders(table: FloatArray, unit: str, name_of: Callable[[float], str]
+            ) -> Iterator[tuple[str, str]]:
+    """Iterate over the strongest orders of a table (order, field), or names, and their texts."""
     field = dict(zip(AMPLITUDE_FIELDS, table.T))
     corrected = np.isfinite(field['corrected_amplitude'])
     amplitude, error = (np.where(corrected, field[f'corrected_{name}'], field[f'raw_{name}'])
                         for name in ('amplitude', 'standard_error'))
     known = np.flatnonzero(np.isfinite(amplitude))
     for place in sorted(known[np.argsort(-amplitude[known])][:_ORDERS]):
-        yield order_text(field['order'][place]), (
+        order = field['order'][place]
+        yield name_of(order) or order_text(order), (
             f'{_interval(amplitude[place], error[place], unit)}, '
             f'attenuation {field["attenuation"][place]:.3g}')
 

@@ -65,8 +65,7 @@ def orders_figure(signals: Signals, series: ShaftSeries, prediction: Array | Non
     `prediction` (order, 3) is mean attenuation and its 5 % and 95 % quantile, if it is known.
     """
     position = np.arange(series.orders.size)
-    names = [signals.order(series.shaft, order).removeprefix('order ')
-             for order in series.orders.tolist()]
+    names = [signals.order(series.shaft, order) for order in series.orders.tolist()]
     upright = position.size > 20 or max(map(len, names)) > 8
     figure = Figure(figsize=(9.0, 6.2 + 0.05 * upright * max(map(len, names))),
                     layout='constrained')

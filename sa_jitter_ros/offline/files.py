@@ -32,6 +32,7 @@ import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
 
 ARRAYS, TABLE = 'averages.npz', 'averages.csv'
@@ -59,9 +60,8 @@ class Signals:
     machine: Machine = field(default_factory=Machine)
 
     def order(self, shaft: str, order: float) -> str:
-        """Return an order in words: with the part of the machine that makes it, if one does."""
-        part = self.machine.name_of(shaft, order)
-        return f'{part} ({order:.6g})' if part else f'order {order:.6g}'
+        """Return an order, behind the part of the machine that makes it, if one does."""
+        return order_text(order, self.machine.name_of(shaft, order))
 
     def label(self, channel: int) -> str:
         """Return name and unit of the channel in this place, for an axis."""

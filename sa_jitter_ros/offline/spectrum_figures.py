@@ -109,7 +109,7 @@ def _draw_spectrum(axes: Axes, signals: Signals, series: ShaftSeries, amplitude:
                         linewidth=1.2, label=label)
         mesh = orders[lines.mesh][:_HARMONICS]
         for order in mesh.tolist():
-            name = signals.order(series.shaft, order).removeprefix('order ')
+            name = signals.order(series.shaft, order)
             axes.annotate(name, (order, amplitude[order]), textcoords='offset points',
                           xytext=(0, 3), ha='left' if len(name) > 8 else 'center',
                           rotation=20 if len(name) > 8 else 0, fontsize='x-small')

@@ -15,6 +15,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.files import Signals
 from sa_jitter_ros.offline.plotting import Array, heading, speed_varies
@@ -43,7 +44,8 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
     figure = Figure(figsize=(9.0, 6.4), layout='constrained')
     panels = figure.subplots(2, len(columns), sharex='col', sharey='row', squeeze=False)
     channels = strongest_lines(series)
-    names = [signals.order(series.shaft, order) for order in series.orders.tolist()]
+    names = [order_words(order, signals.machine.name_of(series.shaft, order))
+             for order in series.orders.tolist()]
     for number, (label, place) in enumerate(columns):
         for colour, order in enumerate(chosen.tolist()):
             _draw(panels[0, number], panels[1, number], place, amplitude[:, order],

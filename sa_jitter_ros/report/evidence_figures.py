@@ -10,7 +10,7 @@
 
 """Figures of the evidence: pulse errors, trigger cycle and amplitudes, expected and observed."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -27,6 +27,7 @@ from sa_jitter_ros.report.expected_errors import (
 from sa_jitter_ros.report.plotting import add_legend, AFTER, BEFORE, MEASURED, panels
 
 Array = NDArray[Any]
+Words = Callable[[float], str]  # an order in a sentence
 
 _MICRO = 1e6
 _MOST_POINTS = 3000
@@ -49,22 +50,26 @@ def pulse_errors(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
     return figure
 
 
-def trigger_cycle(evidence: Evidence, effects: Sequence[Effect]) -> Figure:
-    """Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index."""
+def trigger_cycle(evidence: Evidence, effects: Sequence[Effect], *, words: Words) -> Figure:
+    """
+    Draw the profile over the trigger cycle, the dependence on N_t, and the pulse index.
+
+    `words` names an order.
+    """
     evidence, versions = with_explained_errors(evidence), versions_of(evidence, effects)
     figure, axes = panels(3)
     _profile(axes[0], evidence, versions)
-    _dependence_on_cycles(axes[1], evidence, versions)
+    _dependence_on_cycles(axes[1], evidence, versions, words)
     _folded(axes[2], evidence, versions[-1])
     return figure
 
 
-def amplitudes(evidence: Evidence, channel_names: Sequence[str]) -> Figure:
+def amplitudes(evidence: Evidence, channel_names: Sequence[str], words: Words) -> Figure:
     """Draw how the strongest lines vary: over time, with each other, and their spectrum."""
     lines = evidence.lines
     figure, axes = panels(3)
     strongest = np.argsort(lines.radial_noise)[:4]
-    names = [f'order {lines.order[k]:g}, {channel_names[lines.channel[k]]}' for k in strongest]
+    names = [f'{words(lines.order[k])}, {channel_names[lines.channel[k]]}' for k in strongest]
     changes = lines.radial[..., strongest]
     cycles = changes.shape[1]
     for change, name in zip(changes.reshape(-1, len(names)).T, names):
@@ -234,7 +239,8 @@ def _angle_errors(evidence: Evidence, u: Array) -> Array:
     return np.asarray(read + ripple * u * (1.0 - u))
 
 
-def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version]) -> None:
+def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Version],
+                          words: Words) -> None:
     """Draw the attenuation by the pulse errors in averages of fewer cycles."""
     model = evidence.model
     counts = np.unique(np.geomspace(1, model.trigger_cycles, 7).astype(int))
@@ -258,7 +264,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.set_xscale('log')
     axes.set_xticks(counts, [str(n) for n in counts])
     axes.set_xticks([], minor=True)
-    axes.set(title=f'order {g:g} over the number of cycles', xlabel='trigger cycles in an average',
+    axes.set(title=f'{words(g)} over the number of cycles', xlabel='trigger cycles in an average',
              ylabel='attenuation')
     add_legend(axes)
 

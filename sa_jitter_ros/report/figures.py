@@ -12,6 +12,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 import io
 from typing import Any
 
@@ -24,6 +25,7 @@ from sa_jitter_ros.effects.effect import Effect, effects_of
 from sa_jitter_ros.inference.expectation import Expectation
 from sa_jitter_ros.inference.residual import Residual
 from sa_jitter_ros.inference.trace_result import Trace
+from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.report import evidence_figures
 from sa_jitter_ros.report.plotting import (
     add_legend, AFTER, arrange, BEFORE, MEASURED, panels, with_effects)
@@ -35,6 +37,7 @@ _MOST_PANELS = 3
 _POINTS = 200
 _BAND = 1.96
 _COMPRESSION = 1  # files are a tenth larger than by the default, 6, in half the time
+_LONG = 8  # letters of an order that has a name
 _SPREAD = 0.6  # share of the distance between orders over which the lines of one are spread
 
 
@@ -78,7 +81,7 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
             _distribution_figure(trace))]
     if trace.evidence is None or trace.observation.model.trigger_cycles < _FEWEST_CYCLES:
         return tuple(found)
-    effects = _effects(trace)
+    effects, words = _effects(trace), trace.observation.words
     drawn: Sequence[tuple[str, str, str, Callable[..., Figure]]] = (
         ('pulse_errors', 'Pulse errors',
          'Recovered pulse errors (measured minus true time) of the fitted acquisitions, and those '
@@ -87,12 +90,12 @@ def illustrate(trace: Trace) -> tuple[Illustration, ...]:
         ('trigger_cycle', 'Inside the trigger cycle, and over the number of cycles',
          'Angle error over the trigger cycle, attenuation over the number of averaged cycles, and '
          'mean pulse error over the pulse index.',
-         evidence_figures.trigger_cycle),
+         partial(evidence_figures.trigger_cycle, words=words)),
         ('amplitudes', 'Amplitudes of the lines',
          'Amplitudes of the strongest lines from cycle to cycle, after correction of the pulse '
          'errors: these variations are not due to timing.',
          lambda evidence, _: evidence_figures.amplitudes(
-             evidence, trace.observation.channel_names)))
+             evidence, trace.observation.channel_names, words)))
     for name, title, caption, draw in drawn:
         found.append(Illustration(name, title, caption, draw(trace.evidence, effects)))
     return tuple(found)
@@ -145,8 +148,9 @@ def _residual_figure(trace: Trace) -> Figure:
         row.set_ylabel('observed minus predicted')
         add_legend(row)
     step = max(1, orders.size // 30)
-    axes[-1].set_xticks(np.arange(orders.size)[::step], [f'{g:g}' for g in orders[::step]],
-                        rotation=0 if orders.size <= 20 else 90)
+    names = [order_text(g, trace.observation.name_of(g)) for g in orders[::step]]
+    axes[-1].set_xticks(np.arange(orders.size)[::step], names,
+                        rotation=90 if orders.size > 20 or max(map(len, names)) > _LONG else 0)
     axes[-1].set_xlabel('order (channels side by side)')
     axes[-1].set_xlim(-0.6, orders.size - 0.4)
     return figure
@@ -168,8 +172,8 @@ def _distribution_figure(trace: Trace) -> Figure:
             x = np.linspace(max(0.0, min(low, mean.min() - reach)), max(high, mean.max() + reach),
                             _POINTS)
             one.plot(x, expected.mean_cdf(trace.held_out, line, x), color=colour, label=label)
-        one.set(title=f'order {order:g}, {channel}', xlabel='amplitude / mean level',
-                ylabel='cumulative share')
+        one.set(title=f'{trace.observation.words(order)}, {channel}',
+                xlabel='amplitude / mean level', ylabel='cumulative share')
         add_legend(one)
     _probability_panel(trace, axes[-1])
     return figure

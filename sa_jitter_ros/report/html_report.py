@@ -125,7 +125,7 @@ def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
     if recordings:
         yield f'<p class="quiet">{_TITLE}</p>'
     count = sum(content['acquisitions'].values())
-    orders = ('; orders ' + ', '.join(map(order_text, content['orders']))
+    orders = ('; orders ' + ', '.join(map(order_text, content['orders'], content['order_names']))
               if len(shafts) == 1 else '')
     names = ', '.join(name for name in shafts if name != ONLY_SHAFT)
     analysed = ' '.join(filter(None, (
@@ -163,7 +163,7 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
     added = bool(content['missing_effects'])
     yield '<h2>What it does to the amplitudes</h2>'
     yield _table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
-        (order_text(item.order), percent_text(item.observed, item.standard_error),
+        (order_text(item.order, item.name), percent_text(item.observed, item.standard_error),
          *(percent_text(value, item.standard_error, shown=False)
            for value in (item.before, *((item.after,) if added else ())))) for item in shares])
     yield ('<p class="quiet">Share of the true amplitude that an average keeps, with one standard '
@@ -257,7 +257,7 @@ def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> s
 def _line_table(content: Mapping[str, Json]) -> str:
     return _table(
         ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
-        [(order_text(item['order']), item['channel'],
+        [(order_text(item['order'], item['name']), item['channel'],
           measured_text(item['level'], None, content['unit']),
           percent_text(item['observed'], item['standard_error']),
           *(percent_text(item[key], item['standard_error'], shown=False)

@@ -19,6 +19,7 @@ BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
 # Inches: what stands in 10 points is 10 pixels on a phone.
 _WIDTH, _LEFT, _RIGHT, _HEIGHT = 5.2, 1.0, 0.12, 2.0  # of a figure, beside its panels, of a panel
 _TITLE, _LABELS, _TURNED, _ROW, _GAP = 0.3, 0.5, 0.35, 0.18, 0.12
+_LETTER = 0.085  # of a turned label
 _LONG = 28  # letters of a label beside which no second one has room
 
 
@@ -71,8 +72,8 @@ def _room(panel: Axes, last: bool) -> tuple[float, float]:
     labels = [text.get_text() for text in legend.get_texts()] if legend else []
     rows = _ROW * -(-len(labels) // _columns(labels))
     below = _LABELS if last or panel.get_xlabel() else 0.0
-    if any(label.get_rotation() for label in panel.get_xticklabels()):
-        below += _TURNED
+    turned = [len(label.get_text()) for label in panel.get_xticklabels() if label.get_rotation()]
+    below += max(_TURNED, _LETTER * max(turned)) if turned else 0.0
     return (_GAP + _TITLE, below + rows) if title else (_GAP + rows, below)
 
 

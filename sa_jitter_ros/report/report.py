@@ -49,7 +49,8 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
     observation = trace.observation
     orders = observation.orders
     lines = [{
-        'channel': observation.channel_names[c], 'order': orders[g], 'level': trace.level[i],
+        'channel': observation.channel_names[c], 'order': orders[g],
+        'name': observation.name_of(orders[g]), 'level': trace.level[i],
         'observed': trace.attenuation[list(trace.held_out), i].mean(),
         'predicted_as_declared': (trace.attenuation[list(trace.held_out), i].mean()
                                   - trace.as_declared.mean[i]),
@@ -70,6 +71,7 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'remarks': [*faults, *observation.pulses.remarks, *_not_compared(trace)],
         'acquisitions': {'fit': len(trace.fit), 'held_out': len(trace.held_out)},
         'orders': orders,
+        'order_names': [observation.name_of(order) for order in orders],
         'against': 'reference keyphasor' if observation.against_reference else 'vibration',
         'missing_effects': [_effect(finding) for finding in trace.findings
                             if finding.name not in {item.name for item in trace.declared}],
@@ -93,7 +95,8 @@ def report(trace: Trace, *, recordings: Sequence[str] = (), shaft: str = ONLY_SH
         'clock_steps': [{'time': item.time, 'step': item.step,
                          'standard_error': item.standard_error}
                         for item in observation.clock_steps],
-        'unsteady_lines': [asdict(item) for item in trace.unsteady],
+        'unsteady_lines': [{**asdict(item), 'name': observation.name_of(item.order)}
+                           for item in trace.unsteady],
         'not_testable': [{'name': name, 'reason': reason}
                          for name, reason in trace.not_testable.items()],
         'lines': lines,
@@ -166,8 +169,8 @@ def _not_compared(trace: Trace) -> Sequence[str]:
     if trace.not_compared:
         return [trace.not_compared]
     orders = trace.observation.orders
-    return [f'order {orders[g]:g} is declared but not compared: on no channel is its phase as '
-            'constant from cycle to cycle as that of the other lines'
+    return [f'{trace.observation.words(orders[g])} is declared but not compared: on no '
+            'channel is its phase as constant from cycle to cycle as that of the other lines'
             for g in np.setdiff1d(np.arange(orders.size), trace.lines.order)]
 
 

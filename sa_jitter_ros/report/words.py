@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.effects import EFFECTS
-from sa_jitter_ros.number_text import order_text, percent_text
+from sa_jitter_ros.number_text import order_words, percent_text
 from sa_jitter_ros.report.report import (
     change_text, other_numbers, parameters_text, refinements)
 
@@ -31,6 +31,7 @@ class OrderShare:
     """Shares of the true amplitude of an order that the averages keep, over all its lines."""
 
     order: float
+    name: str
     observed: float
     standard_error: float
     before: float
@@ -46,7 +47,7 @@ def order_shares(content: Mapping[str, Json]) -> tuple[OrderShare, ...]:
     shares = []
     for order in sorted({item['order'] for item in content['lines']}):
         lines = [item for item in content['lines'] if item['order'] == order]
-        shares.append(OrderShare(order, *(
+        shares.append(OrderShare(order, lines[0]['name'], *(
             float(np.mean([item[key] for item in lines])) for key in (
                 'observed', 'standard_error', 'predicted_before', 'predicted_after'))))
     return tuple(shares)
@@ -140,8 +141,8 @@ def next_steps(content: Mapping[str, Json]) -> Sequence[str]:
         worst = min(shares, key=lambda item: item.observed)
         steps.append(
             f'The averages lose {percent_text(1.0 - worst.observed, worst.standard_error)} of '
-            f'order {order_text(worst.order)}. Take corrected amplitudes (correct_jitter: true '
-            'in synchronous_averager), and compare no raw amplitudes across keyphasors.')
+            f'{order_words(worst.order, worst.name)}. Take corrected amplitudes (correct_jitter: '
+            'true in synchronous_averager), and compare no raw amplitudes across keyphasors.')
     for item in content['missing_effects']:
         if item['name'] in EFFECTS and EFFECTS[item['name']].remedy:
             steps.append(f'Against {item["name"]}: {EFFECTS[item["name"]].remedy}.')

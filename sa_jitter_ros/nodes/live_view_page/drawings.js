@@ -1,8 +1,8 @@
 // The charts of the page.
 
 import {Chart, format, known, linear, logarithmic, places, range, withError} from './charts.js';
-import {analysed, channel, channelName, find, finite, ofShaft, orderRows, part, predicted,
-        prediction, refusal, timeUnit, unit, withTimeUnit} from './model.js';
+import {analysed, channel, channelName, find, finite, nameOf, ofShaft, orderRows, part, predicted,
+        prediction, refusal, timeUnit, unit, withTimeUnit, words} from './model.js';
 
 const FEW = 6;  // channels that have the full width and height
 
@@ -90,7 +90,7 @@ export function drawAmplitudes(chart) {
                                         row.noise_standard_deviation])),
     yLabel: `amplitude [${unit()}]`, title: channelName(channel())});
   rows.forEach((row, i) => {
-    const tip = `order ${format(row.order, 6)}: raw ${format(row.raw_amplitude)}, corrected `
+    const tip = `${words(row.order)}: raw ${format(row.raw_amplitude)}, corrected `
       + `${format(row.corrected_amplitude)}, noise ${format(row.noise_standard_deviation)}`;
     chart.dash('noise', i, row.noise_standard_deviation, 0.35, tip);
     for (const [kind, shift] of [['raw', -0.1], ['corrected', 0.1]]) {
@@ -117,7 +117,7 @@ export function drawAttenuation(chart) {
     title: note || channelName(channel())});
   chart.level('zero', 1);
   rows.forEach((row, i) => {
-    const name = `order ${format(row.order, 6)}`, band = row.predicted;
+    const name = words(row.order), band = row.predicted;
     if (band) {
       const tip = `${name}: predicted ${format(band.mean)}, 5 % to 95 %: ${format(band.low)} to `
         + format(band.high);
@@ -185,13 +185,13 @@ export function drawResidual(chart) {
   const at = order => orders.indexOf(order);
   lines.forEach((line, i) => {
     chart.mark('past', at(line.order) - 0.15, before[i], {
-      tip: `${line.channel}, order ${line.order}: ${format(before[i])} with the declared model`});
+      tip: `${line.channel}, ${words(line.order)}: ${format(before[i])} with the declared model`});
     chart.mark('corrected', at(line.order) + 0.15, after[i], {square: true,
-      tip: `${line.channel}, order ${line.order}: ${format(after[i])} with the traced effects`});
+      tip: `${line.channel}, ${words(line.order)}: ${format(after[i])} with the traced effects`});
   });
   residual?.order.forEach((order, i) => chart.mark('measured', at(order), residual.residual[i], {
     error: known(residual.standard_error[i]) ? 2 * residual.standard_error[i] : null,
-    tip: `order ${order}: ${withError(residual.residual[i], residual.standard_error[i])}, z = `
+    tip: `${words(order)}: ${withError(residual.residual[i], residual.standard_error[i])}, z = `
       + `${format(residual.z[i], 3)}`}));
 }
 
@@ -215,13 +215,13 @@ export function drawSpeedLine() {
 export function ordersTable() {
   const rows = orderRows();
   return rows.length && {
-    columns: ['order', ...['raw', 'corrected'].flatMap(kind => [
+    columns: ['order', 'part', ...['raw', 'corrected'].flatMap(kind => [
       `${kind} amplitude [${unit()}]`, `its standard error [${unit()}]`, `${kind} phase [rad]`,
       'its standard error [rad]']), `upper limit at 95 % [${unit()}]`, `noise [${unit()}]`,
               'attenuation', 'standard error of the attenuation', 'predicted attenuation',
               'predicted 5 %', 'predicted 95 %'],
     rows: rows.map(row => [
-      row.order, ...['raw', 'corrected'].flatMap(kind => ['amplitude', 'standard_error', 'phase',
+      row.order, nameOf(row.order), ...['raw', 'corrected'].flatMap(kind => ['amplitude', 'standard_error', 'phase',
         'phase_standard_error'].map(name => row[`${kind}_${name}`])), row.upper_95,
       row.noise_standard_deviation, row.attenuation, row.attenuation_standard_error,
       row.predicted?.mean, row.predicted?.low, row.predicted?.high])};

@@ -14,6 +14,12 @@ export const settings = () => part('settings')
 export const unit = () => settings().vibration_unit || 'unit of the vibration';
 export const channelName = i => settings().channel_names[i] ?? `channel ${i}`;
 export const finite = values => values.filter(known);
+// The part of the machine that makes an order of the shown shaft, and the order in a sentence.
+const SAME = 1e-5;  // relative
+export const nameOf = order => (settings().order_names?.[find('shaft').value] ?? []).find(
+  ([, value]) => Math.abs(value - order) <= SAME * value)?.[0] ?? '';
+export const words = order => nameOf(order) ? `${nameOf(order)} (${format(order, 6)})`
+  : `order ${format(order, 6)}`;
 // Of a condition indicator: those that are no ratios have the unit of the vibration.
 export const unitOf = indicator => ['rms', 'peak'].includes(indicator) ? unit() : '';
 // Several shafts have a prediction each.

@@ -1,8 +1,8 @@
 // The order spectrum, the trend, and the average over the circle.
 
 import {Chart, format, known, linear, logarithmic, range, withError} from './charts.js';
-import {changeOf, changeText, channel, channelName, find, finite, ofShaft, state, unit, unitOf}
-  from './model.js';
+import {changeOf, changeText, channel, channelName, find, finite, ofShaft, state, unit, unitOf,
+        words} from './model.js';
 
 const FLOOR = 1e-6;  // of the largest amplitude: smaller ones are rounding errors
 const SPANS = [[3600, 'h'], [60, 'min'], [1, 's']];
@@ -48,7 +48,7 @@ export function drawSpectrum(chart) {
     if (choice !== document.activeElement) choice.value = known(chart.kept) ? order : '';
     choice.max = most;
     find('spectrum-note').textContent = order === null
-      ? 'point at an order; click, or type its number, to keep it' : `order ${order}: ` + shown.map(
+      ? 'point at an order; click, or type its number, to keep it' : `${words(order)}: ` + shown.map(
         ([kind, amplitudes, phases]) => `${kind} ${format(amplitudes[order - 1])} ${unit()}`
           + (known(phases[order - 1]) ? ` at ${(phases[order - 1] * 180 / Math.PI).toFixed(1)}°`
             : '')).join(', ');
@@ -86,7 +86,7 @@ const parted = choice => [choice.slice(0, choice.indexOf(' ')),
                           choice.slice(choice.indexOf(' ') + 1)];
 const titleOf = choice => {
   const [kind, name] = parted(choice);
-  return kind === 'order' ? choice : name.replaceAll('_', ' ');
+  return kind === 'order' ? words(Number(name)) : name.replaceAll('_', ' ');
 };
 
 function shownTrends() {

@@ -2,8 +2,8 @@
 
 import {format, known, withError} from './charts.js';
 import {drawSpeedLine} from './drawings.js';
-import {analysed, changes, changeText, channelName, find, finite, inBand, ofShaft, orderRows, part, predicted, prediction,
-        state, timeUnit, unit, unitOf, withTimeUnit} from './model.js';
+import {analysed, changes, changeText, channelName, find, finite, inBand, nameOf, ofShaft, orderRows, part,
+        predicted, prediction, state, timeUnit, unit, unitOf, withTimeUnit, words} from './model.js';
 
 const LEVELS = [['ok', 'OK'], ['warn', 'WARN'], ['error', 'ERROR'], ['error', 'STALE']];
 const MOST_CHANGES = 5;
@@ -78,7 +78,7 @@ export function drawOrders() {
     'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation',
     'predicted', '5 % to 95 %', 'in band'].map(right), orderRows().map(row => {
     const inside = inBand(row), band = row.predicted;
-    return [...[format(row.order, 6), withError(row.raw_amplitude, row.raw_standard_error),
+    return [...[nameOf(row.order) ? words(row.order) : format(row.order, 6), withError(row.raw_amplitude, row.raw_standard_error),
                 withError(row.corrected_amplitude, row.corrected_standard_error),
                 format(row.noise_standard_deviation, 2),
                 withError(row.attenuation, row.attenuation_standard_error), format(band?.mean),
@@ -151,7 +151,8 @@ export function drawAttention() {
       : node.message];
   }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
   const changed = [...changes()].sort((a, b) => a.p_value - b.p_value).map(item => [1, item.kind === 'indicator'
-    ? item.name.replaceAll('_', ' ') : `${item.kind === 'bearing' ? 'bearing ' : ''}order ${item.name}`, `of ${item.shaft}, ${channelName(item.channel)}: `
+    ? item.name.replaceAll('_', ' ') : known(item.order) ? item.name
+      : `${item.kind === 'bearing' ? 'bearing ' : ''}order ${item.name}`, `of ${item.shaft}, ${channelName(item.channel)}: `
       + `${changeText(item)} since average ${item.since_sequence}`
       + (known(item.keyphasor_share) ? '; the keyphasor explains '
         + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
