@@ -11,6 +11,7 @@
 """The parameters of one node in a ROS parameter file, read and written without ROS."""
 
 from collections.abc import Collection, Iterator, Mapping
+import json
 from pathlib import Path
 import re
 import stat
@@ -22,6 +23,7 @@ import yaml
 
 _LARGEST_FILE = 1 << 20
 _DEEPEST = 20
+_PLAIN = re.compile(r'[A-Za-z_][\w ./^-]*')  # needs no quotes, unless YAML reads it
 
 
 class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
@@ -71,12 +73,29 @@ def _content(path: Path) -> Any:
         raise ParameterError(f'{path}: cannot be read as YAML: {one_line(error)}') from error
 
 
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    Return values by full names as nested mappings.
+
+    >>> nested({'machine.gears.g.teeth': 19, 'machine.tach_shaft': 'input'})
+    {'machine': {'gears': {'g': {'teeth': 19}}, 'tach_shaft': 'input'}}
+    """
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        *path, last = name.split('.')
+        place = found
+        for key in path:
+            place = place.setdefault(key, {})
+        place[last] = value
+    return found
+
+
 def section_text(node: str, parameters: Mapping[str, Any],
                  remarks: Mapping[str, str] = MappingProxyType({})) -> str:
     """
-    Return the section of a node in any namespace as rcl reads it; mappings are nested.
+    Return the section of a node in any namespace as rcl reads it, of all without its name.
 
-    `remarks` are by the full names of parameters.
+    Mappings are nested; `remarks` are by the full names of parameters.
 
     >>> print(section_text('jitter_predictor', {
     ...     'keyphasor_rate': 3e3, 'effects': {'excess_jitter': {'enabled': True, 'std': 8e-5}},
@@ -89,7 +108,7 @@ def section_text(node: str, parameters: Mapping[str, Any],
             enabled: true
             std: 8.0e-05  # new
     """
-    return '\n'.join((f'/**/{node}:', '  ros__parameters:',
+    return '\n'.join((f'/**/{node}:' if node else '/**:', '  ros__parameters:',
                       *_lines(parameters, remarks, '', '    '), ''))
 
 
@@ -185,11 +204,12 @@ def _lines(parameters: Mapping[str, Any], remarks: Mapping[str, str], prefix: st
            ) -> Iterator[str]:
     for key, value in parameters.items():
         if isinstance(value, Mapping):
-            yield f'{indent}{key}:'
+            yield f'{indent}{_written(key)}:'
             yield from _lines(value, remarks, f'{prefix}{key}.', f'{indent}  ')
         else:
             remark = remarks.get(f'{prefix}{key}', '')
-            yield f'{indent}{key}: {_written(value)}' + (f'  # {remark}' if remark else '')
+            yield (f'{indent}{_written(key)}: {_written(value)}'
+                   + (f'  # {remark}' if remark else ''))
 
 
 def _written(value: Any) -> str:
@@ -204,4 +224,6 @@ def _written(value: Any) -> str:
             mantissa, e, exponent = text.partition('e')
             text = f'{mantissa}.0{e}{exponent}'
         return text
+    if isinstance(value, str) and not (_PLAIN.fullmatch(value) and value_of(value) == value):
+        return json.dumps(value)
     return str(value)

@@ -107,6 +107,39 @@ def test_machine_file_declares_the_machine_to_the_commands(written, recording, c
     assert (written / 'loop' / 'report.json').exists()
 
 
+PARTS = """/**:
+  ros__parameters:
+    hardware_id: "no. 7"
+    machine:
+      tach_shaft: main
+      gears: {g: {shaft: main, teeth: 7, mate_shaft: out, mate_teeth: 21}}
+      bearings: {b: {shaft: out, cage: 0.4, ball: 2.3, outer: 3.0e-5, inner: 5.4}}
+      channels: {"in: #1": {unit: "%", sensitivity: 2.0}}
+jitter_predictor:
+  ros__parameters: {shafts: [main, out], out.orders: [21, 42.0]}
+"""
+
+
+def test_machine_file_keeps_the_parts(recording, tmp_path, ros_graph):
+    declared, found = tmp_path / 'declared.yaml', tmp_path / 'out' / 'machine.yaml'
+    declared.write_text(PARTS)
+    assert check_keyphasor.main([
+        str(recording), '--field', 'vibration=acc', '--field', 'sample_rate=fs', '--field',
+        'pulse_times=clicks', '--params', str(declared), '--output', str(found.parent),
+        '--quiet']) == 0
+    before, after = (read_parameters(path, 'live_view') for path in (declared, found))
+    assert {**after, 'shafts': 0} == {**before, 'shafts': 0}
+    declaration = read_declaration(found)
+    assert {name: model.orders for name, model in declaration.models.items()} == {
+        'main': read_declaration(declared).models['main'].orders, 'out': (21.0, 42.0)}
+    node = ros_graph.add(NODES['synchronous_averager'], cli_args=[
+        '--ros-args', '--params-file', str(found)])
+    assert node.get_parameter('out.ratio').value == pytest.approx(1 / 3)
+    assert list(node.get_parameter('out.orders').value) == [21.0, 42.0]
+    assert list(node.get_parameter('main.mesh_orders').value) == [7.0]
+    assert node.get_parameter('pulses_per_revolution').value == 12
+
+
 def test_machine_file_is_compared_with_what_is_found(recording, tmp_path):
     (tmp_path / 'machine.yaml').write_text(
         '/**/jitter_predictor:\n  ros__parameters:\n    pulses_per_revolution: 50\n'

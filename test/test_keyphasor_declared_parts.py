@@ -86,3 +86,8 @@ def test_a_check_takes_the_machine():
     check = check_keyphasor(recording, machine=gearbox(first=20))
     assert check.findings['ratio'].value == pytest.approx(RATIO, rel=1e-4)
     assert 'machine_contradicted' in {item.code for item in check.warnings}
+    # 19 teeth at 183/76 of the speed are 183/4 orders of the tach shaft: four marks would do, too
+    assert 'marks_ambiguous' in {item.code for item in check_keyphasor(recording).warnings}
+    check = check_keyphasor(recording, machine=gearbox())
+    assert check.findings['pulses_per_revolution'].value == 1
+    assert not {item.code for item in check.warnings} & {'mesh_absent', 'marks_ambiguous'}

@@ -17,7 +17,7 @@ of the vibration. It says what each finding costs, and writes a parameter file f
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 import json
 from pathlib import Path
 import sys
@@ -33,7 +33,7 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.check import check_keyphasor
 from sa_jitter_ros.keyphasor_check.machine_file import machine_file
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
-from sa_jitter_ros.machine import Machine, UNKNOWN
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.nodes.linear_algebra import use_one_thread
 from sa_jitter_ros.offline.repairs_figure import write_repairs
 from sa_jitter_ros.parameter_file import read_parameters
@@ -64,15 +64,19 @@ def _machine_fields(params: Path | None) -> dict[str, Any]:
     """Return what a machine file says of recordings, as keywords of `read`; raises ModelError."""
     if params is None:
         return {}
-    model = next(iter(read_declaration(params).models.values()))
-    fields = {'ratio': model.ratio, 'orders': model.orders,
+    declaration = read_declaration(params)
+    shaft, model = next(iter(declaration.models.items()))
+    names = {order: declaration.machine.name_of(shaft, order) for order in model.orders}
+    fields = {'ratio': model.ratio, 'orders': tuple(  # a sideband need not stand above the noise
+        order for order, name in names.items() if ' -1 ' not in name and ' +1 ' not in name),
               'pulses_per_revolution': model.pulses_per_revolution}
     return fields | ({'pulses_per_trigger': model.pulses_per_trigger}
                      if model.pulses_per_trigger else {})
 
 
-def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
-    """Check the recording, and return both; raises SaJitterError."""
+def run(options: argparse.Namespace, declared: Mapping[str, Any]
+        ) -> tuple[KeyphasorCheck, Recording]:
+    """Check the recording against a declared machine, and return both; raises SaJitterError."""
     def progress(text: str) -> None:
         if not options.quiet:
             print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
@@ -81,9 +85,7 @@ def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
                      **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
-    machine = UNKNOWN if options.params is None else Machine.among(
-        read_parameters(options.params, NODE))
-    return check_keyphasor(recording, teeth=options.teeth, machine=machine,
+    return check_keyphasor(recording, teeth=options.teeth, machine=Machine.among(declared),
                            progress=progress), recording
 
 
@@ -93,12 +95,13 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         require_writable(options.output)
         use_one_thread()
-        found, recording = run(options)
+        declared = read_parameters(options.params, NODE) if options.params else {}
+        found, recording = run(options, declared)
         options.output.mkdir(parents=True, exist_ok=True)
         report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
         (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
         (options.output / 'machine.yaml').write_text(
-            machine_file(found, options.recording.name), encoding='utf-8')
+            machine_file(found, options.recording.name, declared), encoding='utf-8')
         check_figure(found, options.recording.name).savefig(
             options.output / 'keyphasor.png', dpi=110)
         fitted = found.fitted

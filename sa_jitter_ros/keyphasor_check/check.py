@@ -26,7 +26,7 @@ from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.keyphasor_check.clock import find_clock, is_decimal
 from sa_jitter_ros.keyphasor_check.costs import by_marks, costs, NO_ORDERS
-from sa_jitter_ros.keyphasor_check.declared_parts import contradictions
+from sa_jitter_ros.keyphasor_check.declared_parts import contradictions, meshes_seen
 from sa_jitter_ros.keyphasor_check.jitter import measure_jitter
 from sa_jitter_ros.keyphasor_check.lines import (
     find_lines, is_usual, marks_evidence, on_orders, ratio_evidence, speed_ripples, ToothLines,
@@ -263,7 +263,7 @@ class _Check:
         elif declared == best and declared > 1:
             by = 'stated by the recording, which pulses and vibration do not contradict'
         elif vibration[best] > 2.0:
-            by = 'lines of the vibration are multiples of the shaft speed'
+            by = 'lines of the vibration are multiples of the shaft speed, or at known meshes'
         else:
             by = ('even marks look all alike: count the marks on the shaft, or measure its speed '
                   'once with a strobe')
@@ -292,6 +292,10 @@ class _Check:
                          *range(1, _MOST_MARKS + 1)})
         counts = [count for count in counts if count <= max(span // 2, 1) or count == declared]
         vibration = marks_evidence(lines, counts)
+        seen = {count: 0 if lines is None else meshes_seen(
+            lines.scaled(float(count)), self._machine) for count in counts}
+        for count in counts:
+            vibration[count] += _DECLARED * seen[count] / max(1, *seen.values())
         log = {}
         for count in counts:
             pattern = max((item.evidence - (0.0 if count == item.teeth else _SYMMETRY + math.log(

@@ -54,15 +54,24 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
                      + ': count the teeth')
     if found:
         return [Warn('machine_contradicted', found)]
-    meshes = {name: place for name, place in machine.places().items()
-              if name.startswith('mesh ') and name.endswith('x')}
-    if not _near(lines, np.array([*meshes.values()])).any():
+    meshes = _meshes(machine)
+    if not meshes_seen(lines, machine):
         listed = ', '.join(f'{name} {place:.5g}' for name, place in meshes.items()
                            if name.endswith(' 1x'))
         return [Warn('mesh_absent', f'no line of the vibration is at a mesh of the machine ('
                      f'{listed}, in orders of the tach shaft): check tach_shaft, the teeth and '
                      'pulses_per_revolution')]
     return []
+
+
+def meshes_seen(lines: Lines, machine: Machine) -> int:
+    """Return how many lines, in orders of the tach shaft, are at a mesh of the machine."""
+    return int(np.count_nonzero(_near(lines, np.array([*_meshes(machine).values()]))))
+
+
+def _meshes(machine: Machine) -> dict[str, float]:
+    return {name: place for name, place in machine.places().items()
+            if name.startswith('mesh ') and name.endswith('x')}
 
 
 def _variants(machine: Machine) -> Iterator[tuple[str, int, int, Machine]]:
@@ -91,7 +100,7 @@ def _fitting(lines: ToothLines, machine: Machine) -> NDArray[np.bool_]:
 
 
 def _near(lines: ToothLines, places: FloatArray) -> NDArray[np.bool_]:
-    distance = np.abs(lines.places[:, None] - places).min(axis=1)
+    distance = np.abs(lines.places[:, None] - places).min(axis=1, initial=np.inf)
     return np.asarray(distance < _NEAR * lines.step)
 
 

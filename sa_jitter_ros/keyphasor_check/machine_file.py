@@ -10,27 +10,37 @@
 
 """The machine file of a check: parameters of the nodes, as the findings have them."""
 
-import json
+from collections.abc import Mapping
 import math
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from sa_jitter_ros.keyphasor_check.result import KeyphasorCheck
-from sa_jitter_ros.parameter_file import section_text
+from sa_jitter_ros.machine import following, PREFIX
+from sa_jitter_ros.parameter_file import nested, section_text
+from sa_jitter_ros.parameters import HARDWARE_ID
 from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 
 # close_loop compares no fewer cycles; cycles from mark to mark are more, and corrected together
 _LEAST_CYCLES, _MOST_CYCLES, _AVERAGES, _MOST_FROM_MARKS = 5, 100, 8, 400
 _ROUNDED = 0.7  # of the jitter: a clock that makes as much makes all of it
 _SHAFT = 'shaft'
+NOTHING: Mapping[str, Any] = MappingProxyType({})  # declared
 _DISCARDED = 0.5  # of the trigger cycles of an average
 _COARSE, _TICKS, _WIDEST = 0.02, 2.5, 0.45  # of an interval
 _CLEAR = 4.0  # standard errors of a delay that is corrected
 _SHOWS = 1e-4  # rad, of the highest order, by which a mark is uneven enough
 
 
-def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
-    """Return the parameters of the nodes, by the name of the node."""
+def machine_parameters(check: KeyphasorCheck, declared: Mapping[str, Any] = NOTHING
+                       ) -> dict[str, dict[str, Any]]:
+    """
+    Return the parameters of the nodes, by the name of the node.
+
+    `declared` are those of a machine file: ratios and orders of shafts of which it has parts
+    follow from these, unless it gives them.
+    """
     found = {name: item.value for name, item in check.findings.items()}
     count, std, clock = found['pulses_per_revolution'], found['jitter_std'], found['clock_rate']
     tick = 1.0 / clock if clock else 0.0  # s
@@ -41,8 +51,7 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
     cycles = int(np.clip(turns // _AVERAGES, _LEAST_CYCLES if turns > _LEAST_CYCLES else 2,
                          _MOST_CYCLES))
     common: dict[str, Any] = {
-        'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0),
-        **({f'{_SHAFT}.orders': found['orders']} if found['orders'] else {}),
+        **_of_shafts(found, declared),
         'pulses_per_revolution': count, 'trigger_cycles': cycles, 'keyphasor_rate': float(rate)}
     if check.by_marks:
         turns = min(cycles, max(1, _MOST_FROM_MARKS // count))
@@ -55,15 +64,15 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
                                  'maximum_discarded': _DISCARDED, 'correct_jitter': True},
         'jitter_predictor': {**common, 'trigger_speed': float(found['speed']['mean']),
                              'follow_shaft_speed': True, **jitter},
-        'residual_analyser': {'shaft': _SHAFT},
-        'live_view': {'shafts': [_SHAFT]}}
+        'residual_analyser': {'shaft': common['shafts'][0]},
+        'live_view': {'shafts': common['shafts']}}
     pitch = 1.0 / (float(found['speed']['mean']) * count)
     if tick > _COARSE * pitch:  # intervals scatter by a tick to either side
         nodes['synchronous_averager']['interval_tolerance'] = min(
             _WIDEST, _TICKS * tick / pitch)
     target = MarkOffsets(np.array(check.findings['marks'].value),
-                         np.array(check.findings['marks'].standard_error or 0.0))
-    turn = np.abs(target.angles).max() * common[f'{_SHAFT}.ratio'] * max(found['orders'] or [1.0])
+                            np.array(check.findings['marks'].standard_error or 0.0))
+    turn = np.abs(target.angles).max() * (found['ratio'] or 1.0) * max(found['orders'] or [1.0])
     if target.standard_errors.all() and target.significant and turn > _SHOWS:
         nodes['synchronous_averager'] |= {
             'target_geometry': 'given', 'target_angles': target.angles.tolist()}
@@ -76,8 +85,26 @@ def machine_parameters(check: KeyphasorCheck) -> dict[str, dict[str, Any]]:
     return nodes
 
 
-def machine_file(check: KeyphasorCheck, name: str) -> str:
-    """Return the text of a ROS parameter file for all nodes, with what is uncertain as remarks."""
+def _of_shafts(found: Mapping[str, Any], declared: Mapping[str, Any]) -> dict[str, Any]:
+    """Return names, ratios and orders of the shafts: those found, unless a machine has parts."""
+    follow = following(declared)
+    if not follow:
+        orders = {f'{_SHAFT}.orders': found['orders']} if found['orders'] else {}
+        return {'shafts': [_SHAFT], f'{_SHAFT}.ratio': float(found['ratio'] or 1.0), **orders}
+    shafts = follow['shafts']
+    alone = {name: f'{shafts[0]}.{name}' for name in ('ratio', 'orders') if len(shafts) == 1}
+    given = {alone.get(name, name): value for name, value in declared.items()}
+    return {'shafts': shafts, **{
+        f'{shaft}.{name}': np.asarray(given[f'{shaft}.{name}'], float).tolist() for shaft in shafts
+        for name in ('ratio', 'orders') if f'{shaft}.{name}' in given}}
+
+
+def machine_file(check: KeyphasorCheck, name: str, declared: Mapping[str, Any] = NOTHING) -> str:
+    """
+    Return the text of a ROS parameter file for all nodes, with what is uncertain as remarks.
+
+    It keeps the parts of the machine in `declared`, the parameters of a machine file.
+    """
     name = ' '.join(name.split())
     lines = [f'# The machine as check_keyphasor found it in {name}.']
     for key, item in check.findings.items():
@@ -85,9 +112,11 @@ def machine_file(check: KeyphasorCheck, name: str) -> str:
             others = ', '.join(f'{value:.6g} ({probability:.0%})'
                                for value, probability in item.alternatives)
             lines.append(f'# {key} may also be {others}: {item.decided_by}')
-    if not check.findings['orders'].value:
+    if not (check.findings['orders'].value or following(declared)):
         lines.append('# No order is known: add those of interest, as in shaft.orders: [1.0, 2.0], '
                      'to synchronous_averager and jitter_predictor.')
-    lines += ['', '/**:', '  ros__parameters:', f'    hardware_id: {json.dumps(name)}']
+    parts = nested({key: value for key, value in declared.items() if key.startswith(PREFIX)})
+    sections = {'': {HARDWARE_ID.name: declared.get(HARDWARE_ID.name) or name, **parts},
+                **machine_parameters(check, declared)}
     return '\n'.join(lines) + '\n\n' + '\n'.join(
-        section_text(node, parameters) for node, parameters in machine_parameters(check).items())
+        section_text(node, parameters) for node, parameters in sections.items())

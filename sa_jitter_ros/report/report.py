@@ -165,13 +165,14 @@ def change_text(item: Mapping[str, Json], unit: str) -> str:
 
 
 def _not_compared(trace: Trace) -> Sequence[str]:
-    """Return a remark for each declared order that has no line to compare, one if none has."""
+    """Return a remark on the declared orders that have no line to compare, one if none has."""
     if trace.not_compared:
         return [trace.not_compared]
     orders = trace.observation.orders
-    return [f'{trace.observation.words(orders[g])} is declared but not compared: on no '
-            'channel is its phase as constant from cycle to cycle as that of the other lines'
-            for g in np.setdiff1d(np.arange(orders.size), trace.lines.order)]
+    without = np.setdiff1d(np.arange(orders.size), trace.lines.order)
+    names = ', '.join(trace.observation.words(order) for order in orders[without])
+    return [f'{names} is declared but not compared: on no channel is its phase as constant from '
+            'cycle to cycle as that of the other lines'] * bool(names)
 
 
 def _dependence(before: Dependence, after: Dependence) -> Mapping[str, Json]:
