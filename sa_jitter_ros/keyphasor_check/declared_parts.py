@@ -64,7 +64,7 @@ def contradictions(lines: ToothLines | None, machine: Machine) -> list[Warn]:
     return []
 
 
-def meshes_seen(lines: Lines, machine: Machine) -> int:
+def meshes_seen(lines: ToothLines, machine: Machine) -> int:
     """Return how many lines, in orders of the tach shaft, are at a mesh of the machine."""
     return int(np.count_nonzero(_near(lines, np.array([*_meshes(machine).values()]))))
 
