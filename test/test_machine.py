@@ -137,12 +137,29 @@ def test_bearing_by_the_orders_of_its_maker():
     assert sorted(machine.bearing_orders('fan').values()) == [0.4, 2.3, 3.6, 4.6, 5.4]
 
 
+def test_a_shaft_behind_a_belt():
+    fan = {'shaft': 'fan', 'cage': 0.4, 'ball': 2.3, 'inner': 5.4, 'outer': 3.6}
+    machine = a_machine(belts={'b': {'shaft': 'output', 'mate_shaft': 'fan', 'ratio': 0.4}},
+                        bearings={'f': fan})
+    assert machine.ratio('fan') == 0.4 * machine.ratio('output')
+    assert machine.orders('fan') == machine.bearing_orders('fan') != {}
+    closed = {'shaft': 'fan', 'teeth': 20, 'mate_shaft': 'output', 'mate_teeth': 8}
+    Machine('output', belts=machine.belts, gears={'again': closed})  # 8 / 20 is 0.4
+    found = following({'machine.tach_shaft': 'motor', 'machine.belts.b.shaft': 'motor',
+                       'machine.belts.b.mate_shaft': 'fan', 'machine.belts.b.ratio': 0.5})
+    assert (found['shafts'], found['fan.ratio']) == (['motor', 'fan'], 0.5)
+
+
 RING = {'sun': 20, 'ring': 100, 'planet': 40, 'planets': 4, 'fixed': 'ring',
         'input_shaft': 'output', 'output_shaft': 'drum'}
 BALLS = {'shaft': 'input', 'balls': 9, 'pitch_diameter': 0.04, 'ball_diameter': 0.008}
 WRONG = [
     ({'gears': {'a': STAGE, 'b': {**STAGE, 'teeth': 20}}},
      'machine.gears.b closes the train with another ratio: output .*check the teeth'),
+    ({'belts': {'a': {'shaft': 'input', 'mate_shaft': 'input', 'ratio': 2.0}}},
+     'machine.belts.a: shaft and mate_shaft are both input'),
+    ({'belts': {'a': {'shaft': 'input', 'mate_shaft': 'fan', 'ratio': 0}}},
+     'machine.belts.a.ratio is 0: give more than 0.0'),
     ({'gears': {'a': {**STAGE, 'teeth': 4}}}, 'machine.gears.a.teeth is 4: give at least 5'),
     ({'gears': {'a': {**STAGE, 'teeth': 19.5}}}, 'machine.gears.a.teeth is 19.5'),
     ({'gears': {'a': {'shaft': 'input', 'teeth': 19}}}, 'gears.a lacks mate_shaft, mate_teeth'),
@@ -152,7 +169,7 @@ WRONG = [
     ({'gears': {'a': {**STAGE, 'shaft': 'output'}}}, 'are both output'),
     ({'gears': {'a': {**STAGE, 'shaft': 'Input shaft'}}}, 'small letters'),
     ({'gears': 5}, 'machine.gears is unknown'),
-    ({'tach_shaft': 'fan'}, 'tach_shaft is fan, which no gear or stage turns: give one of input'),
+    ({'tach_shaft': 'fan'}, 'tach_shaft is fan, which nothing turns: give one of input'),
     ({'tach_shaft': ''}, 'tach_shaft is not given: name the shaft .* one of input, output'),
     ({'planetary': {'p': {**RING, 'planets': 7}}}, 'p does not assemble: .* no multiple of 7'),
     ({'planetary': {'p': {**RING, 'ring': 108}}}, 'does not assemble: .* planet = 100 teeth'),

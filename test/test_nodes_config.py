@@ -94,7 +94,7 @@ def test_ratios_and_orders_follow_from_the_parts_in_the_nodes_that_have_them(ros
 
 
 def test_a_wrong_machine_is_one_line(ros_graph):
-    with pytest.raises(ParameterError, match='tach_shaft is fan, which no gear or stage turns'):
+    with pytest.raises(ParameterError, match='tach_shaft is fan, which nothing turns'):
         ros_graph.add(ChangeMonitor, {'machine.tach_shaft': 'fan'}, cli_args=[
             '--ros-args', '--params-file', str(MACHINE)])
 

@@ -107,6 +107,32 @@ class GearPair:
 
 
 @dataclass(frozen=True)
+class Belt:
+    """A belt or chain between two shafts: `ratio` is the speed of the mate's over the shaft's."""
+
+    shaft: str
+    mate_shaft: str
+    ratio: float
+    KINDS: ClassVar = {'shaft': _SHAFT, 'mate_shaft': _SHAFT,
+                       'ratio': Parameter('ratio', 1.0, 'ratio of speeds', above=0.0)}
+
+    def check(self, place: str) -> None:
+        """Check the values; raises ParameterError, which names the place in the file."""
+        _checked(place, self, self.KINDS)
+        if self.shaft == self.mate_shaft:
+            raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: give two')
+
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Return the shafts that the belt couples."""
+        return self.shaft, self.mate_shaft
+
+    def orders(self, name: str, shaft: str) -> dict[str, float]:
+        """Return no orders: a belt has no teeth in mesh."""
+        return {}
+
+
+@dataclass(frozen=True)
 class PlanetaryStage:
     """
     A planetary stage, of which one of sun, ring and carrier is fixed.

@@ -18,21 +18,23 @@ from pathlib import Path
 from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
-from sa_jitter_ros.machine.parts import Bearing, GearPair, PlanetaryStage
+from sa_jitter_ros.machine.parts import Bearing, Belt, GearPair, PlanetaryStage
 from sa_jitter_ros.parameter_file import flattened, read_parameters
 from sa_jitter_ros.parameters import require_shaft_names
 
 #: What the names of all parameters of a machine begin with.
 PREFIX = 'machine.'
-_KINDS: dict[str, Any] = {'gears': GearPair, 'planetary': PlanetaryStage, 'bearings': Bearing}
+_KINDS: dict[str, Any] = {'gears': GearPair, 'planetary': PlanetaryStage, 'belts': Belt,
+                          'bearings': Bearing}
 _OTHERS = ('channels', 'limits')  # of a machine, read elsewhere
+_FINEST = 10**6  # denominator of a ratio
 _SAME = 1e-5  # by which an order may differ from that of a part, relative
 
 
 @dataclass(frozen=True)
 class Machine:
     """
-    A machine by its parts, each by its name: gear pairs, planetary stages, bearings.
+    A machine by its parts, each by its name: gear pairs, planetary stages, belts, bearings.
 
     A part is a mapping of its values or one of the classes of `machine.parts`. `tach_shaft`
     carries the keyphasor; it may be left out where there is one shaft only. Raises ParameterError,
@@ -48,6 +50,7 @@ class Machine:
     gears: Mapping[str, Any] = field(default_factory=dict)
     planetary: Mapping[str, Any] = field(default_factory=dict)
     bearings: Mapping[str, Any] = field(default_factory=dict)
+    belts: Mapping[str, Any] = field(default_factory=dict)
     _ratios: dict[str, Fraction] = field(init=False, repr=False, compare=False,
                                          default_factory=dict)
 
@@ -67,8 +70,8 @@ class Machine:
         if self.tach_shaft:
             require_shaft_names('machine.tach_shaft', [self.tach_shaft])
             if coupled and self.tach_shaft not in coupled:
-                raise ParameterError(f'machine.tach_shaft is {self.tach_shaft}, which no gear or '
-                                     f'stage turns: give one of {", ".join(sorted(coupled))}')
+                raise ParameterError(f'machine.tach_shaft is {self.tach_shaft}, which nothing '
+                                     f'turns: give one of {", ".join(sorted(coupled))}')
             self._find_ratios()
         for name, part in self.bearings.items():
             if part.shaft not in self._ratios:
@@ -118,10 +121,10 @@ class Machine:
         except ParameterError as error:
             raise ParameterError(f'{path}: {error}') from None
 
-    def _couplings(self) -> dict[str, GearPair | PlanetaryStage]:
+    def _couplings(self) -> dict[str, GearPair | PlanetaryStage | Belt]:
         """Return what couples two shafts, by its name in the file."""
-        return {**{f'gears.{name}': part for name, part in self.gears.items()},
-                **{f'planetary.{name}': part for name, part in self.planetary.items()}}
+        return {f'{kind}.{name}': part for kind in ('gears', 'planetary', 'belts')
+                for name, part in getattr(self, kind).items()}
 
     def _find_ratios(self) -> None:
         """Find the speed of each shaft over that of the tach shaft, along the couplings."""
@@ -133,17 +136,18 @@ class Machine:
             if not name:
                 part = next(iter(waiting.values()))
                 raise ParameterError(f'shaft {part.ends[0]} is not coupled with the tach shaft '
-                                     f'{self.tach_shaft}: declare the gears between them')
+                                     f'{self.tach_shaft}: declare the gears or belts between them')
             part = waiting.pop(name)
             first, second = part.ends
+            ratio = Fraction(part.ratio).limit_denominator(_FINEST)  # 0.4 of a belt: 2/5
             if first not in self._ratios:
-                self._ratios[first] = self._ratios[second] / part.ratio
-            again = self._ratios[first] * part.ratio
+                self._ratios[first] = self._ratios[second] / ratio
+            again = self._ratios[first] * ratio
             if self._ratios.setdefault(second, again) != again:
                 raise ParameterError(
                     f'machine.{name} closes the train with another ratio: {second} turns '
                     f'{float(again):.6g} times as fast as {self.tach_shaft} by it, and '
-                    f'{float(self._ratios[second]):.6g} times by the other gears; check the teeth')
+                    f'{float(self._ratios[second]):.6g} times by the others; check the teeth')
 
     @property
     def shafts(self) -> tuple[str, ...]:
