@@ -27,6 +27,7 @@ MODULES = sorted(PACKAGE.rglob('*.py'))
 SCIENCE = {'numpy', 'scipy'}
 CORE = {
     'errors': set(),
+    'html_parts': set(),
     'inner_loops': SCIENCE,
     'json_values': {'numpy'},
     'number_text': set(),
@@ -52,13 +53,14 @@ CORE = {
     'monitoring': SCIENCE | {
         'averaging', 'errors', 'json_values', 'machine', 'parameter_file', 'parameters'},
     'keyphasor_check': SCIENCE | {
-        'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'pulses', 'recordings'},
+        'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'parameters', 'pulses',
+        'recordings'},
     'offline': SCIENCE | {
-        'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop', 'machine',
-        'matplotlib', 'monitoring', 'number_text', 'parameter_file', 'parameters', 'pulses',
-        'recordings', 'samples'},
+        'averaging', 'distributed', 'errors', 'html_parts', 'json_values', 'keyphasor_check',
+        'loop', 'machine', 'matplotlib', 'monitoring', 'number_text', 'parameter_file',
+        'parameters', 'pulses', 'recordings', 'samples'},
     'report': SCIENCE | {
-        'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
+        'averaging', 'effects', 'errors', 'html_parts', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},
     'loop': {
         'declaration', 'effects', 'errors', 'inference', 'keyphasor_check', 'prediction',

@@ -246,6 +246,9 @@ def test_figures_of_a_run_up_with_gear(tmp_path):
                             'gear_signals'}
     width, height = imread(figures['order_map']).shape[1::-1]
     assert width > height  # over time, and over speed beside it
+    page = (tmp_path / 'out' / 'run up' / 'page.html').read_text()
+    assert page.count('<img ') == 3  # average, spectrum, trend
+    assert 'No baseline to compare with' in page
 
 
 @pytest.mark.parametrize(('arguments', 'says'), [

@@ -20,6 +20,7 @@ from sa_jitter_ros.commands import average
 from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
 from sa_jitter_ros.offline.change_figure import changes_figure
 from sa_jitter_ros.offline.changes import find_changes, settings_of
+from sa_jitter_ros.offline.machine_page import write_page
 from sa_jitter_ros.offline.tables import write_changes
 
 RATE, SECONDS, BEARING = 6000.0, 3.0, 4.87
@@ -93,6 +94,10 @@ def test_the_figure_shows_what_changed_first(weeks, tmp_path):
         None, ['allow_uncorrected:=true'], LEARNING))
     write_changes(tmp_path, changes, figure=True)
     assert imread(tmp_path / 'changes.png').ndim == 3
+    write_page(weeks[1] / names[-1], changes, place=tmp_path / 'page.html')
+    page = (tmp_path / 'page.html').read_text()
+    assert '<p class="verdict unexplained">the machine has changed in 9 recordings' in page
+    assert page.count('<img alt="Changes"') == 1
     first, *others = changes_figure(changes).axes
     assert first.get_title(loc='left').startswith('bearing order 4.87 of shaft, channel 0: +')
     assert len(others) == 5

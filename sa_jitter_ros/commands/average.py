@@ -11,10 +11,10 @@
 """
 Command `average`: synchronous averages of recordings, all that the averager does, as files.
 
-Each recording gets a folder with averages.npz, averages.csv and figures; averages.csv and
-recordings.csv beside these folders cover all recordings. Recordings that were finished before are
-skipped. A folder counts for all recordings below it. --baseline N says whether the machine has
-changed since the first N recordings, in changes.json and changes.png.
+Each recording gets a folder with averages.npz, averages.csv, figures and page.html, which prints;
+averages.csv and recordings.csv beside these folders cover all recordings. Recordings that were
+finished before are skipped. A folder counts for all recordings below it. --baseline N says whether
+the machine has changed since the first N recordings, in changes.json, changes.png and page.html.
 """
 
 import argparse
@@ -56,7 +56,8 @@ def make_parser() -> Parser:
                         f'since; -p also takes {", ".join(SETTINGS)}')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for the results')
-    parser.add_argument('--no-figures', action='store_true', help='write arrays and tables only')
+    parser.add_argument('--no-figures', action='store_true',
+                        help='write arrays and tables only, no figures and no page')
     parser.add_argument('--quiet', action='store_true', help='show no progress')
     add_fleet_options(parser)
     add_recording_options(parser)
@@ -126,6 +127,10 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
             options.output, [job.name for job in jobs if job.name in averaged], settings,
             jobs[0].machine.machine)
         write_changes(options.output, found, figure=not options.no_figures)
+        if not options.no_figures:
+            from sa_jitter_ros.offline.machine_page import PAGE, write_page
+            write_page(options.output / found.recordings[-1].name, found,
+                       place=options.output / PAGE)
         changes.append(found)
         for line in found.warnings():
             progress.say(f'warning: {line}')

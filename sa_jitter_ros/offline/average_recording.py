@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 Progress = Callable[[float], None]
 Notes = Mapping[float, str]
 
-_VERSION = 3  # of the files: those of another one are written again
+_VERSION = 4  # of the files: those of another one are written again
 _BLOCK = 1 << 19  # values in a block, of all channels
 _MOST_REMARKS = 10
 
@@ -202,7 +202,7 @@ def _settings(job: AverageJob) -> dict[str, Any]:
     """Return all that decides the files, as values of JSON; raises RecordingError."""
     return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
             'figures': job.figures, 'options': json_values(job.options),
-            'averager': dict(job.machine.averager),
+            'averager': dict(job.machine.averager), 'hardware_id': job.machine.hardware_id,
             'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector)}
 
 
@@ -239,6 +239,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
             from sa_jitter_ros.offline.repairs_figure import write_repairs
             write_repairs(folder, job.name, recording, averager.pulses,
                           averager.stream.validator.rejected)
+            from sa_jitter_ros.offline.machine_page import write_page
+            write_page(folder)
     return row
 
 

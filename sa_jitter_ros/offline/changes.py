@@ -38,7 +38,7 @@ from sa_jitter_ros.offline.files import ARRAYS
 from sa_jitter_ros.offline.settings import section
 from sa_jitter_ros.parameter_file import value_of
 
-CHANGES = 'changes.json'
+CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
 #: Parameters of the node that count here, too.
 SETTINGS = {item.name: item for item in PARAMETERS

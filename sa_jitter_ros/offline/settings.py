@@ -51,7 +51,7 @@ class MachineFile:
 
     Among those of the averager is what follows from the machine, whose own are `parts`.
     `source` is the path of the machine file, '' without one; `unknown` are names in it that the
-    averager does not have.
+    averager does not have; `hardware_id` is the name of the machine.
     """
 
     averager: Mapping[str, Any]
@@ -59,6 +59,7 @@ class MachineFile:
     source: str = ''
     unknown: tuple[str, ...] = ()
     parts: Mapping[str, Any] = field(default_factory=dict)
+    hardware_id: str = ''
 
     @property
     def machine(self) -> Machine:
@@ -103,7 +104,8 @@ class MachineFile:
                     for name, value in values.items() if name in known},
                    {item.name: item.convert(detector[item.name])
                     for item in DETECTOR_PARAMETERS if item.name in detector},
-                   '' if params is None else str(params), tuple(unknown), parts)
+                   '' if params is None else str(params), tuple(unknown), parts,
+                   str(values.get(HARDWARE_ID.name, '')))
 
 
 def section(params: Path | None, node: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import json
 from pathlib import Path
 
 from sa_jitter_ros.offline.average_recording import Row
-from sa_jitter_ros.offline.changes import CHANGES, Changes
+from sa_jitter_ros.offline.changes import CHANGES, Changes, FIGURE
 from sa_jitter_ros.offline.files import join_tables, TABLE, write_lines, write_rows
 
 RECORDINGS = 'recordings.csv'
@@ -40,4 +40,4 @@ def write_changes(output: Path, changes: Changes, *, figure: bool) -> None:
     write_lines(output / CHANGES, lambda file: file.writelines((text, '\n')))
     if figure:
         from sa_jitter_ros.offline.change_figure import changes_figure
-        changes_figure(changes).savefig((output / CHANGES).with_suffix('.png'), dpi=110)
+        changes_figure(changes).savefig(output / FIGURE, dpi=110)

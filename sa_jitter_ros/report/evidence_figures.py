@@ -264,7 +264,7 @@ def _dependence_on_cycles(axes: Axes, evidence: Evidence, versions: Sequence[Ver
     axes.set_xscale('log')
     axes.set_xticks(counts, [str(n) for n in counts])
     axes.set_xticks([], minor=True)
-    axes.set(title=f'{words(g)} over the number of cycles', xlabel='trigger cycles in an average',
+    axes.set(title=words(g), xlabel='trigger cycles in an average',
              ylabel='attenuation')
     add_legend(axes)
 

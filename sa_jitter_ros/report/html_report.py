@@ -10,8 +10,7 @@
 
 """The report of a trace as files: `report.json`, self-contained `report.html`, PNG figures."""
 
-import base64
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 import json
 from pathlib import PurePath
@@ -21,40 +20,13 @@ from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import (
     measured_text, number_text, order_text, percent_text)
 from sa_jitter_ros.report.figures import illustrate, Illustration
+from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
 from sa_jitter_ros.report.report import parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
 
 Json = Any
 
-_STYLE = """
-body { font: 16px/1.5 sans-serif; color: #222; max-width: 44rem; margin: 1.5rem auto;
-       padding: 0 1rem; overflow-wrap: break-word }
-h1 { font-size: 1.5rem; margin-bottom: .3rem; overflow-wrap: anywhere }
-h2 { font-size: 1.15rem; margin-top: 2rem }
-h3 { font-size: 1rem; margin-bottom: .2rem }
-.quiet, figcaption { color: #555; font-size: .9rem }
-.verdict { font-size: 1.1rem; padding: .8rem 1rem; border-left: .4rem solid; background: #f3f3f3 }
-.traced { border-color: #1f77b4 }
-.none { border-color: #2ca02c }
-.unexplained { border-color: #d62728 }
-.unseen { border-color: #999 }
-pre { background: #f3f3f3; padding: .8rem; white-space: pre-wrap; font-size: .85rem }
-table { border-collapse: collapse; margin: .5rem 0; width: 100%; font-size: .9rem }
-th, td { border-bottom: 1px solid #ccc; padding: .25rem .5rem .25rem 0; text-align: left;
-         vertical-align: top; font-variant-numeric: tabular-nums }
-.pairs td, .cards td { overflow-wrap: anywhere }
-th { color: #555; font-weight: normal }
-figure { margin: 1rem 0 }
-img { width: 100%; max-width: 38rem }
-summary { cursor: pointer; font-weight: bold; padding: .3rem 0 }
-@media (max-width: 40rem) {
-  .cards tr { display: block; padding: .4rem 0; border-bottom: 1px solid #ccc }
-  .cards tr.head { display: none }
-  .cards td { display: grid; grid-template-columns: 9rem minmax(0, 1fr); border: none; padding: 0 }
-  .cards td::before { content: attr(data-label); color: #555 }
-}
-"""
 _TITLE = 'Keyphasor jitter: measured against predicted'
 _UNITS = {'keyphasor_rate': 'Hz', 'trigger_speed': 'Hz', 'sample_rate': 'Hz', 'jitter_std': 's',
           'jitter_table': 's'}
@@ -72,9 +44,8 @@ def report_files(trace: Trace, content: Mapping[str, Json]) -> Mapping[str, byte
     """Return all files of a report by name; `content` is that of `report.json`."""
     figures = illustrate(trace)
     pictures = {f'{item.name}.png': item.png() for item in figures}
-    page = html(content, figures, pictures)
     return {'report.json': _json(content),
-            'report.html': page.encode(), **pictures}
+            'report.html': html(content, figures, pictures).encode(), **pictures}
 
 
 def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, bytes]]
@@ -90,7 +61,7 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
         parts += [f'<h2><a href="{escape(shaft)}/report.html">Shaft {escape(shaft)}</a></h2>',
                   _verdict(item)]
     return {'report.json': _json(content),
-            'report.html': _page(content['verdict'], parts).encode(),
+            'report.html': page(f'Report: {content["verdict"]}', parts).encode(),
             **{f'{shaft}/{name}': data for shaft, each in files.items()
                for name, data in each.items()}}
 
@@ -98,22 +69,15 @@ def files_of_all(content: Mapping[str, Json], files: Mapping[str, Mapping[str, b
 def html(content: Mapping[str, Json], figures: Sequence[Illustration],
          pictures: Mapping[str, bytes]) -> str:
     """Return the page; `pictures` are the PNGs of the figures by file name."""
-    return _page(content['verdict'], [
+    return page(f'Report: {content["verdict"]}', [
         *_head(content, [content['shaft']]), _verdict(content), *_found(content),
         *_amplitudes(content), *_steps(content),
-        *(_figure(item, pictures[f'{item.name}.png']) for item in figures),
+        *(figure(item.title, pictures[f'{item.name}.png'], item.caption) for item in figures),
         '<h2>Evidence</h2>', *_evidence(content)])
 
 
 def _json(content: Mapping[str, Json]) -> bytes:
     return (json.dumps(content, indent=2, allow_nan=False) + '\n').encode()
-
-
-def _page(verdict: str, parts: Sequence[str]) -> str:
-    return ('<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-            '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-            f'<title>Report: {escape(verdict)}</title>\n<style>{_STYLE}</style>\n</head>\n'
-            '<body>\n' + '\n'.join(parts) + '\n</body>\n</html>\n')
 
 
 # --- for five minutes ----------------------------------------------------------------------------
@@ -140,7 +104,7 @@ def _head(content: Mapping[str, Json], shafts: Sequence[str]) -> Iterator[str]:
 def _verdict(content: Mapping[str, Json]) -> str:
     kind = content['verdict'] if content['lines'] else 'unseen'
     return (f'<p class="verdict {escape(kind)}">'
-            f'{_kept(verdict_sentence(content))}</p>')
+            f'{kept(verdict_sentence(content))}</p>')
 
 
 def _found(content: Mapping[str, Json]) -> Iterator[str]:
@@ -148,7 +112,7 @@ def _found(content: Mapping[str, Json]) -> Iterator[str]:
     if found or content['remarks']:
         yield '<h2>What was found</h2>'
     for meaning, effect in found:
-        yield f'<p><b>{escape(meaning)}</b><br>{_kept(effect)}</p>'
+        yield f'<p><b>{escape(meaning)}</b><br>{kept(effect)}</p>'
     for remark in content['remarks']:
         yield f'<p>Note: {escape(remark)}.</p>'
 
@@ -162,7 +126,7 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
                if content['against'] == 'reference keyphasor' else 'the corrected amplitudes')
     added = bool(content['missing_effects'])
     yield '<h2>What it does to the amplitudes</h2>'
-    yield _table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
+    yield table(('order', 'measured', 'as declared', *(('as found',) if added else ())), [
         (order_text(item.order, item.name), percent_text(item.observed, item.standard_error),
          *(percent_text(value, item.standard_error, shown=False)
            for value in (item.before, *((item.after,) if added else ())))) for item in shares])
@@ -173,16 +137,9 @@ def _amplitudes(content: Mapping[str, Json]) -> Iterator[str]:
 
 def _steps(content: Mapping[str, Json]) -> Iterator[str]:
     yield '<h2>What to do next</h2>'
-    yield '<ol>' + ''.join(f'<li>{_kept(step)}</li>' for step in next_steps(content)) + '</ol>'
+    yield '<ol>' + ''.join(f'<li>{kept(step)}</li>' for step in next_steps(content)) + '</ol>'
     if content['parameter_file']:
         yield f'<pre>{escape(content["parameter_file"])}</pre>'
-
-
-def _figure(item: Illustration, picture: bytes) -> str:
-    data = base64.b64encode(picture).decode()
-    return (f'<h2>{escape(item.title)}</h2>\n<figure>'
-            f'<img alt="{escape(item.title)}" src="data:image/png;base64,{data}">'
-            f'<figcaption>{escape(item.caption)}</figcaption></figure>')
 
 
 # --- for those who want to know ------------------------------------------------------------------
@@ -191,41 +148,36 @@ def _evidence(content: Mapping[str, Json]) -> Iterator[str]:
     """Return everything that the report rests on, each part to be opened."""
     if content['lines']:
         if content['missing_effects']:
-            yield _part('Effects that are missing', *_effects(content))
-        yield _part('Error of the averages that served no fit', _error_table(content))
-        yield _part('Dependence of the residual on other quantities',
+            yield part('Effects that are missing', *_effects(content))
+        yield part('Error of the averages that served no fit', _error_table(content))
+        yield part('Dependence of the residual on other quantities',
                     _dependence_table(content['dependence']))
-        yield _part('All effects that were tried', _candidate_table(content['candidates']))
-        yield _part('What an effect that was not found could be at most', _limit_table(content))
-        yield _part('All lines', _line_table(content))
-    yield _part('Declared model and data', _declared_table(content))
-
-
-def _part(title: str, *parts: str) -> str:
-    content = '\n'.join(parts)
-    return f'<details><summary>{escape(title)}</summary>\n{content}\n</details>'
+        yield part('All effects that were tried', _candidate_table(content['candidates']))
+        yield part('What an effect that was not found could be at most', _limit_table(content))
+        yield part('All lines', _line_table(content))
+    yield part('Declared model and data', _declared_table(content))
 
 
 def _effects(content: Mapping[str, Json]) -> Iterator[str]:
     for number, item in enumerate(content['missing_effects'], 1):
         yield f'<h3>{number}. {escape(item["name"])}</h3>'
-        yield _table(('parameter', 'value'), [
+        yield table(('parameter', 'value'), [
             (name, measured_text(value['value'], value['standard_error'], parameter_unit(
                 item['name'], name, value['unit'], content['unit'])))
             for name, value in item['parameters'].items()])
-        yield f'<p>Evidence: {_kept(item["evidence"])}.</p>'
+        yield f'<p>Evidence: {kept(item["evidence"])}.</p>'
 
 
 def _error_table(content: Mapping[str, Json]) -> str:
     before, after = content['error_before'], content['error_after']
-    return _table(('', 'before', 'after'), [
+    return table(('', 'before', 'after'), [
         *((text, number_text(before[key]), number_text(after[key])) for key, text in _ERRORS),
         ('unsteadiness: unexplained scatter of the amplitudes, which chi2 takes into account',
          *2 * (percent_text(content['unsteadiness']),))])
 
 
 def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
-    return _table(
+    return table(
         ('over', 'from', 'to', 'change of the residual, before', 'after'),
         [(item['on'].replace('_', ' '), number_text(item['low']),
           measured_text(item['high'], None, item['unit']),
@@ -234,14 +186,14 @@ def _dependence_table(rows: Sequence[Mapping[str, Json]]) -> str:
 
 
 def _candidate_table(candidates: Sequence[Mapping[str, Json]]) -> str:
-    return _table(('effect', 'round', 'held-out score', 'outcome'), [
+    return table(('effect', 'round', 'held-out score', 'outcome'), [
         (item['name'], item['round'], number_text(item['held_out_score']),
          item['rejected_because'] or 'added')
         for item in candidates], kind='cards')
 
 
 def _limit_table(content: Mapping[str, Json]) -> str:
-    return _table(('effect', 'parameter', 'at 95 %'), [
+    return table(('effect', 'parameter', 'at 95 %'), [
         (item['name'], item['parameter'], ' and '.join(filter(None, (
             bound and f'{word} {bound}' for word, bound in (
                 ('at least', _bound(item, 'lower_95', content)),
@@ -255,7 +207,7 @@ def _bound(item: Mapping[str, Json], key: str, content: Mapping[str, Json]) -> s
 
 
 def _line_table(content: Mapping[str, Json]) -> str:
-    return _table(
+    return table(
         ('order', 'channel', 'amplitude', 'measured', 'as declared', 'as found'),
         [(order_text(item['order'], item['name']), item['channel'],
           measured_text(item['level'], None, content['unit']),
@@ -276,7 +228,7 @@ def _declared_table(content: Mapping[str, Json]) -> str:
              ('attenuation measured against', content['against']),
              ('acquisitions fitted', content['acquisitions']['fit']),
              ('acquisitions held out', content['acquisitions']['held_out'])]
-    return _table(('quantity', 'value'), rows, kind='pairs')
+    return table(('quantity', 'value'), rows, kind='pairs')
 
 
 def _given(value: Json) -> str:
@@ -284,22 +236,3 @@ def _given(value: Json) -> str:
     if isinstance(value, list):
         return ', '.join(map(_given, value)) or '–'
     return f'{value:.6g}' if isinstance(value, float) else str(value)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[Json]], *, kind: str = '') -> str:
-    """
-    Return a table.
-
-    On a narrow screen the rows of the kind `cards` are blocks with a line per cell; in `pairs`
-    long words break.
-    """
-    lines = ['<tr class="head">' + ''.join(f'<th>{escape(cell)}</th>' for cell in head) + '</tr>']
-    lines += ['<tr>' + ''.join(f'<td data-label="{escape(name)}">{_kept(str(cell))}</td>'
-                               for name, cell in zip(head, row)) + '</tr>' for row in rows]
-    style = f' class="{kind}"' if kind else ''
-    return f'<table{style}>\n' + '\n'.join(lines) + '\n</table>'
-
-
-def _kept(text: str) -> str:
-    """Return a text in which numbers stay together with their errors and units."""
-    return escape(text.replace(' ± ', '\u00a0±\u00a0').replace(' %', '\u00a0%'))

@@ -19,7 +19,8 @@ BEFORE, AFTER, MEASURED = 'tab:red', 'tab:blue', 'black'
 # Inches: what stands in 10 points is 10 pixels on a phone.
 _WIDTH, _LEFT, _RIGHT, _HEIGHT = 5.2, 1.0, 0.12, 2.0  # of a figure, beside its panels, of a panel
 _TITLE, _LABELS, _TURNED, _ROW, _GAP = 0.3, 0.5, 0.35, 0.18, 0.12
-_LETTER = 0.085  # of a turned label
+_LETTER = 0.075  # of a turned label
+_LONG_TITLE = 44  # letters that fill a panel
 _LONG = 28  # letters of a label beside which no second one has room
 
 
@@ -60,6 +61,8 @@ def arrange(figure: Figure) -> None:
     height = top = sum(above + _HEIGHT + below for above, below in rooms)
     figure.set_size_inches(_WIDTH, height)
     for panel, (above, below) in zip(figure.axes, rooms):
+        if len(panel.get_title()) > _LONG_TITLE:
+            panel.title.set_fontsize('small')
         top -= above + _HEIGHT
         panel.set_position((_LEFT / _WIDTH, top / height, 1.0 - (_LEFT + _RIGHT) / _WIDTH,
                             _HEIGHT / height))

@@ -1,0 +1,181 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""
+A machine on a page that prints: changes, orders, indicators, keyphasor and figures.
+
+It is made of the files of a recording; numbers are those of its last average.
+"""
+
+from collections.abc import Iterator, Sequence
+from html import escape
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sa_jitter_ros.averaging.indicators import IN_UNIT
+from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.number_text import measured_text, order_text, percent_text
+from sa_jitter_ros.offline.changes import Changes, FIGURE
+from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
+from sa_jitter_ros.offline.plotting import squared
+from sa_jitter_ros.offline.series import ShaftSeries
+from sa_jitter_ros.html_parts import figure, kept, page, table
+
+PAGE = 'page.html'
+_OVER_ANGLE = ('waveform', '_average', '_standard_error', '_spectrum')  # ends of names, unused
+_CHANNELS, _ORDERS = 3, 10  # the strongest ones
+_CLEAR = 0.05  # standard error of an attenuation that is one
+_HALF = 1.96  # of a 95 % interval, standard errors
+_FIGURES = {'waveform': 'Average', 'spectrum': 'Order spectrum', 'tracked_orders': 'Trend',
+            'envelope': 'Squared envelope'}
+
+
+def write_page(folder: Path, changes: Changes | None = None, *, place: Path | None = None) -> None:
+    """
+    Write `page.html` of the files in a folder into it, or at another `place`; raises OSError.
+
+    `changes` are those of the machine up to this recording, with their figure beside the page.
+    """
+    with np.load(folder / ARRAYS) as arrays:
+        about = json.loads(str(arrays['about']))
+        signals = Signals(
+            about['settings']['hardware_id'] or str(arrays['recording']),
+            tuple(arrays['channels'].tolist()), tuple(arrays['channel_names'].tolist()),
+            tuple(arrays['units'].tolist()), Machine.among(about['settings']['machine']))
+        shafts = [ShaftSeries(shaft, {
+            name.removeprefix(f'{shaft}_'): arrays[name] for name in arrays.files
+            if name.startswith(f'{shaft}_') and not name.endswith(_OVER_ANGLE)})
+            for shaft in arrays['shafts'].tolist()]
+    place = place or folder / PAGE
+    parts = [*_head(signals, shafts, about['row']), *_findings(changes, about['row']),
+             *_keyphasor(signals, shafts, about['row']),
+             *_picture(place.with_name(FIGURE), 'Changes')]
+    for series in shafts:
+        parts += _shaft(signals, series)
+        prefix = f'{series.shaft}_' if len(shafts) > 1 else ''
+        for name, title in _FIGURES.items():
+            parts += _picture(folder / f'{prefix}{name}.png', title)
+    parts += _picture(folder / 'repairs.png', 'Repaired pulses')
+    write_lines(place, lambda file: file.writelines([page(signals.recording, parts)]))
+
+
+def _picture(path: Path, title: str) -> Iterator[str]:
+    if path.exists():
+        yield figure(title, path.read_bytes(), kind='wide')
+
+
+def _head(signals: Signals, shafts: Sequence[ShaftSeries], row: dict[str, Any]) -> Iterator[str]:
+    speed = shafts[0]['trigger_speed']
+    yield f'<h1>{escape(signals.recording)}</h1>'
+    yield (f'<p class="quiet">Recording {escape(row["recording"])}: {row["averages"]} averages of '
+           f'{", ".join(map(escape, (item.shaft for item in shafts)))}, tach shaft at '
+           f'{speed.min():.4g} to {speed.max():.4g} Hz, {len(signals.channels)} '
+           f'channel{"s" * (len(signals.channels) > 1)}.</p>')
+
+
+def _findings(changes: Changes | None, row: dict[str, Any]) -> Iterator[str]:
+    """Return what has changed, and what is doubtful."""
+    if changes is None:
+        yield ('<p class="verdict unseen">No baseline to compare with: --baseline takes the first '
+               'recordings of this machine as its normal state.</p>')
+    else:
+        kind = 'unexplained' if changes.changes else 'none'
+        yield f'<p class="verdict {kind}">{"<br>".join(map(kept, changes.lines()))}</p>'
+    for remark in filter(None, (row['error'], *row['remarks'])):
+        yield f'<p>Note: {escape(remark)}.</p>'
+
+
+# --- one shaft -----------------------------------------------------------------------------------
+
+def _shaft(signals: Signals, series: ShaftSeries) -> Iterator[str]:
+    """Return the orders, bearings and indicators of the last average."""
+    amplitude, error = (np.where(np.isfinite(series.field('corrected_amplitude')[-1]), *(
+        series.field(f'{kind}_{name}')[-1] for kind in ('corrected', 'raw')))
+        for name in ('amplitude', 'standard_error'))
+    size = np.nan_to_num(amplitude)
+    channels = sorted(np.argsort(-size.max(axis=1))[:_CHANNELS].tolist())
+    strongest = sorted(np.argsort(-size.max(axis=0))[:_ORDERS].tolist())
+    first = np.argmax(size, axis=0)  # channel on which an order is strongest
+    share, doubt = (series.field(f'attenuation{end}')[-1] for end in ('', '_standard_error'))
+    names = [signals.channel_names[channel] for channel in channels]
+    units = [signals.units[channel] for channel in channels]
+    yield f'<h2>Shaft {escape(series.shaft)}</h2>'
+    yield ('<p class="quiet">The last average, of '
+           f'{series["trigger_cycles"][-1]} trigger cycles, with half of the 95 % interval.</p>')
+    yield table(('order', *map(_headed, names, units), 'attenuation'), [
+        (signals.order(series.shaft, series.orders[place]), *(
+            _interval(amplitude[channel, place], error[channel, place]) for channel in channels),
+         _share(share[first[place], place], doubt[first[place], place]))
+        for place in strongest], kind='pairs')
+    if 'condition_indicator' in series:
+        found, errors = (series[f'condition_indicator{end}'][-1] for end in ('', '_error'))
+        yield table(('indicator', *names), [
+            (name.replace('_', ' '), *(_interval(
+                found[channel, place], errors[channel, place],
+                units[number] if name in IN_UNIT else '') for number, channel in enumerate(
+                    channels)))
+            for place, name in enumerate(series['condition_indicator_names'].tolist())
+            if np.isfinite(found[channels, place]).any()], kind='pairs')
+    if 'envelope_amplitude' in series:
+        lines = series['envelope_amplitude'][-1]
+        yield table(('line of the squared envelope', *map(_headed, names, map(squared, units))), [
+            (order_text(order, signals.machine.name_of(series.shaft, order, bearing=True)), *(
+                _interval(*lines[channel, place, 2:4]) for channel in channels))
+            for place, order in enumerate(lines[0, :, 0].tolist())], kind='pairs')
+
+
+def _headed(name: str, unit: str) -> str:
+    return f'{name} [{unit}]' if unit else name
+
+
+def _interval(value: float, error: float, unit: str = '') -> str:
+    """
+    Return a value with half of its 95 % interval.
+
+    >>> _interval(0.99823, 0.0061, 'g'), _interval(math.nan, 1.0)
+    ('0.998 ± 0.012 g', '–')
+    """
+    if not math.isfinite(value):
+        return '–'
+    return measured_text(float(value), _HALF * float(error) if math.isfinite(error) else None,
+                         unit)
+
+
+def _share(value: float, error: float) -> str:
+    return percent_text(float(value), _HALF * float(error)) if math.isfinite(value) else '–'
+
+
+# --- the keyphasor -------------------------------------------------------------------------------
+
+def _keyphasor(signals: Signals, shafts: Sequence[ShaftSeries], row: dict[str, Any]
+               ) -> Iterator[str]:
+    """Return how good the pulses are, and what their errors cost."""
+    rows: list[tuple[str, str]] = []
+    if 'pulse_error' in shafts[0]:
+        fields = dict(zip(shafts[0]['pulse_error_fields'].tolist(), shafts[0]['pulse_error'].T))
+        power = np.nanmean(fields['error']**2 - fields['standard_error']**2)
+        rows.append(('pulse errors, RMS', measured_text(math.sqrt(max(power, 0.0)), None, 's')))
+    for series in shafts:
+        clear = series.field('attenuation_standard_error') < _CLEAR
+        share = np.ma.array(series.field('attenuation'), mask=~clear).mean(axis=(0, 1))
+        if clear.any():
+            place = int(np.argmin(share))
+            rows.append((f'smallest attenuation, {series.shaft}',
+                         f'{percent_text(float(share[place]))} are left of '
+                         f'{signals.order(series.shaft, series.orders[place])}'))
+    yield '<h2>Keyphasor</h2>'
+    yield table(('quantity', 'value'), [*rows, (
+        'averaged and dropped', f'{row["trigger_cycles"]} trigger cycles averaged; '
+        f'{row["cycles_dropped"]} cycles, {row["pulses_dropped"]} pulses and '
+        f'{row["samples_dropped"]} samples dropped; {row["gaps"]} gaps; '
+        f'{row["corrections_refused"]} corrections refused')], kind='pairs')
