@@ -50,6 +50,7 @@ summary { cursor: pointer; font-weight: bold; padding: .3rem 0 }
   th, td { padding: .1rem .5rem .1rem 0 }
   tr, li, figure, .verdict { break-inside: avoid }
   img { max-width: 100%; max-height: 215mm; object-fit: contain; object-position: left }
+  .half img { max-height: 105mm }
   .wide img { max-height: 66mm }
   figure { margin: .5rem 0 }
   figure h2 { margin: .3rem 0 }
@@ -66,7 +67,11 @@ def page(title: str, parts: Sequence[str]) -> str:
 
 
 def figure(title: str, picture: bytes, caption: str = '', *, kind: str = 'tall') -> str:
-    """Return a figure with its title; `picture` is a PNG; three `wide` ones go on a sheet."""
+    """
+    Return a figure with its title; `picture` is a PNG.
+
+    A sheet has room for one that is `tall`, two that are `half` as tall, three `wide` ones.
+    """
     data = base64.b64encode(picture).decode()
     below = f'<figcaption>{escape(caption)}</figcaption>' if caption else ''
     return (f'<figure class="{kind}"><h2>{escape(title)}</h2>\n'

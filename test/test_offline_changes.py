@@ -96,7 +96,7 @@ def test_the_figure_shows_what_changed_first(weeks, tmp_path):
     assert imread(tmp_path / 'changes.png').ndim == 3
     write_page(weeks[1] / names[-1], changes, place=tmp_path / 'page.html')
     page = (tmp_path / 'page.html').read_text()
-    assert '<p class="verdict unexplained">the machine has changed in 9 recordings' in page
+    assert '<p class="verdict unexplained">The machine has changed in 9 recordings' in page
     assert page.count('<img alt="Changes"') == 1
     first, *others = changes_figure(changes).axes
     assert first.get_title(loc='left').startswith('bearing order 4.87 of shaft, channel 0: +')

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.machine import Machine
-from sa_jitter_ros.number_text import measured_text, order_text, percent_text
+from sa_jitter_ros.number_text import measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
 from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
 from sa_jitter_ros.offline.plotting import squared
@@ -59,7 +59,7 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
     place = place or folder / PAGE
     parts = [*_head(signals, shafts, about['row']), *_findings(changes, about['row']),
              *_keyphasor(signals, shafts, about['row']),
-             *_picture(place.with_name(FIGURE), 'Changes')]
+             *_picture(place.with_name(FIGURE), 'Changes', kind='half')]
     for series in shafts:
         parts += _shaft(signals, series)
         prefix = f'{series.shaft}_' if len(shafts) > 1 else ''
@@ -69,9 +69,9 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
     write_lines(place, lambda file: file.writelines([page(signals.recording, parts)]))
 
 
-def _picture(path: Path, title: str) -> Iterator[str]:
+def _picture(path: Path, title: str, *, kind: str = 'wide') -> Iterator[str]:
     if path.exists():
-        yield figure(title, path.read_bytes(), kind='wide')
+        yield figure(title, path.read_bytes(), kind=kind)
 
 
 def _head(signals: Signals, shafts: Sequence[ShaftSeries], row: dict[str, Any]) -> Iterator[str]:
@@ -90,7 +90,8 @@ def _findings(changes: Changes | None, row: dict[str, Any]) -> Iterator[str]:
                'recordings of this machine as its normal state.</p>')
     else:
         kind = 'unexplained' if changes.changes else 'none'
-        yield f'<p class="verdict {kind}">{"<br>".join(map(kept, changes.lines()))}</p>'
+        text = '<br>'.join(map(kept, changes.lines()))
+        yield f'<p class="verdict {kind}">{text[:1].upper()}{text[1:]}</p>'
     for remark in filter(None, (row['error'], *row['remarks'])):
         yield f'<p>Note: {escape(remark)}.</p>'
 
@@ -163,16 +164,18 @@ def _keyphasor(signals: Signals, shafts: Sequence[ShaftSeries], row: dict[str, A
     rows: list[tuple[str, str]] = []
     if 'pulse_error' in shafts[0]:
         fields = dict(zip(shafts[0]['pulse_error_fields'].tolist(), shafts[0]['pulse_error'].T))
-        power = np.nanmean(fields['error']**2 - fields['standard_error']**2)
-        rows.append(('pulse errors, RMS', measured_text(math.sqrt(max(power, 0.0)), None, 's')))
+        power, noise = (float(np.nanmean(fields[name]**2)) for name in ('error', 'standard_error'))
+        rows.append(('pulse errors, RMS', measured_text(math.sqrt(power - noise), None, 's')
+                     if power > noise else f'below {measured_text(math.sqrt(noise), None, "s")}'))
     for series in shafts:
-        clear = series.field('attenuation_standard_error') < _CLEAR
-        share = np.ma.array(series.field('attenuation'), mask=~clear).mean(axis=(0, 1))
-        if clear.any():
-            place = int(np.argmin(share))
+        doubt = np.median(series.field('attenuation_standard_error'), axis=0)
+        share = np.where(doubt < _CLEAR, np.mean(series.field('attenuation'), axis=0), np.inf)
+        place = np.unravel_index(np.argmin(share), share.shape)
+        if np.isfinite(share[place]):
+            order = series.orders[place[1]]
             rows.append((f'smallest attenuation, {series.shaft}',
                          f'{percent_text(float(share[place]))} are left of '
-                         f'{signals.order(series.shaft, series.orders[place])}'))
+                         + order_words(order, signals.machine.name_of(series.shaft, order))))
     yield '<h2>Keyphasor</h2>'
     yield table(('quantity', 'value'), [*rows, (
         'averaged and dropped', f'{row["trigger_cycles"]} trigger cycles averaged; '
