@@ -350,6 +350,27 @@ def test_command(block, words, capsys, monkeypatch):
                     'as text, or add it to OTHERS')
 
 
+TUTORIAL = ROOT / 'docs' / 'tutorial.md'
+DAY = '## 9. A day with an own gearbox'
+
+
+def test_a_day_with_an_own_gearbox_can_be_spent(capsys):
+    """All of its commands run, in their order, and print what is shown."""
+    begins = TUTORIAL.read_text(encoding='utf-8').splitlines().index(DAY)
+    blocks = [block for block in BLOCKS if block.document == TUTORIAL and block.line > begins]
+    namespace_of(TUTORIAL)['np'] = np
+    for block in blocks:
+        if block.language == 'python':
+            run_python(block)
+        for words in lines_of(block) if block.language == 'bash' else ():
+            if words[:3] == ['ros2', 'run', 'sa_jitter_ros'] and words[3] in COMMANDS:
+                with inside(folder_of(TUTORIAL)):
+                    assert COMMANDS[words[3]].main(words[4:]) == 0
+                printed = capsys.readouterr().out
+                assert set(stripped(SHOWN.get(block, ''))) <= {*stripped(printed), ''}
+    assert (folder_of(TUTORIAL) / 'averages' / 'gearbox' / 'page.html').exists()
+
+
 def check_executable(block, name, arguments, capsys):
     """Construct a node with its arguments, or take a command's."""
     if name in COMMANDS:
