@@ -51,7 +51,8 @@ CORE = {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
         'samples'},
     'monitoring': SCIENCE | {
-        'averaging', 'errors', 'json_values', 'machine', 'parameter_file', 'parameters'},
+        'averaging', 'errors', 'json_values', 'machine', 'number_text', 'parameter_file',
+        'parameters'},
     'keyphasor_check': SCIENCE | {
         'averaging', 'effects', 'errors', 'machine', 'parameter_file', 'parameters', 'pulses',
         'recordings'},

@@ -79,6 +79,23 @@ def test_summary_says_amplitudes_with_intervals_and_units(ros_graph, bench):
     assert 'kurtosis' in values
 
 
+def test_the_level_of_a_summary_is_that_of_the_worst_limit(ros_graph, bench):
+    summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
+    amplitude, _ = MACHINE.components[7.0]
+    limits = {'all.order': 7.0, 'all.warn': 0.8 * amplitude, 'all.alarm': 1.2 * amplitude,
+              'one.order': 1.0, 'one.warn': 1e-6, 'one.channel': '0',
+              'rise.order': 7.0, 'rise.relative': True, 'rise.alarm': 1.5}
+    b = bench(overrides=[Parameter(f'machine.limits.{key}', value=value)
+                         for key, value in limits.items()])
+    b.play(MACHINE, 2.0)
+    first, second = summaries[-1].status
+    assert first.level == DiagnosticStatus.WARN
+    assert re.fullmatch(r'order 1 of shaft, channel 0: .* above 1e-06 \(warn\), since average 0',
+                        first.message)
+    assert second.level == DiagnosticStatus.ERROR  # twice the amplitude
+    assert 'order 7 of shaft, channel 1: ' in second.message
+
+
 def test_summaries_of_sliding_averages_come_once_a_second(ros_graph, bench):
     summaries = ros_graph.capture('shaft/summary', DiagnosticArray)
     b = bench(averaging='sliding')

@@ -32,7 +32,7 @@ from std_msgs.msg import Float64MultiArray, String
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 KEYS = {'shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_sequence',
-        'since_time', 'keyphasor_share', 'p_value'}
+        'since_time', 'keyphasor_share', 'p_value', 'level', 'limit'}
 
 
 class MonitorBench(NodeBench):
@@ -94,6 +94,49 @@ def test_learns_then_names_the_change(ros_graph):
     assert (level, text.partition(':')[0]) == (ERROR, 'order 38 of input, channel 1')
     assert b.set_parameter('severe_change', 10.0) == (True, '')
     assert b.diagnostics()[0] == WARN
+
+
+LIMITS = {'machine__tach_shaft': 'input', 'machine__channels__motor__unit': 'g',
+          'machine__channels__pump__unit': 'g', 'machine__limits__mesh__order': 19,
+          'machine__limits__mesh__warn': 1.5, 'machine__limits__mesh__alarm': 2,
+          'machine__limits__mesh__channel': 'pump', 'machine__limits__other__order': 40.0,
+          'machine__limits__other__relative': True, 'machine__limits__other__alarm': 3.0}
+
+
+def test_limits_are_warnings_and_errors_before_the_baseline_is_complete(ros_graph):
+    b, machine = MonitorBench(ros_graph, **LIMITS), DrawnMachine(21)
+    b.play(machine, 3)
+    assert b.change()['changes'] == []
+    level, text, _ = b.diagnostics()
+    assert (level, text) == (
+        WARN, 'limit other: the averages of input lack order 40: see input.orders')
+    machine.gain[1, 1] = 1.7
+    b.play(machine, 2)
+    found, = b.change()['changes']
+    assert found.keys() == KEYS | {'value', 'value_error', 'limit_name'}
+    assert [found[key] for key in ('shaft', 'channel', 'kind', 'name', 'level', 'limit')] == [
+        'input', 1, 'limit', 'order 19', 'warn', 1.5]
+    assert (found['since_sequence'], found['change'], found['limit_name']) == (3, None, 'mesh')
+    assert found['value'] == pytest.approx(1.7, abs=4.0 * found['value_error'])
+    level, text, values = b.diagnostics()
+    assert (level, values['limits_passed']) == (WARN, '1')
+    assert text.startswith('a limit is passed: order 19 of input, channel 1: 1.')
+    assert 'limit other: ' in text
+    machine.gain[1, 1] = 2.5
+    b.play(machine, 1)
+    level, text, _ = b.diagnostics()
+    assert level == ERROR
+    assert text.startswith('order 19 of input, channel 1: 2.')
+    assert 'above 2 (alarm), since average 5' in text
+    machine.gain[1, 1] = 1.0
+    b.play(machine, 1)
+    assert b.change()['changes'] == []
+    assert b.diagnostics()[0] == WARN  # of the other one
+
+
+def test_a_wrong_limit_stops_the_node_with_one_line(ros_graph):
+    with pytest.raises(ParameterError, match=r"^machine\.limits\.mesh\.channel is 'fan'"):
+        MonitorBench(ros_graph, **{**LIMITS, 'machine__limits__mesh__channel': 'fan'})
 
 
 def test_speeds_that_are_never_learnt_are_said(ros_graph):

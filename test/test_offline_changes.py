@@ -17,6 +17,7 @@ from matplotlib.image import imread
 import numpy as np
 import pytest
 from sa_jitter_ros.commands import average
+from sa_jitter_ros.machine import Machine
 from sa_jitter_ros.monitoring.change_test import ChangeTest, memory_of
 from sa_jitter_ros.offline.change_figure import changes_figure
 from sa_jitter_ros.offline.changes import find_changes, settings_of
@@ -101,6 +102,29 @@ def test_the_figure_shows_what_changed_first(weeks, tmp_path):
     first, *others = changes_figure(changes).axes
     assert first.get_title(loc='left').startswith('bearing order 4.87 of shaft, channel 0: +')
     assert len(others) == 5
+
+
+def test_limits_of_days_are_passed_beside_the_changes(weeks, tmp_path):
+    names = [f'day_{number:02d}' for number in range(1, DAYS + 1)]
+    machine = Machine(limits={
+        'fault': {'order': BEARING, 'relative': True, 'warn': 3.0, 'alarm': 30.0},
+        'mesh': {'order': 19.0, 'warn': 0.1, 'channel': '0'},
+        'other': {'order': 19.0, 'warn': 99.0, 'channel': 'gearbox'}})
+    changes = find_changes(weeks[1], names, settings_of(
+        None, ['allow_uncorrected:=true'], LEARNING), machine)
+    write_changes(tmp_path, changes, figure=True)
+    statistical, fault, mesh = sorted(answer(tmp_path)['changes'], key=lambda item: item['name'])
+    assert (fault['kind'], fault['name'], fault['level']) == (
+        'limit', f'bearing order {BEARING}', 'warn')
+    assert fault['since_recording'] in {f'day_{BEGIN + late:02d}' for late in (1, 2, 3, 4)}
+    assert fault['limit'] == pytest.approx(3.0 * fault['value'] / (1.0 + fault['change']))
+    assert (mesh['name'], mesh['since_recording'], mesh['limit']) == ('order 19', 'day_01', 0.1)
+    assert (statistical['kind'], statistical['level']) == ('bearing', None)
+    assert any(line.endswith(f'since {fault["since_recording"]}') for line in changes.lines())
+    assert 'limit other: no channel gearbox among channel 0' in changes.warnings()
+    titles = [axes.get_title(loc='left') for axes in changes_figure(changes).axes]
+    assert titles[0].startswith('order 19 of shaft')
+    assert titles[1].startswith('bearing order 4.87 of shaft')
 
 
 def test_a_second_run_only_looks_again(weeks, capsys):

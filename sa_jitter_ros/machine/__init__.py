@@ -15,6 +15,7 @@ The machine by its parts: ratios and orders from numbers of teeth and geometry o
 """
 
 from sa_jitter_ros.machine.following import following
+from sa_jitter_ros.machine.limits import LEVELS, Limit
 from sa_jitter_ros.machine.train import Machine, PREFIX, UNKNOWN
 
-__all__ = ['PREFIX', 'UNKNOWN', 'Machine', 'following']
+__all__ = ['LEVELS', 'PREFIX', 'UNKNOWN', 'Limit', 'Machine', 'following']

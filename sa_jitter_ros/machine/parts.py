@@ -33,7 +33,7 @@ _LENGTH = Parameter('length', 0.0, 'a length', unit='m', above=0.0)
 _ORDER = Parameter('order', 0.0, 'a multiple of the speed of the shaft', above=0.0)
 
 
-def _checked(place: str, part: Any, kinds: Mapping[str, Parameter]) -> None:
+def checked(place: str, part: Any, kinds: Mapping[str, Parameter]) -> None:
     """Convert and check the fields of a part; raises ParameterError with the place of it."""
     for item in fields(part):
         value, kind = getattr(part, item.name), kinds[item.name]
@@ -66,7 +66,7 @@ class GearPair:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        _checked(place, self, self.KINDS)
+        checked(place, self, self.KINDS)
         if self.shaft == self.mate_shaft:
             raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: gears in '
                                  'mesh are on two shafts')
@@ -118,7 +118,7 @@ class Belt:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        _checked(place, self, self.KINDS)
+        checked(place, self, self.KINDS)
         if self.shaft == self.mate_shaft:
             raise ParameterError(f'{place}: shaft and mate_shaft are both {self.shaft}: give two')
 
@@ -165,7 +165,7 @@ class PlanetaryStage:
 
     def check(self, place: str) -> None:
         """Check the values, and that the teeth assemble; raises ParameterError."""
-        _checked(place, self, self.KINDS)
+        checked(place, self, self.KINDS)
         if self.input == self.fixed:
             raise ParameterError(f'{place}.input is {self.input}, which is fixed: give another '
                                  'member')
@@ -274,7 +274,7 @@ class Bearing:
 
     def check(self, place: str) -> None:
         """Check the values; raises ParameterError, which names the place in the file."""
-        _checked(place, self, self.KINDS)
+        checked(place, self, self.KINDS)
         geometry, given = ([name for name in names if getattr(self, name) is not None]
                            for names in (self.GEOMETRY, self.GIVEN))
         if given and geometry:

@@ -13,11 +13,13 @@
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from difflib import get_close_matches
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 from sa_jitter_ros.errors import ParameterError
+from sa_jitter_ros.machine.limits import Limit
 from sa_jitter_ros.machine.parts import Bearing, Belt, GearPair, PlanetaryStage
 from sa_jitter_ros.parameter_file import flattened, read_parameters
 from sa_jitter_ros.parameters import require_shaft_names
@@ -25,8 +27,8 @@ from sa_jitter_ros.parameters import require_shaft_names
 #: What the names of all parameters of a machine begin with.
 PREFIX = 'machine.'
 _KINDS: dict[str, Any] = {'gears': GearPair, 'planetary': PlanetaryStage, 'belts': Belt,
-                          'bearings': Bearing}
-_OTHERS = ('channels', 'limits')  # of a machine, read elsewhere
+                          'bearings': Bearing, 'limits': Limit}
+_OTHERS = ('channels',)  # of a machine, read elsewhere
 _FINEST = 10**6  # denominator of a ratio
 _SAME = 1e-5  # by which an order may differ from that of a part, relative
 
@@ -36,9 +38,11 @@ class Machine:
     """
     A machine by its parts, each by its name: gear pairs, planetary stages, belts, bearings.
 
-    A part is a mapping of its values or one of the classes of `machine.parts`. `tach_shaft`
-    carries the keyphasor; it may be left out where there is one shaft only. Raises ParameterError,
-    in one line, for parts that contradict each other.
+    It has limits, too.
+
+    A part is a mapping of its values or one of the classes of `machine.parts`, a limit a mapping
+    or a `Limit`. `tach_shaft` carries the keyphasor; it may be left out where there is one shaft
+    only. Raises ParameterError, in one line, for parts that contradict each other.
 
     >>> machine = Machine(tach_shaft='output', gears={'stage': {
     ...     'shaft': 'input', 'teeth': 19, 'mate_shaft': 'output', 'mate_teeth': 61}})
@@ -51,6 +55,7 @@ class Machine:
     planetary: Mapping[str, Any] = field(default_factory=dict)
     bearings: Mapping[str, Any] = field(default_factory=dict)
     belts: Mapping[str, Any] = field(default_factory=dict)
+    limits: Mapping[str, Any] = field(default_factory=dict)
     _ratios: dict[str, Fraction] = field(init=False, repr=False, compare=False,
                                          default_factory=dict)
 
@@ -77,6 +82,16 @@ class Machine:
             if part.shaft not in self._ratios:
                 raise ParameterError(f'machine.bearings.{name}.shaft is {part.shaft}, which is '
                                      f'unknown: give one of {", ".join(self.shafts)}')
+        self._check_limits()
+
+    def _check_limits(self) -> None:
+        names = dict.fromkeys(name for shaft in self.shafts for name in self.orders(shaft))
+        for name, limit in self.limits.items():
+            if limit.part is not None and limit.part not in names:
+                near = get_close_matches(limit.part, names, 3, cutoff=0.0)
+                raise ParameterError(
+                    f'machine.limits.{name}.part is {limit.part!r}, which no gear, stage or '
+                    f'bearing makes: give {" or ".join(near) if near else "an order"}')
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> 'Machine':

@@ -24,6 +24,7 @@ from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.baseline_file import (
     lock_baseline, read_baseline, set_aside, write_baseline)
+from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
 
@@ -97,13 +98,13 @@ class MachineMonitor:
 
     `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
     the process. With `anew` an older file is kept under another name, and not used. `parts` name
-    the orders. Raises RecordingError for a file that cannot be used.
+    the orders, `limits` are watched beside. Raises RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
-                 path: Path | None = None, *, parts: Machine = UNKNOWN, anew: bool = False
-                 ) -> None:
-        self._parts = parts
+                 path: Path | None = None, *, parts: Machine = UNKNOWN,
+                 limits: LimitWatch | None = None, anew: bool = False) -> None:
+        self._parts, self.limits = parts, limits or LimitWatch(UNKNOWN, shafts)
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
         self._others: dict[str, ShaftMonitor] = {}
@@ -165,10 +166,13 @@ class MachineMonitor:
         """Take a whole average, as `take` does its arrays."""
         self.uncorrected[shaft].add(not average.is_corrected)
         monitor = self.monitors.get(shaft) or self._begin(shaft, average)
+        fitted = average.fitted(monitor.layout) if monitor is not None else None
+        lines = self.limits.update(shaft, average) if monitor is None or fitted is None else (
+            self.limits.update(shaft, fitted, monitor.usual()))
         if monitor is None:
-            return []
+            return lines
         self.unsaved = True
-        return monitor.update(average)
+        return lines + monitor.update(average)
 
     def _begin(self, shaft: str, average: MonitoredAverage) -> ShaftMonitor | None:
         """Return a new monitor, or None while it is not known what the shaft has."""
@@ -203,7 +207,8 @@ class MachineMonitor:
         """Return the object of the topic `change`, without NaN and infinities."""
         found: dict[str, Any] = json_values({
             'baseline': {'averages': self.averages, 'complete': self.is_complete},
-            'changes': [item.content() for item in self.changes()]})
+            'changes': [*(item.content() for item in self.limits.passed()),
+                        *(item.content() for item in self.changes())]})
         return found
 
     def save(self) -> None:

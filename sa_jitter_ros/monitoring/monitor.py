@@ -25,7 +25,7 @@ from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
-from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage
+from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import Parameter, Values
 from scipy import special
@@ -114,7 +114,7 @@ class Change:
 
     def content(self) -> dict[str, Any]:
         """Return the object of the topic `change`: of a known part with its name, and `order`."""
-        found = asdict(self)
+        found = {**asdict(self), 'level': None, 'limit': None}
         part = found.pop('part')
         return {**found, 'name': part, 'order': float(self.name)} if part else found
 
@@ -326,11 +326,7 @@ class ShaftMonitor:
 
     def words(self, kind: str, name: str) -> str:
         """Return a quantity in words: the part of the machine, if one is known."""
-        return self._part(kind, name) or in_words(kind, name)
-
-    def _part(self, kind: str, name: str) -> str:
-        return '' if kind == 'indicator' else self.machine.name_of(
-            self.shaft, float(name), bearing=kind == 'bearing')
+        return part_of(self.machine, self.shaft, kind, name) or in_words(kind, name)
 
     # --- the baseline ---
 
@@ -390,6 +386,22 @@ class ShaftMonitor:
                         known.mean.reshape(shape), scatter,
                         self.correlation() * scatter[:, :, None] * scatter[:, None, :])
 
+    def usual(self) -> FloatArray:
+        """
+        Return what readings (channel, quantity) are at the present speed, NaN before it is learnt.
+
+        Of orders it is the root mean square of the amplitudes with their noise.
+        """
+        if not self.is_complete:
+            return np.full(self.layout.shape, np.nan)
+        known = self._test.bins[self._bin].baseline()
+        count = len(self.layout.orders)
+        mean, noise = (item.reshape(self.layout.shape) for item in (known.mean, known.noise))
+        noise = noise * self.settings.group_averages
+        return np.concatenate([
+            (np.maximum(mean[:, :count], 0.0)**2 + noise[:, :count])**0.25,
+            np.exp(mean[:, count:])], axis=1)
+
     # --- changes ---
 
     def changes(self) -> list[Change]:
@@ -416,7 +428,7 @@ class ShaftMonitor:
             found.append(Change(
                 self.shaft, channel, *self.layout.quantities[quantity], change, error,
                 int(sequence), time, doubt, min(chance * independent, 1.0),
-                self._part(*self.layout.quantities[quantity])))
+                part_of(self.machine, self.shaft, *self.layout.quantities[quantity])))
         return sorted(found, key=lambda item: item.p_value)
 
     def _independent(self) -> float:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.results import (
     AMPLITUDE_FIELDS, AverageHeader, AverageMessage, ENVELOPE_FIELDS)
 from sa_jitter_ros.errors import MessageError
+from sa_jitter_ros.machine import Machine
 
 FloatArray = NDArray[np.float64]
 
@@ -80,15 +81,23 @@ def in_words(kind: str, name: str) -> str:
     return f'{_NOUNS[kind]}{name}'
 
 
+def part_of(machine: Machine, shaft: str, kind: str, name: str) -> str:
+    """Return the part of a machine that makes a quantity, '' where none is known to."""
+    return '' if kind == 'indicator' else machine.name_of(
+        shaft, float(name), bearing=kind == 'bearing')
+
+
 @dataclass(frozen=True)
 class MonitoredAverage:
     """
-    The monitored quantities of one average, each array (channel, quantity), NaN where unknown.
+    The monitored quantities of one average, each array (..., channel, quantity), NaN if unknown.
 
     `values` are squares of amplitudes without noise, then logarithms of indicators and of the
     depths of modulation at the bearing orders; `noise` are the published variances of amplitudes
     and logarithms without, and `doubt` the published errors of the correction for the keyphasor
-    alone.
+    alone. `readings` (4, channel, quantity) are what limits are for, also without a correction:
+    amplitudes, indicators and depths themselves, their variances without and their errors by the
+    correction, and 1 where they are of a corrected average, else 0.
     """
 
     header: AverageHeader
@@ -96,6 +105,7 @@ class MonitoredAverage:
     values: FloatArray
     noise: FloatArray
     doubt: FloatArray
+    readings: FloatArray
 
     @property
     def is_corrected(self) -> bool:
@@ -116,11 +126,11 @@ class MonitoredAverage:
             return None
         places = {quantity: place for place, quantity in enumerate(own.quantities)}
         found = []
-        for array in (self.values, self.noise, self.doubt):
-            rows = np.full(layout.shape, np.nan)
+        for array in (self.values, self.noise, self.doubt, self.readings):
+            rows = np.full((*array.shape[:-2], *layout.shape), np.nan)
             for place, quantity in enumerate(layout.quantities):
                 if quantity in places:
-                    rows[:, place] = array[:, places[quantity]]
+                    rows[..., place] = array[..., places[quantity]]
             found.append(rows)
         return MonitoredAverage(self.header, layout, *found)
 
@@ -185,23 +195,41 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
                             np.ones(amplitude.shape, np.bool_)), axis=1)
     for array in found:
         array[~(np.isfinite(array) & known)] = np.nan
+    found.append(
+        _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
     return MonitoredAverage(
         amplitudes.header, Layout(channels, tuple(table[0, :, 0].tolist()) if channels else (),
                                   names, tuple(bearings[np.isfinite(bearings)].tolist())), *found)
+
+
+def _readings(table: FloatArray, *others: tuple[FloatArray, FloatArray]) -> FloatArray:
+    """Return the readings of a table, and of others: values and their relative variances."""
+    corrected = np.isfinite(table[..., _FIELD['corrected_amplitude']])
+    amplitude, error = (np.where(corrected, table[..., _FIELD[f'corrected_{name}']],
+                                 table[..., _FIELD[f'raw_{name}']])
+                        for name in ('amplitude', 'standard_error'))
+    noise = np.fmin(table[..., _FIELD['noise_standard_deviation']], error)
+    found = [np.stack((amplitude, noise**2, np.sqrt(np.maximum(error**2 - noise**2, 0.0)),
+                       corrected))]
+    is_corrected = [corrected.any(axis=1, keepdims=True), np.ones((len(table), 1), np.bool_)]
+    for (values, variance), known in zip(others, is_corrected):
+        found.append(np.stack((values, variance * values**2, np.zeros(values.shape),
+                               np.broadcast_to(known, values.shape))))
+    return np.concatenate(found, axis=2)
 
 
 def mean_of(averages: Sequence[MonitoredAverage]) -> MonitoredAverage:
     """
     Return the mean of consecutive averages of one layout, NaN where most are missing.
 
-    Its header is that of all of them, with the mean speed; its noise is that of the mean.
+    Its header is that of all of them, with the mean speed; its noise is that of the mean. Readings
+    are those of the corrected averages where there are some.
     """
-    rows = np.array([(item.values, item.noise, item.doubt) for item in averages])
-    known = np.isfinite(rows)
-    number = known.sum(axis=0)
-    means = np.where(2 * number >= len(averages),
-                     np.where(known, rows, 0.0).sum(axis=0) / np.maximum(number, 1), np.nan)
-    means[1] /= np.maximum(number[0], 1)
+    means = _mean(np.array([(item.values, item.noise, item.doubt) for item in averages]),
+                  0.5 * len(averages))
+    readings = np.array([item.readings for item in averages])
+    best = np.fmax.reduce(readings[:, 3])
+    found = _mean(np.where(readings[:, 3:] >= best, readings, np.nan), 1.0)
     first, last = averages[0].header, averages[-1].header
     header = replace(
         first, end_time=last.end_time,
@@ -209,4 +237,14 @@ def mean_of(averages: Sequence[MonitoredAverage]) -> MonitoredAverage:
         fundamental_cycles=sum(item.header.fundamental_cycles for item in averages),
         mean_trigger_speed=float(np.mean([item.header.mean_trigger_speed for item in averages])),
         discarded_cycles=sum(item.header.discarded_cycles for item in averages))
-    return MonitoredAverage(header, averages[0].layout, *means)
+    return MonitoredAverage(header, averages[0].layout, *(*means, found))
+
+
+def _mean(rows: FloatArray, fewest: float) -> FloatArray:
+    """Return the mean of rows (average, row, ...), of row 1 the variance of that of row 0."""
+    known = np.isfinite(rows)
+    number = known.sum(axis=0)
+    means = np.where(number >= fewest, np.where(known, rows, 0.0).sum(axis=0)
+                     / np.maximum(number, 1), np.nan)
+    means[1] /= np.maximum(number[0], 1)
+    return means

@@ -19,6 +19,9 @@ from sa_jitter_ros.averaging.average import Average
 from sa_jitter_ros.averaging.indicators import GearSettings
 from sa_jitter_ros.averaging.results import ShaftResults
 from sa_jitter_ros.averaging.shortfall import Shortfall
+from sa_jitter_ros.monitoring.limits import LimitWatch
+from sa_jitter_ros.monitoring.machine_monitor import KINDS
+from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.nodes.base import MonitoringNode
 from sa_jitter_ros.nodes.messages import encode_average
 from sa_jitter_ros.nodes.summary import summary_of
@@ -31,8 +34,8 @@ ROUNDING = 1e-9  # relative scatter of a constant that was resampled
 class ShaftOutput:
     """Publishes the results of one shaft, and says what they lack."""
 
-    def __init__(self, node: MonitoringNode, name: str) -> None:
-        self._node, self._name = node, name
+    def __init__(self, node: MonitoringNode, name: str, limits: LimitWatch) -> None:
+        self._node, self._name, self._limits = node, name, limits
         self._publishers: dict[str, Publisher] = {
             kind: node.create_output(Float64MultiArray, f'{name}/{kind}')
             for kind in ('synchronous_average', 'standard_error', 'order_amplitude',
@@ -54,12 +57,15 @@ class ShaftOutput:
         results = self._results.of(average)
         for kind, result in results.items():
             self._publishers[kind].publish(encode_average(kind, result))
+        if self._limits.names:
+            self._limits.update(self._name, monitored(
+                results[KINDS[0]], *map(results.get, KINDS[1:])))
         since = average.end_time - self._summarised
         if not 0.0 <= since < pause and self._summary.get_subscription_count():
             self._summarised = average.end_time
             self._summary.publish(summary_of(
                 self._name, results, channels, self._node.hardware_id,
-                self._node.parameters.machine))
+                self._node.parameters.machine, self._limits.passed(self._name)))
         self.published += 1
         self._node.set_missing(f'condition indicators of {self._name}', self._results.problem)
         constant = np.ptp(average.waveform, axis=1) <= ROUNDING * np.abs(average.waveform[:, 0])

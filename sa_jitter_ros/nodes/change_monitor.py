@@ -21,7 +21,8 @@ from urllib.parse import quote
 
 from rclpy.parameter import Parameter as RosParameter
 from sa_jitter_ros.errors import ParameterError, RecordingError
-from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
@@ -29,6 +30,7 @@ from sa_jitter_ros.nodes.health import first_of
 from sa_jitter_ros.nodes.messages import decode_average
 from sa_jitter_ros.nodes.result_flows import ResultFlows
 from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, require_shaft_names, Values
+from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
 from std_msgs.msg import Float64MultiArray, String
 
 PARAMETERS = (
@@ -85,10 +87,14 @@ class ChangeMonitor(MonitoringNode):
         self._monitor: MachineMonitor | None = None
         self._saved, self._was_complete = time.monotonic(), False
         reason = ''
+        given = self.parameters.given_values
+        parts, channels = Machine.among(given), channels_of(given)
+        limits = LimitWatch(parts, values['shafts'], list(channels),
+                            labels=lambda count: scale_of(channels, count).labels)
         try:
             self._monitor = MachineMonitor(
                 values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
-                parts=Machine.among(self.parameters.given_values), anew=anew)
+                parts=parts, limits=limits, anew=anew)
             self._was_complete = self._monitor.is_complete
         except RecordingError as error:
             reason = str(error)
@@ -150,7 +156,7 @@ class ChangeMonitor(MonitoringNode):
             self._fail(f'baseline of {shaft}', '')
         for line in lines:
             self.get_logger().warning(line)
-        if self._monitor.averages != before:
+        if lines or self._monitor.averages != before:
             self._show()
             self._publish()
             due = time.monotonic() - self._saved > _SAVE_PERIOD
@@ -169,8 +175,15 @@ class ChangeMonitor(MonitoringNode):
             self.set_missing('baseline file', '')
 
     def _show(self) -> None:
-        """Show the changes in the status: severe ones as an error."""
+        """Show limits and changes in the status: alarms and severe changes as errors."""
         assert self._monitor is not None
+        passed = self._monitor.limits.passed()
+        alarms = [str(item) for item in passed if item.level == LEVELS[-1]]
+        self.faults.pop('limit', '')
+        if alarms:
+            self.faults['limit'] = first_of(alarms)
+        self.set_missing('a limit is passed', first_of(
+            [str(item) for item in passed if item.level != LEVELS[-1]]))
         severe: list[str] = []
         others: list[str] = []
         for item in self._monitor.changes():
@@ -197,6 +210,8 @@ class ChangeMonitor(MonitoringNode):
         if self._monitor is None:
             return
         found = self._monitor.monitors
+        for name in self._monitor.limits.names:
+            self.set_missing(f'limit {name}', self._monitor.limits.missing.get(name, ''))
         self.counts.update(averages_overlapping=sum(item.overlapping for item in found.values()))
         for shaft, lack in self._monitor.uncorrected.items():
             self.set_missing(f'comparison of {shaft}', (
@@ -215,6 +230,7 @@ class ChangeMonitor(MonitoringNode):
         values = {
             'baseline_averages': str(monitor.averages),
             'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
+            'limits_passed': str(len(monitor.limits.passed())),
             'uncorrected': str(sum(item.uncorrected for item in found.values())),
             'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
             'baseline_file': str(self._path or f'{_NOT_KEPT}, lost when the node ends')}

@@ -10,7 +10,7 @@
 
 """Averages as texts that a person reads in any tool: `<shaft>/summary`."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 import math
 
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.averaging.results import AMPLITUDE_FIELDS, AverageMessage
 from sa_jitter_ros.errors import MessageError
-from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.machine import LEVELS, Machine
+from sa_jitter_ros.monitoring.limits import PassedLimit
 from sa_jitter_ros.number_text import measured_text, order_text
 from sa_jitter_ros.recordings.channel_units import ChannelScale
 from sa_jitter_ros.recordings.message_layouts import encode_time
@@ -28,12 +29,19 @@ from sa_jitter_ros.recordings.message_layouts import encode_time
 FloatArray = NDArray[np.float64]
 
 _ORDERS = 10  # the strongest ones
+_STATUS = dict(zip(('', *LEVELS), (
+    DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)))
 _HALF = 1.96  # of a 95 % interval, standard errors
 
 
 def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: ChannelScale,
-               hardware_id: str, machine: Machine) -> DiagnosticArray:
-    """Return one status for each channel; `results` are those of `ShaftResults`."""
+               hardware_id: str, machine: Machine, passed: Sequence[PassedLimit] = ()
+               ) -> DiagnosticArray:
+    """
+    Return one status for each channel; `results` are those of `ShaftResults`.
+
+    Its level is that of the worst of the limits that are `passed`, the worst first.
+    """
     table = results['order_amplitude']
     message = DiagnosticArray()
     try:
@@ -46,10 +54,12 @@ def summary_of(shaft: str, results: Mapping[str, AverageMessage], channels: Chan
         values = {'sequence': str(table.header.sequence),
                   'trigger_speed_hz': f'{table.header.mean_trigger_speed:.6g}',
                   **orders, **_indicators(results, channel, unit)}
+        worst = next((item for item in passed if item.channel == channel), None)
         message.status.append(DiagnosticStatus(
-            level=DiagnosticStatus.OK, name=f'{shaft}: {name}', hardware_id=hardware_id,
-            message=f'average {table.header.sequence} of {table.header.trigger_cycles} trigger '
-                    f'cycles at {table.header.mean_trigger_speed:.4g} Hz',
+            level=_STATUS[worst.level if worst else ''], name=f'{shaft}: {name}',
+            hardware_id=hardware_id, message=str(
+                worst or f'average {table.header.sequence} of {table.header.trigger_cycles} '
+                f'trigger cycles at {table.header.mean_trigger_speed:.4g} Hz'),
             values=[KeyValue(key=key, value=value) for key, value in values.items()]))
     return message
 

@@ -24,6 +24,8 @@ from sa_jitter_ros.averaging.averager_parameters import (
 from sa_jitter_ros.averaging.interpolator_gain import without_amplitude
 from sa_jitter_ros.averaging.standing_orders import without_lines
 from sa_jitter_ros.errors import SignalError
+from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.nodes.averager_output import ShaftOutput
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
 from sa_jitter_ros.nodes.health import Flow
@@ -31,7 +33,8 @@ from sa_jitter_ros.nodes.messages import (
     decode_pulse_array, decode_pulse_reference, encode_geometry, known_type, PULSE_TYPES)
 from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
-from sa_jitter_ros.pulses.target_geometry import MarkOffsets
+from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.recordings.channel_units import channels_of
 from std_msgs.msg import Float64, Float64MultiArray
 
 FloatArray = NDArray[np.float64]
@@ -54,7 +57,10 @@ class SynchronousAverager(MonitoringNode):
         for name in names:
             if values[f'{name}.ratio_teeth'] and f'{name}.ratio' in self.parameters.given:
                 raise one_ratio(values, name)
-        self._shafts = {name: ShaftOutput(self, name) for name in names}
+        given = self.parameters.given_values
+        limits = LimitWatch(Machine.among(given), names, list(channels_of(given)),
+                            labels=lambda count: self._samples.scale.labels)
+        self._shafts = {name: ShaftOutput(self, name, limits) for name in names}
         self._latest = {name: deque[Average](maxlen=_LATEST) for name in names}
         self._averager = streaming_averager(
             values, buffer_seconds=values['buffer_seconds'])

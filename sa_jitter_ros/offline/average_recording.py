@@ -25,6 +25,9 @@ from sa_jitter_ros.averaging.streaming import StreamingAverager
 from sa_jitter_ros.errors import RecordingError, SaJitterError, SignalError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.keyphasor_check.plausibility import doubts, weak_orders
+from sa_jitter_ros.monitoring.limits import LimitWatch
+from sa_jitter_ros.monitoring.machine_monitor import KINDS
+from sa_jitter_ros.monitoring.quantities import monitored
 from sa_jitter_ros.offline.files import (
     finished_together, read_about, Signals, stamp, write_averages)
 from sa_jitter_ros.offline.series import ShaftCollector, ShaftSeries
@@ -90,7 +93,8 @@ class Row:
 class RecordingAverager:
     """Averages a recording; the counts and remarks are complete when `results` is exhausted."""
 
-    def __init__(self, recording: Recording, values: Values, detector: Values) -> None:
+    def __init__(self, recording: Recording, values: Values, detector: Values,
+                 limits: LimitWatch) -> None:
         self._recording, self._values = recording, values
         self._stream = streaming_averager(values, buffer_seconds=math.inf)
         self._results = {name: ShaftResults(gear_settings(values, name))
@@ -98,6 +102,9 @@ class RecordingAverager:
         waveform = detector_of(detector)
         self._pulses = recording.keyphasor_pulses(detector=waveform)
         self._spikes = spikes_text(waveform.state.spikes)
+        self.limits = limits
+        #: What was said of limits that the averages passed.
+        self.passed: list[str] = []
         self.refused = 0
         self.ended_early = ''
 
@@ -173,7 +180,11 @@ class RecordingAverager:
                 ) -> Iterator[tuple[str, dict[str, Any], Notes]]:
         for name, average in averages:
             self.refused += average.correction is not None and not average.correction.accepted
-            yield name, self._results[name].of(average), average.refused
+            results = self._results[name].of(average)
+            if self.limits.names:
+                self.passed += self.limits.update(name, monitored(
+                    results[KINDS[0]], *map(results.get, KINDS[1:])))
+            yield name, results, average.refused
 
 
 def average_file(job: AverageJob, progress: Progress | None = None) -> Row:
@@ -220,15 +231,18 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
            ': lower its gain, or choose a larger range')
         for channel, reason in faults.items())]
     recording = without_channels(recording, lost)
-    signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
-                      job.machine.machine)
     values = averager_values(job.machine, recording, fields=job.fields)
-    averager = RecordingAverager(recording, values, detector_values(job.machine))
+    labels = [(str(number), name) for number, name in zip(kept, recording.channel_names)]
+    limits = LimitWatch(job.machine.machine, values['shafts'], labels=lambda count: labels)
+    signals = Signals(job.name, tuple(kept), recording.channel_names, recording.units,
+                      job.machine.machine, limits)
+    averager = RecordingAverager(recording, values, detector_values(job.machine), limits)
     with finished_together(Path(job.folder)) as folder:
         series = collect(averager, folder.parent, progress)
         if not series:
             raise averager.none()
-        remarks += [*averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
+        remarks += [*averager.passed[:_MOST_REMARKS // 2], *limits.warnings(),
+                    *averager.doubts(series), *averager.stream.take_messages()[:_MOST_REMARKS]]
         row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
         row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {'settings': settings, 'row': asdict(row)})

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
 from sa_jitter_ros.offline.changes import Changes, Key, key_of
-from sa_jitter_ros.offline.plotting import Array, legend_under, MARK, MEASURED
+from sa_jitter_ros.offline.plotting import Array, draw_limits, legend_under, MARK, MEASURED
 
 _PANELS = 6
 _MOST_TICKS = 12
@@ -40,7 +40,8 @@ def changes_figure(changes: Changes) -> Figure:
 
 def _chosen(changes: Changes) -> list[Key]:
     """Return the quantities that are drawn."""
-    keys = [key_of(item) for item in changes.changes]
+    keys = [(item.shaft, item.channel, *item.quantity) for item in changes.limits.passed()]
+    keys += [key_of(item) for item in changes.changes]
     far = []
     for shaft, monitor in changes.monitors.items():
         for channel in range(monitor.layout.channels):
@@ -80,6 +81,11 @@ def _draw(axes: Axes, changes: Changes, key: Key) -> None:
     axes.axhline(middle, color='tab:blue', linewidth=0.8)
     axes.plot(np.arange(values.size), unit(values), '.-', color=MEASURED, linewidth=0.6,
               markersize=4.0)
+    layout, usual = changes.monitors[shaft].layout, changes.monitors[shaft].usual()
+    place = layout.quantities.index((kind, name))
+    draw_limits(axes, [(level, bound * usual[channel, place] if relative else bound)
+                       for level, bound, relative in changes.limits.bounds(
+                           shaft, layout, channel, place)])
     title = f'{changes.monitors[shaft].words(kind, name)} of {shaft}, channel {channel}'
     change = next((item for item in changes.changes if key_of(item) == key), None)
     if change is not None:

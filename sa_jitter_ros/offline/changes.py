@@ -30,6 +30,7 @@ from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import memory_of
+from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
 from sa_jitter_ros.monitoring.quantities import (
@@ -57,7 +58,7 @@ class Recorded:
     """
     A recording: its `name`, `start` and `end` (s), `speed` (Hz), and numbers of its channels.
 
-    `means` are those of the averages of each shaft, `units` those of the channels.
+    `means` are those of the averages of each shaft; channels have `units` and `channel_names`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class Recorded:
     channels: tuple[int, ...]
     means: Mapping[str, MonitoredAverage]
     units: tuple[str, ...] = ()
+    channel_names: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Changes:
     What the monitors of the shafts found in `recordings`, in order of time.
 
     The first `learning` are the baseline. `left_out` are reasons by the names of recordings;
-    `found` are those with which the present `changes` were found.
+    `found` are those with which the present `changes` were found, `limits` the machine's.
     """
 
     learning: int
@@ -92,6 +94,7 @@ class Changes:
     monitors: Mapping[str, ShaftMonitor]
     events: tuple[Event, ...]
     found: Mapping[Key, str]
+    limits: LimitWatch
 
     @property
     def changes(self) -> list[Change]:
@@ -99,8 +102,8 @@ class Changes:
         return sorted((item for monitor in self.monitors.values() for item in monitor.changes()),
                       key=lambda item: item.p_value)
 
-    def since(self, change: Change) -> str:
-        """Return the recording with which a change began."""
+    def since(self, change: Change | PassedLimit) -> str:
+        """Return the recording with which a change began, or a limit was passed."""
         return self.recordings[change.since_sequence].name
 
     def report(self) -> dict[str, Any]:
@@ -108,20 +111,24 @@ class Changes:
         found: dict[str, Any] = json_values({
             'baseline': {'averages': self.learning, 'complete': all(
                 monitor.is_complete for monitor in self.monitors.values())},
-            'changes': [{**item.content(), 'channel': self.recordings[0].channels[item.channel],
-                         'since_recording': self.since(item),
-                         'found_recording': self.found[key_of(item)]} for item in self.changes],
+            'changes': [*(self._content(item, self.since(item)) for item in self.limits.passed()),
+                        *(self._content(item, self.found[key_of(item)])
+                          for item in self.changes)],
             'events': [{'recording': item.found, 'text': item.text} for item in self.events],
             'recordings': [item.name for item in self.recordings],
             'left_out': dict(self.left_out)})
         return found
+
+    def _content(self, item: Change | PassedLimit, found: str) -> dict[str, Any]:
+        return {**item.content(), 'channel': self.recordings[0].channels[item.channel],
+                'since_recording': self.since(item), 'found_recording': found}
 
     def warnings(self) -> list[str]:
         """Return what is not compared, and what to do about it."""
         missing = sum(not all(mean.is_corrected for mean in item.means.values())
                       for item in self.recordings)
         return [*(f'{name} is not compared: it {reason}' for name, reason in
-                  self.left_out.items()),
+                  self.left_out.items()), *self.limits.warnings(),
                 *(f'no bearing of {shaft} is watched, and averages do not show its faults: give '
                   f'{shaft}.bearing_orders' for shaft, monitor in self.monitors.items()
                   if not monitor.layout.bearings),
@@ -135,13 +142,16 @@ class Changes:
         after = f'{tested} recordings after the baseline of {self.learning}'
         compared = [f'compared: {monitor.layout} of {shaft}'
                     for shaft, monitor in self.monitors.items()]
+        passed = self.limits.passed()
+        limits = ['limits are passed:', *(f'  {item.words(self.since(item))}'
+                                          for item in passed[:_MOST_LINES])] if passed else []
         if not changes:
-            return [f'no change in {after}', *compared]
+            return [f'no change in {after}', *limits, *compared]
         more = len(changes) - _MOST_LINES
         return [f'the machine has changed in {after}:', *(
             f'  {item.words(self.since(item))}; found with {self.found[key_of(item)]}'
             for item in changes[:_MOST_LINES]), *(
-                [f'  and {more} more: see {CHANGES}'] if more > 0 else []), *compared]
+                [f'  and {more} more: see {CHANGES}'] if more > 0 else []), *limits, *compared]
 
 
 def key_of(change: Change) -> Key:
@@ -239,7 +249,7 @@ def _recorded(name: str, arrays: Mapping[str, NDArray[Any]], orders: Mapping[str
                       allow_uncorrected=settings.allow_uncorrected) for part in parts])
     return Recorded(name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
                     float(arrays['trigger_speed'].mean()), tuple(arrays['channels'].tolist()),
-                    means, tuple(arrays['units'].tolist()))
+                    means, *(tuple(arrays[key].tolist()) for key in ('units', 'channel_names')))
 
 
 def _listed(channels: Sequence[int]) -> str:
@@ -264,6 +274,10 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                     if shaft in item.means and (fitted := item.means[shaft].fitted(layout))]
         monitors[shaft] = ShaftMonitor(shaft, layout, settings, share=1.0 / len(shafts),
                                        memory=memory_of(np.array(baseline)), machine=machine)
+    channels = [(str(number), name) for number, name in zip(
+        recorded[0].channels, recorded[0].channel_names)]
+    limits = LimitWatch(machine, list(shafts), labels=lambda count: channels,
+                        since=lambda number: recorded[number].name)
     events: list[Event] = []
     found: dict[Key, str] = {}
     for number, item in enumerate(recorded):
@@ -272,10 +286,13 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 continue
             mean = item.means[shaft]
             # Which speeds compare is decided already: all are in one bin.
-            monitor.update(replace(mean, header=replace(
+            mean = replace(mean, header=replace(
                 mean.header, sequence=number, mean_trigger_speed=1.0,
                 start_time=item.start if clock else math.nan,
-                end_time=item.end if clock else number * _INTERVAL)))
+                end_time=item.end if clock else number * _INTERVAL))
+            events += [Event(item.name, line) for line in limits.update(
+                shaft, mean.fitted(monitor.layout) or mean, monitor.usual())]
+            monitor.update(mean)
             now = {key_of(change): change for change in monitor.changes()}
             for key in now.keys() - found.keys():
                 found[key] = item.name
@@ -286,4 +303,4 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 events.append(Event(item.name, f'{monitor.words(*key[2:])} of {shaft}, channel '
                                                f'{key[1]} is back at its baseline'))
     return Changes(settings.learning_averages, tuple(recorded), left_out, monitors, tuple(events),
-                   found)
+                   found, limits)

@@ -31,7 +31,8 @@ from typing import Any, TextIO
 import numpy as np
 from sa_jitter_ros.errors import RecordingError
 from sa_jitter_ros.json_values import json_values
-from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.machine import Machine, UNKNOWN
+from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.number_text import order_text
 from sa_jitter_ros.offline.series import ShaftSeries
 
@@ -50,7 +51,7 @@ class Signals:
     """
     What was averaged: name of the recording, and number, name and unit of its channels.
 
-    The `machine` names the orders.
+    The `machine` names the orders; `limits` are its own.
     """
 
     recording: str
@@ -58,6 +59,7 @@ class Signals:
     channel_names: tuple[str, ...]
     units: tuple[str, ...]
     machine: Machine = field(default_factory=Machine)
+    limits: LimitWatch = field(default_factory=lambda: LimitWatch(UNKNOWN, ()))
 
     def order(self, shaft: str, order: float) -> str:
         """Return an order, behind the part of the machine that makes it, if one does."""

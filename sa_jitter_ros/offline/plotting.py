@@ -10,6 +10,7 @@
 
 """Colours, panels and labels that the figures of averages share."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -23,6 +24,7 @@ Array = NDArray[Any]
 
 RAW, CORRECTED, MEASURED, MARK = 'tab:red', 'tab:blue', 'black', 'tab:orange'
 MOST_CHANNELS = 3
+_LEVELS = {'warn': 'darkorange', 'alarm': 'red'}
 VARIES = 0.02  # relative change of speed from which on results are shown over speed, too
 
 
@@ -61,6 +63,15 @@ def rows_of_channels(signals: Signals, channels: list[int], *, height: float = 2
     for row, channel in zip(panels, channels):
         row[0].set_ylabel(signals.label(channel))
     return figure, panels
+
+
+def draw_limits(axes: Axes, bounds: Iterable[tuple[str, float]], name: str = '') -> None:
+    """Draw limits, level and bound, as lines with their level, and the name of the quantity."""
+    for level, bound in bounds:
+        axes.axhline(bound, color=_LEVELS[level], linestyle='--', linewidth=1.0)
+        axes.annotate(f'{level} {name}'.rstrip(), (0.995, bound), ha='right', va='bottom',
+                      xycoords=('axes fraction', 'data'), fontsize='x-small',
+                      color=_LEVELS[level])
 
 
 def legend_under(axes: Axes, columns: int = 4) -> None:

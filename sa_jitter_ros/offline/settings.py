@@ -23,6 +23,7 @@ from sa_jitter_ros.averaging.averager_parameters import (
     gear_settings, one_ratio, PARAMETERS, shaft_parameters, shaft_settings)
 from sa_jitter_ros.errors import ParameterError, RecordingError
 from sa_jitter_ros.machine import following, Machine, PREFIX
+from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.parameter_file import read_parameters, value_of
 from sa_jitter_ros.parameters import (
     HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
@@ -88,6 +89,8 @@ class MachineFile:
             overrides[name] = value_of(value)
         values |= overrides
         found = following(values)
+        LimitWatch(Machine.among(values), found.get('shafts') or _SHAFTS.convert(
+            values.get('shafts', _SHAFTS.default)))
         parts = {name: values.pop(name) for name in [*values] if name.startswith(PREFIX)}
         known = _specifications(found | values)
         values = {name: value for name, value in found.items() if name in known} | values

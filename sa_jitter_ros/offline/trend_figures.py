@@ -15,10 +15,11 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
+from sa_jitter_ros.monitoring.quantities import Layout
 from sa_jitter_ros.number_text import order_words
 from sa_jitter_ros.offline.average_figures import on_strongest, strongest_lines
 from sa_jitter_ros.offline.files import Signals
-from sa_jitter_ros.offline.plotting import Array, heading, speed_varies
+from sa_jitter_ros.offline.plotting import Array, draw_limits, heading, speed_varies
 from sa_jitter_ros.offline.series import ShaftSeries
 
 _FEWEST = 2  # averages
@@ -44,6 +45,7 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
     figure = Figure(figsize=(9.0, 6.4), layout='constrained')
     panels = figure.subplots(2, len(columns), sharex='col', sharey='row', squeeze=False)
     channels = strongest_lines(series)
+    layout = Layout(len(signals.channels), tuple(series.orders.tolist()))
     names = [order_words(order, signals.machine.name_of(series.shaft, order))
              for order in series.orders.tolist()]
     for number, (label, place) in enumerate(columns):
@@ -52,6 +54,10 @@ def tracked_orders_figure(signals: Signals, series: ShaftSeries) -> Figure | Non
                   error[:, order], _phase(phase[:, order], amplitude[:, order], noise[:, order]),
                   color=f'C{colour}', label=f'{names[order]}, '
                   f'{signals.channel_names[channels[order]]}')
+            draw_limits(panels[0, number], [
+                (level, bound) for level, bound, relative in signals.limits.bounds(
+                    series.shaft, layout, int(channels[order]), order) if not relative],
+                names[order])
         panels[1, number].set_xlabel(label)
     units = {signals.units[channels[order]] for order in chosen.tolist()}
     panels[0, 0].set_ylabel(f'{kind} amplitude [{" / ".join(sorted(units)) or "unit unknown"}]')

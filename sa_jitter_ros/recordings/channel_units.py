@@ -50,6 +50,11 @@ class ChannelScale:
         """Return samples (channel, sample) in the units."""
         return samples if np.all(self.divisor == 1.0) else samples / self.divisor
 
+    @property
+    def labels(self) -> list[tuple[str, str]]:
+        """Return what a machine file may call each channel: its number or its name."""
+        return [(str(place), name) for place, name in enumerate(self.names)]
+
 
 def channel_parameters(values: Mapping[str, Any]) -> list[Parameter]:
     """Return the parameters of the channels that names of parameters tell; raises as below."""
