@@ -54,8 +54,8 @@ class Machine:
     gears: Mapping[str, Any] = field(default_factory=dict)
     planetary: Mapping[str, Any] = field(default_factory=dict)
     bearings: Mapping[str, Any] = field(default_factory=dict)
-    belts: Mapping[str, Any] = field(default_factory=dict)
     limits: Mapping[str, Any] = field(default_factory=dict)
+    belts: Mapping[str, Any] = field(default_factory=dict)
     _ratios: dict[str, Fraction] = field(init=False, repr=False, compare=False,
                                          default_factory=dict)
 
