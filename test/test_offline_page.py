@@ -30,6 +30,8 @@ MACHINE = f"""/**:
     machine:
       tach_shaft: output
       gears: {{g: {{shaft: input, teeth: 19, mate_shaft: output, mate_teeth: 38}}}}
+      limits:
+        mesh: {{part: mesh input-output 1x, shaft: input, channel: near, warn: 0.5, alarm: 5.0}}
       bearings: {{b: {{shaft: input, cage: 0.4, ball: 2.3, inner: 5.4, outer: 3.6}}}}
 /**/synchronous_averager:
   ros__parameters:
@@ -105,6 +107,8 @@ def test_tables_hold_the_last_average_of_the_strongest_channels(folder):
     assert rows['rms'][0].startswith(f'{rms:.2g}'[:4])
     assert rows['rms'][0].endswith(' g')
     assert len(rows['bearing b outer (3.6)']) == 3
+    assert re.search('<h2>Limits</h2>\n<ul><li>mesh input-output 1x of input, channel 1: '
+                     r'[^ ]* \+- [^ ]* above 0.5 \(warn\), since average 0</li></ul>', text)
     jitter = 1e6 / CLOCK / 12**0.5
     found = re.fullmatch('(.*) µs', rows['pulse errors, RMS'][0])
     assert float(found[1]) == pytest.approx(jitter, rel=0.25)

@@ -9,7 +9,7 @@
 # the License.
 
 """
-A machine on a page that prints: changes, orders, indicators, keyphasor and figures.
+A machine on a page that prints: changes, limits, orders, indicators, keyphasor and figures.
 
 It is made of the files of a recording; numbers are those of its last average.
 """
@@ -58,6 +58,7 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
             for shaft in arrays['shafts'].tolist()]
     place = place or folder / PAGE
     parts = [*_head(signals, shafts, about['row']), *_findings(changes, about['row']),
+             *_limits(signals.machine, about['limits']),
              *_keyphasor(signals, shafts, about['row']),
              *_picture(place.with_name(FIGURE), 'Changes', kind='half')]
     for series in shafts:
@@ -94,6 +95,15 @@ def _findings(changes: Changes | None, row: dict[str, Any]) -> Iterator[str]:
         yield f'<p class="verdict {kind}">{text[:1].upper()}{text[1:]}</p>'
     for remark in filter(None, (row['error'], *row['remarks'])):
         yield f'<p>Note: {escape(remark)}.</p>'
+
+
+def _limits(machine: Machine, passed: Sequence[str]) -> Iterator[str]:
+    """Return the limits that this recording passes."""
+    if machine.limits:
+        yield '<h2>Limits</h2>'
+        count = len(machine.limits)
+        yield ('<ul>' + ''.join(f'<li>{kept(line)}</li>' for line in passed) + '</ul>' if passed
+               else f'<p>None of {count} limit{"s" * (count > 1)} is passed.</p>')
 
 
 # --- one shaft -----------------------------------------------------------------------------------
