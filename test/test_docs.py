@@ -27,6 +27,7 @@ from importlib import import_module
 from importlib.util import find_spec
 import io
 from itertools import pairwise
+import json
 import os
 from pathlib import Path
 import re
@@ -44,7 +45,7 @@ import pytest
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sa_jitter_ros.averaging.indicators import INDICATORS
-from sa_jitter_ros.commands import design
+from sa_jitter_ros.commands import chain, design
 from sa_jitter_ros.effects import EFFECTS
 from sa_jitter_ros.nodes import messages
 from sa_jitter_ros.nodes.base import DIAGNOSTIC_KEYS
@@ -52,6 +53,7 @@ from sa_jitter_ros.nodes.tach_detector import JOINT_TYPE
 from sa_jitter_ros.pulses.sampled_angle import AngleState
 from sa_jitter_ros.recordings.fields import FIELDS
 from scipy.io import wavfile
+from std_msgs.msg import String
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -354,21 +356,39 @@ TUTORIAL = ROOT / 'docs' / 'tutorial.md'
 DAY = '## 9. A day with an own gearbox'
 
 
-def test_a_day_with_an_own_gearbox_can_be_spent(capsys):
+def test_a_day_with_an_own_gearbox_can_be_spent(capsys, ros_graph):
     """All of its commands run, in their order, and print what is shown."""
     begins = TUTORIAL.read_text(encoding='utf-8').splitlines().index(DAY)
-    blocks = [block for block in BLOCKS if block.document == TUTORIAL and block.line > begins]
     namespace_of(TUTORIAL)['np'] = np
-    for block in blocks:
+    online = []
+    for block in (item for item in BLOCKS if item.document == TUTORIAL and item.line > begins):
         if block.language == 'python':
             run_python(block)
         for words in lines_of(block) if block.language == 'bash' else ():
-            if words[:3] == ['ros2', 'run', 'sa_jitter_ros'] and words[3] in COMMANDS:
-                with inside(folder_of(TUTORIAL)):
-                    assert COMMANDS[words[3]].main(words[4:]) == 0
-                printed = capsys.readouterr().out
-                assert set(stripped(SHOWN.get(block, ''))) <= {*stripped(printed), ''}
+            if words[:2] != ['ros2', 'run'] or words[3] not in COMMANDS.keys() - {'chain'}:
+                online.append(words[3:])
+                continue
+            with inside(folder_of(TUTORIAL)):
+                assert COMMANDS[words[3]].main(words[4:]) == 0
+            printed = capsys.readouterr().out
+            assert set(stripped(SHOWN.get(block, ''))) <= {*stripped(printed), ''}
     assert (folder_of(TUTORIAL) / 'averages' / 'gearbox' / 'page.html').exists()
+    see_the_alarm(online, ros_graph)
+
+
+def see_the_alarm(online, ros_graph):
+    """Start the nodes of the commands for programs on line, and wait for their alarm."""
+    (_, _, params, _, *others), (player, *_), _ = online
+    changes = ros_graph.capture('change', String, latched=True)
+    for name in (*chain.NODES, *others):
+        ros_graph.add(NODES[name], cli_args=[
+            '--ros-args', '--params-file', str(folder_of(TUTORIAL) / params)])
+    ros_graph.add(NODES[player], {
+        'recording': str(folder_of(TUTORIAL) / 'gearbox.npz'), 'rate': 10.0})
+    assert ros_graph.spin(lambda: changes and json.loads(changes[-1].data)['changes'])
+    change, = json.loads(changes[-1].data)['changes']
+    assert (change['kind'], change['name'], change['level']) == (
+        'limit', 'mesh input-output 2x', 'warn')
 
 
 def check_executable(block, name, arguments, capsys):

@@ -677,6 +677,13 @@ def test_orders_have_the_names_of_the_parts_that_make_them(bench):
     page = shown(b)
     assert re.search(r'mesh shaft-out 1x \(19\) +0.389', text_of(page, 'orders'))
     assert 'mesh shaft-out 1x (19): +4.10 ± 0.60 % since' in page  # a trend
+    limit = {**CHANGE['changes'][0], 'kind': 'limit', 'name': 'mesh shaft-out 2x', 'p_value': None,
+             'level': 'alarm', 'value': 0.913, 'value_error': 0.016, 'limit': 0.8,
+             'keyphasor_share': None}
+    b.send('change', String(data=json.dumps({**CHANGE, 'changes': [limit]})))
+    b.settle()
+    said = re.sub(r'\s+', ' ', text_of(shown(b), 'attention'))
+    assert 'mesh shaft-out 2x of shaft, channel 0: 0.913 ± 0.016 above 0.8 (alarm) since' in said
 
 
 def test_the_browser_shows_the_numbers(bench):

@@ -78,7 +78,8 @@ export function drawOrders() {
     'order', `raw [${unit()}]`, `corrected [${unit()}]`, `noise [${unit()}]`, 'attenuation',
     'predicted', '5 % to 95 %', 'in band'].map(right), orderRows().map(row => {
     const inside = inBand(row), band = row.predicted;
-    return [...[nameOf(row.order) ? words(row.order) : format(row.order, 6), withError(row.raw_amplitude, row.raw_standard_error),
+    return [...[nameOf(row.order) ? words(row.order) : format(row.order, 6),
+                withError(row.raw_amplitude, row.raw_standard_error),
                 withError(row.corrected_amplitude, row.corrected_standard_error),
                 format(row.noise_standard_deviation, 2),
                 withError(row.attenuation, row.attenuation_standard_error), format(band?.mean),
@@ -140,6 +141,13 @@ export function drawEffects() {
   find('effects').replaceChildren(list);
 }
 
+// What has changed, and how: of a limit its value and bound.
+const quantityOf = item => item.kind === 'indicator' ? item.name.replaceAll('_', ' ')
+  : item.kind === 'limit' || known(item.order) ? item.name
+    : `${item.kind === 'bearing' ? 'bearing ' : ''}order ${item.name}`;
+const findingOf = item => item.kind === 'limit' ? `${withError(item.value, item.value_error)} above `
+  + `${format(item.limit)} (${item.level})` : changeText(item);
+
 // Above everything: what has changed, and which nodes lack something, with their own words.
 export function drawAttention() {
   // What the monitor says of changes stands there already.
@@ -150,12 +158,11 @@ export function drawAttention() {
     return [age > 5 ? 3 : node.level, name, age > 5 ? `no status for ${age.toFixed(0)} s`
       : node.message];
   }).filter(([level]) => level > 0).sort(([a], [b]) => b - a);
-  const changed = [...changes()].sort((a, b) => a.p_value - b.p_value).map(item => [1, item.kind === 'indicator'
-    ? item.name.replaceAll('_', ' ') : known(item.order) ? item.name
-      : `${item.kind === 'bearing' ? 'bearing ' : ''}order ${item.name}`, `of ${item.shaft}, ${channelName(item.channel)}: `
-      + `${changeText(item)} since average ${item.since_sequence}`
-      + (known(item.keyphasor_share) ? '; the keyphasor explains '
-        + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
+  const changed = [...changes()].sort((a, b) => (a.p_value ?? 0) - (b.p_value ?? 0)).map(
+    item => [item.level === 'alarm' ? 2 : 1, quantityOf(item),
+             `of ${item.shaft}, ${channelName(item.channel)}: ${findingOf(item)} since average `
+             + item.since_sequence + (known(item.keyphasor_share) ? '; the keyphasor explains '
+               + `${format(100 * item.keyphasor_share, 2)} %` : '')]);
   const lines = [...changed.slice(0, MOST_CHANGES).map(
     ([level, name, text]) => [level, `${name} ${text}`]),
                  ...(changed.length > MOST_CHANGES
