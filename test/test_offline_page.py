@@ -107,8 +107,11 @@ def test_tables_hold_the_last_average_of_the_strongest_channels(folder):
     assert rows['rms'][0].startswith(f'{rms:.2g}'[:4])
     assert rows['rms'][0].endswith(' g')
     assert len(rows['bearing b outer (3.6)']) == 3
-    assert re.search('<h2>Limits</h2>\n<ul><li>mesh input-output 1x of input, channel 1: '
-                     r'[^ ]* \+- [^ ]* above 0.5 \(warn\), since average 0</li></ul>', text)
+    assert re.search(
+        '<p class="verdict unexplained">Limits are passed:<br>mesh input-output 1x of input, '
+        'channel 1: [^ ]* above 0.5 .warn., since average 0</p>', text)
+    assert rows['mesh'] == ['mesh input-output 1x', 'input', 'near', '0.5', '5']
+    assert '<p>Note: mesh' not in text
     jitter = 1e6 / CLOCK / 12**0.5
     found = re.fullmatch('(.*) µs', rows['pulse errors, RMS'][0])
     assert float(found[1]) == pytest.approx(jitter, rel=0.25)

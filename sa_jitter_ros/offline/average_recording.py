@@ -246,7 +246,8 @@ def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress |
         row = _counted(Row(job.name, job.path, error=averager.ended_early), averager, series)
         row = replace(row, remarks=tuple(dict.fromkeys(remarks))[:_MOST_REMARKS])
         write_averages(folder, signals, series, {
-            'settings': settings, 'row': asdict(row), 'limits': [*map(str, limits.passed())]})
+            'settings': settings, 'row': asdict(row), 'said': averager.passed,
+            'limits': [*map(str, limits.passed())]})
         if job.figures:
             from sa_jitter_ros.offline.figures import write_figures
             write_figures(folder, signals, series, {

@@ -14,7 +14,7 @@ A machine on a page that prints: changes, limits, orders, indicators, keyphasor 
 It is made of the files of a recording; numbers are those of its last average.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 import json
 import math
@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
-from sa_jitter_ros.machine import Machine
+from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.number_text import measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
 from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
@@ -57,8 +57,7 @@ def write_page(folder: Path, changes: Changes | None = None, *, place: Path | No
             if name.startswith(f'{shaft}_') and not name.endswith(_OVER_ANGLE)})
             for shaft in arrays['shafts'].tolist()]
     place = place or folder / PAGE
-    parts = [*_head(signals, shafts, about['row']), *_findings(changes, about['row']),
-             *_limits(signals.machine, about['limits']),
+    parts = [*_head(signals, shafts, about['row']), *_findings(changes, about), *_limits(signals),
              *_keyphasor(signals, shafts, about['row']),
              *_picture(place.with_name(FIGURE), 'Changes', kind='half')]
     for series in shafts:
@@ -84,26 +83,35 @@ def _head(signals: Signals, shafts: Sequence[ShaftSeries], row: dict[str, Any]) 
            f'channel{"s" * (len(signals.channels) > 1)}.</p>')
 
 
-def _findings(changes: Changes | None, row: dict[str, Any]) -> Iterator[str]:
-    """Return what has changed, and what is doubtful."""
-    if changes is None:
-        yield ('<p class="verdict unseen">No baseline to compare with: --baseline takes the first '
-               'recordings of this machine as its normal state.</p>')
+def _findings(changes: Changes | None, about: Mapping[str, Any]) -> Iterator[str]:
+    """Return what has changed, the limits that are passed, and what is doubtful."""
+    lines, kind = about['limits'], 'unexplained'
+    if changes is not None:
+        lines = changes.lines()
+        kind = kind if changes.changes or changes.limits.passed() else 'none'
+    elif lines:
+        lines = ['limits are passed:', *lines]
     else:
-        kind = 'unexplained' if changes.changes else 'none'
-        text = '<br>'.join(map(kept, changes.lines()))
-        yield f'<p class="verdict {kind}">{text[:1].upper()}{text[1:]}</p>'
+        lines, kind = ['No baseline to compare with: --baseline takes the first recordings of '
+                       'this machine as its normal state.'], 'unseen'
+    text = '<br>'.join(kept(line.replace(' +- ', ' ± ')) for line in lines)
+    yield f'<p class="verdict {kind}">{text[:1].upper()}{text[1:]}</p>'
+    row = about['row']
     for remark in filter(None, (row['error'], *row['remarks'])):
-        yield f'<p>Note: {escape(remark)}.</p>'
+        if remark not in about['said']:  # of limits
+            yield f'<p>Note: {escape(remark)}.</p>'
 
 
-def _limits(machine: Machine, passed: Sequence[str]) -> Iterator[str]:
-    """Return the limits that this recording passes."""
-    if machine.limits:
+def _limits(signals: Signals) -> Iterator[str]:
+    """Return the limits that are set."""
+    if signals.machine.limits:
         yield '<h2>Limits</h2>'
-        count = len(machine.limits)
-        yield ('<ul>' + ''.join(f'<li>{kept(line)}</li>' for line in passed) + '</ul>' if passed
-               else f'<p>None of {count} limit{"s" * (count > 1)} is passed.</p>')
+        yield table(('limit', 'of', 'shaft', 'channel', *LEVELS), [
+            (name, limit.part or limit.indicator or order_words(limit.order),
+             limit.shaft or '', limit.channel or 'all', *(
+                 f'{limit.bounds[level]:g}{" × baseline" * bool(limit.relative)}'
+                 if level in limit.bounds else '–' for level in LEVELS))
+            for name, limit in signals.machine.limits.items()], kind='pairs')
 
 
 # --- one shaft -----------------------------------------------------------------------------------
@@ -163,7 +171,7 @@ def _interval(value: float, error: float, unit: str = '') -> str:
 
 
 def _share(value: float, error: float) -> str:
-    return percent_text(float(value), _HALF * float(error)) if math.isfinite(value) else '–'
+    return percent_text(float(value), _HALF * float(error)) if error < _CLEAR else '–'
 
 
 # --- the keyphasor -------------------------------------------------------------------------------
