@@ -36,7 +36,6 @@ from shutil import copyfile
 import subprocess
 import sys
 import tempfile
-from types import SimpleNamespace
 
 from matplotlib.figure import Figure
 from matplotlib.image import imread
@@ -605,23 +604,6 @@ def test_names_in_backticks_exist(name):
     words = {re.sub('[./]data$', '', word) for word in words_in(ROOT / 'docs' / name)
              if re.fullmatch(r'[a-z<][a-z0-9_<>./]+', word)}
     assert not words - known_words() - ORDINARY - EFFECTS.keys()
-
-
-def test_the_subscriber_reads_averages(ros_graph):
-    block, = (block for block in BLOCKS if 'class Watch(Node)' in block.text)
-    namespace = {}
-    exec(block.text, namespace)
-    watch = ros_graph.add(namespace['Watch'])
-    lines = []
-    watch.get_logger = lambda: SimpleNamespace(info=lines.append)
-    values = np.zeros((2, 1, len(messages.AMPLITUDE_FIELDS)))
-    values[0, 0, :2] = 19.0, 0.5
-    ros_graph.publish('shaft/order_amplitude', messages.encode_average(
-        'order_amplitude', messages.AverageMessage(
-            messages.AverageHeader(0.0, 2.4, 0, 40, 96, 16.6), values,
-            messages.AMPLITUDE_FIELDS)))
-    ros_graph.settle()
-    assert lines == ['2.4 s: order 19: 0.5']
 
 
 def test_every_topic_is_in_the_interfaces():
