@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
+from sa_jitter_ros.html_parts import figure, kept, page, table
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.number_text import measured_text, order_text, order_words, percent_text
 from sa_jitter_ros.offline.changes import Changes, FIGURE
 from sa_jitter_ros.offline.files import ARRAYS, Signals, write_lines
 from sa_jitter_ros.offline.plotting import squared
 from sa_jitter_ros.offline.series import ShaftSeries
-from sa_jitter_ros.html_parts import figure, kept, page, table
 
 PAGE = 'page.html'
 _OVER_ANGLE = ('waveform', '_average', '_standard_error', '_spectrum')  # ends of names, unused

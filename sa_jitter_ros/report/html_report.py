@@ -16,11 +16,11 @@ import json
 from pathlib import PurePath
 from typing import Any
 
+from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.inference.trace_result import Trace
 from sa_jitter_ros.number_text import (
     measured_text, number_text, order_text, percent_text)
 from sa_jitter_ros.report.figures import illustrate, Illustration
-from sa_jitter_ros.html_parts import figure, kept, page, part, table
 from sa_jitter_ros.report.new_section import ONLY_SHAFT
 from sa_jitter_ros.report.report import parameter_unit
 from sa_jitter_ros.report.words import findings, next_steps, order_shares, verdict_sentence
@@ -151,7 +151,7 @@ def _evidence(content: Mapping[str, Json]) -> Iterator[str]:
             yield part('Effects that are missing', *_effects(content))
         yield part('Error of the averages that served no fit', _error_table(content))
         yield part('Dependence of the residual on other quantities',
-                    _dependence_table(content['dependence']))
+                   _dependence_table(content['dependence']))
         yield part('All effects that were tried', _candidate_table(content['candidates']))
         yield part('What an effect that was not found could be at most', _limit_table(content))
         yield part('All lines', _line_table(content))
