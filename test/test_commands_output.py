@@ -68,9 +68,9 @@ def test_machine_file_describes_the_recording_and_fields_win(tmp_path, monkeypat
                str(shipped('machine.yaml'))]
     parser = check_keyphasor.make_parser()
     found, _ = check_keyphasor.run(parser.parse_args(command))
-    assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (183 / 76, 18.0, 1)
+    assert (found.ratio, found.orders[0], found.pulses_per_revolution) == (183 / 76, 19.0, 1)
     found, _ = check_keyphasor.run(parser.parse_args([*command, '--field', 'ratio=3']))
-    assert (found.ratio, found.orders[0]) == (3.0, 18.0)
+    assert (found.ratio, found.orders[0]) == (3.0, 19.0)
 
 
 class Terminal(io.StringIO):

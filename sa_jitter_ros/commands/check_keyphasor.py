@@ -74,9 +74,13 @@ def _machine_fields(params: Path | None) -> dict[str, Any]:
                      if model.pulses_per_trigger else {})
 
 
-def run(options: argparse.Namespace, declared: Mapping[str, Any]
-        ) -> tuple[KeyphasorCheck, Recording]:
-    """Check the recording against a declared machine, and return both; raises SaJitterError."""
+def _declared(params: Path | None) -> Mapping[str, Any]:
+    """Return the parameters of a machine file, none without it; raises ParameterError."""
+    return {} if params is None else read_parameters(params, NODE)
+
+
+def run(options: argparse.Namespace) -> tuple[KeyphasorCheck, Recording]:
+    """Check the recording, and return both; raises SaJitterError."""
     def progress(text: str) -> None:
         if not options.quiet:
             print(f'check_keyphasor: {text}', file=sys.stderr, flush=True)
@@ -85,8 +89,8 @@ def run(options: argparse.Namespace, declared: Mapping[str, Any]
                      **{**_machine_fields(options.params), **read_options(options)})
     for remark in recording.remarks:
         progress(remark)
-    return check_keyphasor(recording, teeth=options.teeth, machine=Machine.among(declared),
-                           progress=progress), recording
+    return check_keyphasor(recording, teeth=options.teeth, progress=progress,
+                           machine=Machine.among(_declared(options.params))), recording
 
 
 def main(args: Sequence[str] | None = None) -> int:
@@ -95,13 +99,13 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         require_writable(options.output)
         use_one_thread()
-        declared = read_parameters(options.params, NODE) if options.params else {}
-        found, recording = run(options, declared)
+        found, recording = run(options)
         options.output.mkdir(parents=True, exist_ok=True)
         report = json.dumps(json_values(found.report), indent=1, allow_nan=False)
         (options.output / 'keyphasor.json').write_text(f'{report}\n', encoding='utf-8')
         (options.output / 'machine.yaml').write_text(
-            machine_file(found, options.recording.name, declared), encoding='utf-8')
+            machine_file(found, options.recording.name, _declared(options.params)),
+            encoding='utf-8')
         check_figure(found, options.recording.name).savefig(
             options.output / 'keyphasor.png', dpi=110)
         fitted = found.fitted
