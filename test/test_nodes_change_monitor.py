@@ -28,7 +28,7 @@ from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.nodes import health, messages
 from sa_jitter_ros.nodes.change_monitor import baseline_path, ChangeMonitor
 from sa_jitter_ros.nodes.testing import Graph
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 KEYS = {'shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_sequence',
@@ -38,12 +38,13 @@ KEYS = {'shaft', 'channel', 'kind', 'name', 'change', 'standard_error', 'since_s
 class MonitorBench(NodeBench):
     """A bench around a monitor of drawn averages."""
 
-    def __init__(self, graph, *, shafts=('input',), **parameters):
+    def __init__(self, graph, *, shafts=('input',), state=None, **parameters):
         parameters = {'learning_averages': 40, 'group_averages': 4, 'hardware_id': 'pump 3',
                       'shafts': list(shafts), 'baseline_file': 'none', **parameters}
         super().__init__(
             graph, ChangeMonitor,
-            inputs={f'{shaft}/{kind}': Float64MultiArray for shaft in shafts for kind in KINDS},
+            inputs={f'{shaft}/{kind}': Float64MultiArray for shaft in shafts for kind in KINDS
+                    } | ({'operating_state': state} if state else {}),
             outputs={}, **parameters)
         self.received['change'] = graph.capture('change', String, latched=True)
 
@@ -145,9 +146,61 @@ def test_speeds_that_are_never_learnt_are_said(ros_graph):
         machine.speed = (16.6, 20.0, 24.0)[number % 3]
         b.play(machine, 2)
     assert b.diagnostics()[:2] == (
-        OK, 'learning: 16 of 40 averages of input at 24.53 Hz, of 48 at all speeds: a larger '
-        'speed_bin learns sooner')
+        OK, 'learning: 16 of 40 averages of input at 24.53 Hz, of 48 in all bins: larger ones '
+        'learn sooner')
     assert not b.change()['baseline']['complete']
+
+
+@pytest.mark.parametrize('stamped', [False, True])
+def test_a_load_that_changes_is_no_change_of_the_machine(ros_graph, stamped):
+    kind = Float64MultiArray if stamped else Float64
+    b, machine = MonitorBench(
+        ros_graph, state=kind, state_bin=50, state_lowest=50,
+        operating_state_type=f'std_msgs/{kind.__name__}'), DrawnMachine(22)
+    for number in range(20):
+        load = (100.0, 200.0, 20.0, 200.0)[number % 4]
+        machine.gain[:] = load / 100.0
+        stamp = machine.sequence * 60.0
+        b.send('operating_state', Float64MultiArray(data=[stamp, load]) if stamped else
+               Float64(data=load))
+        b.settle()
+        b.play(machine, 8 if load == 200.0 else 4)
+    assert b.change() == {'baseline': {'averages': 100, 'complete': True}, 'changes': []}
+    level, text, values = b.diagnostics()
+    assert (level, text, values['averages_discarded']) == (OK, 'no change in 100 averages', '20')
+    b.send('operating_state', Float64MultiArray(data=[machine.sequence * 60.0, 20.0]) if stamped
+           else Float64(data=20.0))
+    b.settle()
+    b.play(machine, 1)
+    assert b.diagnostics()[:2] == (
+        OK, '21 averages discarded; input: state 20 is below 50')
+    wrong = Float64MultiArray(data=[0.0, np.nan]) if stamped else Float64(data=np.nan)
+    b.send('operating_state', wrong)
+    level, text, values = b.diagnostics()
+    assert (level, values['messages_rejected']) == (WARN, '1')
+    assert text.startswith('operating_state: state nan at ')
+
+
+def test_an_operating_state_that_never_comes_is_said(ros_graph, monkeypatch):
+    clock = SteadyClock()
+    monkeypatch.setattr(health, 'time', clock)
+    b = MonitorBench(ros_graph, state_bin=50.0, stale_after=5.0)
+    clock.now += 4.0
+    b.play(DrawnMachine(23), 2)
+    clock.now += 2.0
+    level, text, values = b.diagnostics()
+    assert level == WARN
+    assert text == ('no /operating_state since the start 6 s ago: nobody publishes it: start its '
+                    'source, and compare topics and namespaces (ros2 topic list)')
+    assert values['averages_discarded'] == '2'
+    assert b.change()['baseline']['averages'] == 0
+
+
+def test_an_unused_operating_state_is_not_asked_for(ros_graph):
+    b = MonitorBench(ros_graph)
+    assert not [item for item in b.node.subscriptions if 'operating' in item.topic_name]
+    with pytest.raises(ParameterError, match=r"^operating_state_type is 'std_msgs/Int8': give"):
+        MonitorBench(ros_graph, operating_state_type='std_msgs/Int8')
 
 
 def test_late_subscriber_gets_the_last_answer(ros_graph):

@@ -38,7 +38,7 @@ from sa_jitter_ros.parameter_file import require_regular_file
 FORMAT = 'sa_jitter_ros change baseline 1'
 _LARGEST_FILE = 1 << 28
 # The settings of the learning: of other ones the sums cannot be used.
-_LEARNING = ('group_averages', 'speed_bin')
+_LEARNING = ('group_averages', 'speed_bin', 'state_bin')
 
 
 def lock_baseline(path: Path) -> TextIO | None:
@@ -167,6 +167,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     about = json.loads(str(arrays.pop('machine')))
     if about['format'] != FORMAT:
         raise ValueError(f'format {about["format"]!r}')
+    about['settings'] = {'state_bin': 0.0, **about['settings']}  # which older files lack
     if not (isinstance(about['machine'], str) and isinstance(about['shafts'], dict)
             and about['settings'].keys() == set(_LEARNING)):
         raise ValueError('incomplete description')

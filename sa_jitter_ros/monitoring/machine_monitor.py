@@ -12,6 +12,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from sa_jitter_ros.monitoring.baseline_file import (
     lock_baseline, read_baseline, set_aside, write_baseline)
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.monitor import Change, Settings, ShaftMonitor
+from sa_jitter_ros.monitoring.operating import OperatingState
 from sa_jitter_ros.monitoring.quantities import Layout, monitored, MonitoredAverage
 
 FloatArray = NDArray[np.float64]
@@ -98,12 +100,18 @@ class MachineMonitor:
 
     `path` is the file, None: it is not kept. Nobody else can use it before `close`, or the end of
     the process. With `anew` an older file is kept under another name, and not used. `parts` name
-    the orders, `limits` are watched beside. Raises RecordingError for a file that cannot be used.
+    the orders, `limits` are watched beside; averages get the operating `state`. Raises
+    RecordingError for a file that cannot be used.
     """
 
     def __init__(self, machine: str, shafts: Sequence[str], settings: Settings,
                  path: Path | None = None, *, parts: Machine = UNKNOWN,
-                 limits: LimitWatch | None = None, anew: bool = False) -> None:
+                 limits: LimitWatch | None = None, state: OperatingState | None = None,
+                 anew: bool = False) -> None:
+        self.state = state or OperatingState(stamped=True)
+        #: Averages discarded for their operating state, and why the latest one of each shaft was.
+        self.discarded = 0
+        self.refusals: dict[str, str] = {}
         self._parts, self.limits = parts, limits or LimitWatch(UNKNOWN, shafts)
         self.machine, self.shafts, self._settings, self.path = machine, shafts, settings, path
         self.monitors: dict[str, ShaftMonitor] = {}
@@ -164,6 +172,12 @@ class MachineMonitor:
 
     def take_average(self, shaft: str, average: MonitoredAverage) -> list[str]:
         """Take a whole average, as `take` does its arrays."""
+        if self._settings.uses_state:
+            average = replace(average, state=self.state.of(shaft, average.header))
+            self.refusals[shaft] = self._settings.refusal(average.state)
+            if self.refusals[shaft]:
+                self.discarded += 1
+                return []
         self.uncorrected[shaft].add(not average.is_corrected)
         monitor = self.monitors.get(shaft) or self._begin(shaft, average)
         fitted = average.fitted(monitor.layout) if monitor is not None else None

@@ -25,6 +25,7 @@ from sa_jitter_ros.averaging.results import AverageHeader
 from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.machine import Machine, UNKNOWN
 from sa_jitter_ros.monitoring.change_test import ChangeTest, LEAST_LEARNED
+from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import in_words, Layout, MonitoredAverage, part_of
 from sa_jitter_ros.monitoring.speed_bin import SpeedBin
 from sa_jitter_ros.parameters import Parameter, Values
@@ -33,7 +34,7 @@ from scipy import special
 FloatArray = NDArray[np.float64]
 
 YEAR = 365.25 * 86400.0  # s
-# Bins of speed: the machine passes through more of them in a run-up than it stays in.
+# Bins: the machine passes through more of them in a run-up than it stays in.
 _MOST_BINS = 64
 # Intervals between averages of which the median counts.
 _INTERVALS = 256
@@ -54,6 +55,12 @@ PARAMETERS = (
               'then another keyphasor is a change, too'),
     Parameter('speed_bin', 0.05, 'relative width of a bin of speed, each with its own baseline',
               minimum=1e-4, maximum=1.0, read_only=True),
+    Parameter('state_bin', 0.0, 'width of a bin of the operating state, in its unit, each with '
+              'its own baseline; 0: one for all', minimum=0.0, read_only=True),
+    Parameter('state_lowest', math.nan, 'operating state below which averages are discarded; NaN: '
+              'none', read_only=True),
+    Parameter('state_highest', math.nan, 'operating state above which averages are discarded; '
+              'NaN: none', read_only=True),
 )
 
 
@@ -66,6 +73,9 @@ class Settings:
     group_averages: int = 5
     speed_bin: float = 0.05
     allow_uncorrected: bool = False
+    state_bin: float = 0.0
+    state_lowest: float = math.nan
+    state_highest: float = math.nan
 
     def __post_init__(self) -> None:
         """Check that the baseline has enough groups."""
@@ -76,6 +86,9 @@ class Settings:
                 f'learning_averages is {self.learning_averages} and group_averages '
                 f'{self.group_averages}: learn at least {LEAST_LEARNED} groups, '
                 f'{LEAST_LEARNED * self.group_averages} averages')
+        if self.state_lowest >= self.state_highest:
+            raise ParameterError(f'state_lowest is {self.state_lowest:g}, state_highest '
+                                 f'{self.state_highest:g}: give a lower one first')
 
     @classmethod
     def of(cls, values: Values) -> 'Settings':
@@ -86,6 +99,23 @@ class Settings:
     def learning_groups(self) -> int:
         """Return the number of groups that are learnt."""
         return self.learning_averages // self.group_averages
+
+    @property
+    def uses_state(self) -> bool:
+        """Return whether the operating state counts."""
+        return bool(self.state_bin) or math.isfinite(self.state_lowest) or math.isfinite(
+            self.state_highest)
+
+    def refusal(self, state: float) -> str:
+        """Return why an average at an operating state is discarded, '' where it is not."""
+        if not self.uses_state:
+            return ''
+        if math.isnan(state):
+            return 'no operating state is known'
+        if state < self.state_lowest:
+            return f'state {state:.4g} is below {self.state_lowest:g}'
+        return f'state {state:.4g} is above {self.state_highest:g}' if (
+            state > self.state_highest) else ''
 
 
 @dataclass(frozen=True)
@@ -185,7 +215,7 @@ def _slides(before: AverageHeader, now: AverageHeader) -> bool:
 
 
 class _Group:
-    """Sums over consecutive averages in one bin of speed."""
+    """Sums over consecutive averages in one bin."""
 
     def __init__(self, average: MonitoredAverage) -> None:
         self.first = average.header
@@ -225,7 +255,7 @@ class ShaftMonitor:
         # Sums of products of scores of a channel, and their numbers.
         self._products: FloatArray = np.zeros((2, channels, count, count))
         self._groups: dict[int, _Group] = {}
-        self._speed = math.nan  # the middle of bin 0
+        self._bins = OperatingBins(settings.speed_bin, settings.state_bin)
         self._bin = 0
         self._intervals: list[float] = []
         self._end = math.nan
@@ -252,7 +282,7 @@ class ShaftMonitor:
             self.uncorrected += 1
         if not np.isfinite(average.values).any():
             return []
-        key = self._bin_of(header.mean_trigger_speed)
+        key = self._bin_of(header.mean_trigger_speed, average.state)
         if key is None:
             self.beyond += 1
             return []
@@ -268,14 +298,10 @@ class ShaftMonitor:
         del self._groups[key]
         return self._test_group(key, group)
 
-    def _bin_of(self, speed: float) -> int | None:
-        if not (math.isfinite(speed) and speed > 0.0):
-            return None
-        if math.isnan(self._speed):
-            self._speed = speed
-        key = round(math.log(speed / self._speed) / math.log1p(self.settings.speed_bin))
+    def _bin_of(self, speed: float, state: float) -> int | None:
+        key = self._bins.key(speed, state)
         known = self._test.bins.keys() | self._groups.keys()
-        return key if key in known or len(known) < _MOST_BINS else None
+        return key if key is None or key in known or len(known) < _MOST_BINS else None
 
     def scores_per_alarm(self) -> float:
         """Return the number of tested groups of each quantity for one false alarm."""
@@ -349,9 +375,9 @@ class ShaftMonitor:
             place.count.max() > self.settings.learning_groups - 0.5)
 
     @property
-    def speed(self) -> float:
-        """Return the trigger speed in Hz of the middle of the present bin, NaN at the start."""
-        return self._speed * (1.0 + self.settings.speed_bin) ** self._bin
+    def place(self) -> str:
+        """Return trigger speed and operating state in the middle of the present bin in words."""
+        return self._bins.words(self._bin)
 
     def _correlate(self, place: SpeedBin, values: FloatArray) -> None:
         """Add the products of the deviations of values from the baseline of their bin."""
@@ -374,12 +400,12 @@ class ShaftMonitor:
         np.einsum('cii->ci', found)[:] = 1.0
         return np.clip(found, -1.0, 1.0)
 
-    def baseline(self, speed: float) -> Baseline | None:
-        """Return what is learnt at a trigger speed in Hz, None where nothing is."""
-        key = round(math.log(speed / self._speed) / math.log1p(self.settings.speed_bin))
-        place = self._test.bins.get(key)
-        if place is None:
+    def baseline(self, speed: float, state: float = math.nan) -> Baseline | None:
+        """Return what is learnt at a trigger speed in Hz and a state, None where nothing is."""
+        key = self._bins.key(speed, state)
+        if key not in self._test.bins:
             return None
+        place = self._test.bins[key]
         known, shape = place.baseline(), self.layout.shape
         scatter = np.sqrt(known.variance.reshape(shape))
         return Baseline(place.count.reshape(shape) * self.settings.group_averages,
@@ -442,7 +468,8 @@ class ShaftMonitor:
         """Return what `restore` needs: arrays by names. Groups that are not full are left out."""
         return {**self._test.state(), 'products': self._products,
                 'intervals': np.array(self._intervals),
-                'place': np.array([self._speed, self._bin, self._end, self.averages])}
+                'place': np.array([self._bins.speed, self._bin, self._end, self.averages,
+                                   self._bins.state])}
 
     def restore(self, state: dict[str, NDArray[Any]]) -> None:
         """Go on from a state; raises KeyError and ValueError for one of something else."""
@@ -452,5 +479,6 @@ class ShaftMonitor:
             raise ValueError('other shape')
         self._products = state['products'].copy()
         self._intervals = state['intervals'].tolist()
-        speed, key, end, averages = state['place'].tolist()
-        self._speed, self._bin, self._end, self.averages = speed, int(key), end, int(averages)
+        speed, key, end, averages, *states = state['place'].tolist()
+        self._bin, self._end, self.averages = int(key), end, int(averages)
+        self._bins.speed, self._bins.state = speed, sum(states)  # older files have none

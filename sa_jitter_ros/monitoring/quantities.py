@@ -20,6 +20,7 @@ amplitude of the squared envelope over its mean, because both follow load and sp
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +98,7 @@ class MonitoredAverage:
     and logarithms without, and `doubt` the published errors of the correction for the keyphasor
     alone. `readings` (4, channel, quantity) are what limits are for, also without a correction:
     amplitudes, indicators and depths themselves, their variances without and their errors by the
-    correction, and 1 where they are of a corrected average, else 0.
+    correction, and 1 where they are of a corrected average, else 0; `state` is the operating one.
     """
 
     header: AverageHeader
@@ -106,6 +107,7 @@ class MonitoredAverage:
     noise: FloatArray
     doubt: FloatArray
     readings: FloatArray
+    state: float = math.nan
 
     @property
     def is_corrected(self) -> bool:
@@ -132,7 +134,9 @@ class MonitoredAverage:
                 if quantity in places:
                     rows[..., place] = array[..., places[quantity]]
             found.append(rows)
-        return MonitoredAverage(self.header, layout, *found)
+        values, noise, doubt, readings = found
+        return replace(self, layout=layout, values=values, noise=noise, doubt=doubt,
+                       readings=readings)
 
 
 def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = None,
@@ -190,16 +194,16 @@ def monitored(amplitudes: AverageMessage, indicators: AverageMessage | None = No
     parts = ((square, np.log(values), np.log(amplitude / mean)),
              (own, variance, (error / amplitude) ** 2),
              (doubt, relative * power, np.zeros(amplitude.shape)))
-    found = [np.concatenate(part, axis=1) for part in parts]
+    found: list[FloatArray] = [np.concatenate(part, axis=1) for part in parts]
     known = np.concatenate((np.broadcast_to(corrected, (channels, count + len(names))),
                             np.ones(amplitude.shape, np.bool_)), axis=1)
     for array in found:
         array[~(np.isfinite(array) & known)] = np.nan
-    found.append(
-        _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
     return MonitoredAverage(
         amplitudes.header, Layout(channels, tuple(table[0, :, 0].tolist()) if channels else (),
-                                  names, tuple(bearings[np.isfinite(bearings)].tolist())), *found)
+                                  names, tuple(bearings[np.isfinite(bearings)].tolist())),
+        found[0], found[1], found[2],
+        _readings(table, (values, variance), (amplitude / mean, (error / amplitude) ** 2)))
 
 
 def _readings(table: FloatArray, *others: tuple[FloatArray, FloatArray]) -> FloatArray:
@@ -237,7 +241,9 @@ def mean_of(averages: Sequence[MonitoredAverage]) -> MonitoredAverage:
         fundamental_cycles=sum(item.header.fundamental_cycles for item in averages),
         mean_trigger_speed=float(np.mean([item.header.mean_trigger_speed for item in averages])),
         discarded_cycles=sum(item.header.discarded_cycles for item in averages))
-    return MonitoredAverage(header, averages[0].layout, *(*means, found))
+    values, noise, doubt = means
+    return MonitoredAverage(header, averages[0].layout, values, noise, doubt, found,
+                            float(np.mean([item.state for item in averages])))
 
 
 def _mean(rows: FloatArray, fewest: float) -> FloatArray:

@@ -13,6 +13,7 @@
 from collections.abc import Sequence
 from functools import partial
 import json
+import math
 import os
 from pathlib import Path
 import time
@@ -20,19 +21,24 @@ from typing import Any
 from urllib.parse import quote
 
 from rclpy.parameter import Parameter as RosParameter
-from sa_jitter_ros.errors import ParameterError, RecordingError
+from sa_jitter_ros.errors import MessageError, ParameterError, RecordingError
 from sa_jitter_ros.machine import LEVELS, Machine
 from sa_jitter_ros.monitoring.limits import LimitWatch
 from sa_jitter_ros.monitoring.machine_monitor import KINDS, MachineMonitor
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS as TEST_PARAMETERS, Settings
+from sa_jitter_ros.monitoring.operating import OperatingState
 from sa_jitter_ros.nodes.base import LATCHED_QOS, MonitoringNode, run_node
-from sa_jitter_ros.nodes.health import first_of
-from sa_jitter_ros.nodes.messages import decode_average
+from sa_jitter_ros.nodes.health import first_of, Flow
+from sa_jitter_ros.nodes.messages import decode_average, known_type
 from sa_jitter_ros.nodes.result_flows import ResultFlows
-from sa_jitter_ros.parameters import HARDWARE_ID, Parameter, require_shaft_names, Values
+from sa_jitter_ros.parameters import (
+    HARDWARE_ID, Parameter, require_shaft_names, STALE_AFTER, Values)
 from sa_jitter_ros.recordings.channel_units import channels_of, scale_of
-from std_msgs.msg import Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray, String
 
+#: Message types of `operating_state`.
+STATE_TYPES: dict[str, type] = {
+    'std_msgs/Float64': Float64, 'std_msgs/Float64MultiArray': Float64MultiArray}
 PARAMETERS = (
     Parameter('shafts', ['shaft'], 'names of the shafts that are monitored', read_only=True),
     *TEST_PARAMETERS,
@@ -44,6 +50,9 @@ PARAMETERS = (
               'lost when the node ends', read_only=True),
     Parameter('relearn', False, 'set to true at run time: learn a new baseline; the file of the '
               'old one is kept beside the new one, with a number in its name'),
+    Parameter('operating_state_type', 'std_msgs/Float64', 'message type of operating_state; '
+              'std_msgs/Float64MultiArray is [time in s on the clock of the averages, value]',
+              read_only=True),
 )
 _NOT_KEPT = 'none'
 _SAVE_PERIOD = 60.0  # s between writings of the file, unless something happens
@@ -66,6 +75,10 @@ class ChangeMonitor(MonitoringNode):
             raise ParameterError('relearn is true: set it while the node runs')
         self._path = baseline_path(values['baseline_file'], values[HARDWARE_ID.name],
                                    self.get_fully_qualified_name())
+        self._state_type = STATE_TYPES[known_type(
+            'operating_state_type', values['operating_state_type'], STATE_TYPES)]
+        self._state = OperatingState(stamped=self._state_type is Float64MultiArray)
+        self._hold()
         self._begin()
         self._change = self.create_output(String, 'change', LATCHED_QOS)
         for shaft in shafts:
@@ -73,6 +86,11 @@ class ChangeMonitor(MonitoringNode):
                 self.create_input(Float64MultiArray, f'{shaft}/{kind}',
                                   partial(self._on_array, shaft, kind))
         self._flows = ResultFlows(self, shafts, KINDS[1:])
+        self._state_flow: Flow | None = None
+        if Settings.of(values).uses_state:
+            self.create_input(self._state_type, 'operating_state', self._on_state)
+            self._state_flow = self.watch_input('operating_state', 'operating_state',
+                                                'averages without it are discarded')
         self.parameters.watch(check=Settings.of, apply=self._apply)
         self._publish()
         if self._monitor is not None:
@@ -94,11 +112,16 @@ class ChangeMonitor(MonitoringNode):
         try:
             self._monitor = MachineMonitor(
                 values[HARDWARE_ID.name], values['shafts'], Settings.of(values), self._path,
-                parts=parts, limits=limits, anew=anew)
+                parts=parts, limits=limits, anew=anew,
+                state=self._state)
             self._was_complete = self._monitor.is_complete
         except RecordingError as error:
             reason = str(error)
         self._fail('baseline', reason)
+
+    def _hold(self) -> None:
+        """Let a value of the operating state count until it is stale."""
+        self._state.hold = self.get_parameter(STALE_AFTER.name).value or math.inf
 
     def keep_state(self) -> None:
         """Write the baseline."""
@@ -119,6 +142,7 @@ class ChangeMonitor(MonitoringNode):
 
     def _apply(self, values: Values) -> None:
         self._values = values
+        self._hold()
         if values['relearn']:
             self._close()
             for shaft in values['shafts']:
@@ -140,6 +164,14 @@ class ChangeMonitor(MonitoringNode):
             self.faults[what] = reason
 
     # --- messages ---
+
+    def _on_state(self, message: Any) -> None:
+        numbers = [message.data] if self._state_type is Float64 else message.data
+        if len(numbers) != 1 + (self._state_type is Float64MultiArray):
+            raise MessageError(f'{len(numbers)} numbers: publish [time in s, value]')
+        self._state.add(numbers[-1], numbers[0])
+        if self._state_flow is not None:
+            self._state_flow.came()
 
     def _on_array(self, shaft: str, kind: str, message: Float64MultiArray) -> None:
         decoded = decode_average(kind, message)
@@ -232,16 +264,20 @@ class ChangeMonitor(MonitoringNode):
             'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
             'limits_passed': str(len(monitor.limits.passed())),
             'uncorrected': str(sum(item.uncorrected for item in found.values())),
+            **({'averages_discarded': str(monitor.discarded)} if self._state_flow else {}),
             'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
             'baseline_file': str(self._path or f'{_NOT_KEPT}, lost when the node ends')}
+        refusals = [f'{shaft}: {reason}' for shaft, reason in monitor.refusals.items() if reason]
+        if refusals:
+            return f'{monitor.discarded} averages discarded; {first_of(refusals)}', values
         if not found:
             return 'no average received yet', values
         if not monitor.is_complete:
             shaft, item = min(found.items(), key=lambda each: each[1].learned)
             enough = self._values['learning_averages']
             return (f'learning: {item.learned} of {enough} averages of {shaft} at '
-                    f'{item.speed:.4g} Hz' + (
-                        f', of {item.averages} at all speeds: a larger speed_bin learns sooner'
+                    f'{item.place}' + (
+                        f', of {item.averages} in all bins: larger ones learn sooner'
                         if item.averages > enough else ''), values)
         return (f'{changes} changes' if changes else
                 f'no change in {monitor.averages} averages'), values
