@@ -588,8 +588,10 @@ def diagnostic_keys():
     return keys
 
 
-# Other words in backticks: ROS's own, and the dimensions of arrays.
+# Other words in backticks: ROS's own, the dimensions of arrays, and a topic that is subscribed to
+# only where parameters use it.
 ORDINARY = {
+    'operating_state',
     'ros2', 'foxglove_bridge', 'joint_states', 'nan', 'diagnostic_aggregator', 'diagnostics_agg',
     *(folder + path.name for path in (ROOT / 'config').iterdir() for folder in ('', 'config/')),
     'channel', 'sample', 'angle', 'order', 'field', 'pulse', 'mark', 'indicator', 'time_ref',

@@ -224,6 +224,59 @@ def test_settings_of_the_machine_file_count(weeks, tmp_path):
     assert [item['kind'] for item in found['changes']] == ['bearing']
 
 
+@pytest.fixture(scope='module')
+def loads(tmp_path_factory):
+    """Return arguments for days of two loads, with a channel of the torque."""
+    place, days = tmp_path_factory.mktemp('loads'), {}
+    for number in range(1, 25):
+        content, load = day(number, depth=0.0), 1.0 + 2.0 * (11 < number < 23)
+        rng = np.random.default_rng([8, number])
+        torque = np.full(round(RATE * SECONDS), 100.0 * load + rng.standard_normal())
+        scale = load * np.exp(0.02 * rng.standard_normal()) / np.std(content['vibration'])
+        days[number] = {**content, 'vibration': [content['vibration'][0] * scale, torque],
+                        'channel_names': ['acc', 'torque']}
+    return (write(place / 'in', days), '--output', place / 'out', '--no-figures', '--baseline',
+            LEARNING, *SETTINGS)
+
+
+def test_a_load_that_changes_is_a_change_where_it_is_not_known(loads):
+    assert run(*loads) == 0
+    texts = [event['text'] for event in answer(loads[2])['events']]
+    assert any(text.startswith('order 19 of shaft, channel 0: +') for text in texts)
+
+
+def test_days_are_compared_with_days_of_their_load(loads, tmp_path):
+    assert run(*loads, '--state', 'torque', '-p', 'state_bin:=100') == 0
+    found = answer(loads[2])
+    assert [found[key] for key in ('changes', 'events', 'left_out')] == [[], [], {}]
+    assert found['baseline'] == {'averages': 2 * LEARNING, 'complete': True}
+    changes = find_changes(loads[2], found['recordings'], settings_of(
+        None, ['allow_uncorrected:=true', 'state_bin:=100.0'], LEARNING), state='1')
+    assert changes.baseline == tuple(
+        (number if number < 12 else number - 11) <= LEARNING for number in range(1, 25))
+    write_changes(tmp_path, changes, figure=True)
+    assert imread(tmp_path / 'changes.png').ndim == 3
+
+
+def test_averages_outside_the_gate_do_not_count(loads, capsys):
+    assert run(*loads, '--state', 'torque', '-p', 'state_highest:=200') == 0
+    found, told = answer(loads[2]), capsys.readouterr()
+    assert len(found['recordings']) == 13
+    assert found['left_out']['day_12'].endswith(' is above 200')
+    assert f'no change in 4 recordings after the baseline of {LEARNING}' in told.out
+
+
+@pytest.mark.parametrize(('arguments', 'text'), [
+    (('--state', 'power', '-p', 'state_bin:=80'), 'are the baseline: give 10 or more; their '
+     'averages are written; day_01 has no channel power'),
+    (('--state', 'torque'), 'average: --state needs state_bin, state_lowest or state_highest'),
+    (('-p', 'state_bin:=80'), 'average: state_bin, state_lowest and state_highest need --state'),
+    (('--state', 'torque', '-p', 'state_bin:=-1'), 'average: state_bin is -1: give at least 0')])
+def test_a_wrong_state_is_one_line(loads, arguments, text, capsys):
+    assert run(*loads, *arguments) == 2
+    assert text in capsys.readouterr().err.splitlines()[-1]
+
+
 def alarms(kept, learning, *, known):
     """Return the share of series of 45 days, which remember a part of the day before, with one."""
     rng, units, quantities = np.random.default_rng(9), 200, 12

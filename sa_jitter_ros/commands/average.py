@@ -28,6 +28,7 @@ from sa_jitter_ros.commands.command_line import (
     add_fleet_options, add_recording_options, few_collections, Parser, read_options, show)
 from sa_jitter_ros.commands.fleet_run import recordings_of, run_to_end, work_through
 from sa_jitter_ros.commands.progress import Progress
+from sa_jitter_ros.errors import ParameterError
 from sa_jitter_ros.monitoring.change_test import LEAST_LEARNED
 from sa_jitter_ros.monitoring.monitor import Settings
 from sa_jitter_ros.offline.average_recording import average_file, AverageJob, Row
@@ -54,6 +55,9 @@ def make_parser() -> Parser:
                         help='the recordings are those of one machine, in order of time, and the '
                         'first N of them (at least 8) its normal state: say what has changed '
                         f'since; -p also takes {", ".join(SETTINGS)}')
+    parser.add_argument('--state', default='', metavar='CHANNEL', help='with --baseline: name or '
+                        'number of the channel whose mean is the operating state, for '
+                        'state_bin, state_lowest and state_highest')
     parser.add_argument('--output', type=Path, required=True, metavar='DIR',
                         help='folder for the results')
     parser.add_argument('--no-figures', action='store_true',
@@ -78,10 +82,17 @@ def settings_for_changes(options: argparse.Namespace) -> Settings | None:
     Its parameters are taken out of the given ones.
     """
     if options.baseline is None:
+        if options.state:
+            raise ParameterError('--state needs --baseline')
         return None
     of_monitor = [text for text in options.given if text.partition(':=')[0] in SETTINGS]
     options.given = [text for text in options.given if text not in of_monitor]
-    return settings_of(options.params, of_monitor, options.baseline)
+    settings = settings_of(options.params, of_monitor, options.baseline)
+    if settings.uses_state != bool(options.state):
+        raise ParameterError('--state needs state_bin, state_lowest or state_highest'
+                             if options.state else 'state_bin, state_lowest and state_highest '
+                             'need --state CHANNEL')
+    return settings
 
 
 def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
@@ -95,7 +106,7 @@ def jobs_of(options: argparse.Namespace) -> tuple[list[AverageJob], list[Row]]:
     keywords, fields = read_options(options), tuple(fields_of(options.fields))
     return [AverageJob(
         item.name, os.path.abspath(item.path), str(output / item.name), machine, keywords, fields,
-        not options.no_figures) for item in found if not item.error], [
+        not options.no_figures, options.state) for item in found if not item.error], [
             Row(item.name, str(item.path), item.error) for item in found if item.error]
 
 
@@ -125,7 +136,7 @@ def run(options: argparse.Namespace, progress: Progress, *, changes: list[Change
         averaged = {row.recording for row in rows if row.averages}
         found = find_changes(
             options.output, [job.name for job in jobs if job.name in averaged], settings,
-            jobs[0].machine.machine)
+            jobs[0].machine.machine, state=options.state)
         write_changes(options.output, found, figure=not options.no_figures)
         if not options.no_figures:
             from sa_jitter_ros.offline.machine_page import PAGE, write_page

@@ -264,7 +264,7 @@ class ChangeMonitor(MonitoringNode):
             'baseline_complete': str(monitor.is_complete).lower(), 'changes': str(changes),
             'limits_passed': str(len(monitor.limits.passed())),
             'uncorrected': str(sum(item.uncorrected for item in found.values())),
-            **({'averages_discarded': str(monitor.discarded)} if self._state_flow else {}),
+            'averages_discarded': str(monitor.discarded),
             'averages_beyond_bins': str(sum(item.beyond for item in found.values())),
             'baseline_file': str(self._path or f'{_NOT_KEPT}, lost when the node ends')}
         refusals = [f'{shaft}: {reason}' for shaft, reason in monitor.refusals.items() if reason]

@@ -54,7 +54,8 @@ class AverageJob:
     """
     One recording to average: its `name` in the results, its `path` and the folder of its files.
 
-    `options` are keywords of `read`; `fields` among them are those that the user gave.
+    `options` are keywords of `read`; `fields` among them are those that the user gave. The channel
+    `state`, a name or a number, may be constant.
     """
 
     name: str
@@ -64,6 +65,7 @@ class AverageJob:
     options: Mapping[str, Any] = field(default_factory=dict)
     fields: tuple[str, ...] = ()
     figures: bool = True
+    state: str = ''
 
 
 @dataclass(frozen=True)
@@ -212,14 +214,16 @@ def _row(values: Mapping[str, Any]) -> Row:
 def _settings(job: AverageJob) -> dict[str, Any]:
     """Return all that decides the files, as values of JSON; raises RecordingError."""
     return {'version': _VERSION, 'files': stamp(Path(job.path)), 'path': job.path,
-            'figures': job.figures, 'options': json_values(job.options),
+            'figures': job.figures, 'state': job.state, 'options': json_values(job.options),
             'averager': dict(job.machine.averager), 'hardware_id': job.machine.hardware_id,
             'machine': dict(job.machine.parts), 'detector': dict(job.machine.detector)}
 
 
 def _averaged(job: AverageJob, settings: Mapping[str, Any], progress: Progress | None) -> Row:
     recording = read(job.path, **job.options)
-    faults = channel_faults(recording)
+    faults = {channel: reason for channel, reason in channel_faults(recording).items()
+              if not job.state or job.state not in (
+                  str(channel), recording.channel_names[channel])}
     lost = {channel for channel, reason in faults.items() if is_lost(reason)}
     kept = [k for k in range(recording.channels) if k not in lost] or range(recording.channels)
     several = '' if recording.acquisitions == 1 else (

@@ -10,10 +10,13 @@
 
 """Figure of what has changed: the trends of the quantities over all recordings."""
 
+from collections.abc import Mapping
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.averaging.indicators import IN_UNIT
+from sa_jitter_ros.monitoring.monitor import ShaftMonitor
 from sa_jitter_ros.offline.changes import Changes, Key, key_of
 from sa_jitter_ros.offline.plotting import Array, draw_limits, legend_under, MARK, MEASURED
 
@@ -23,11 +26,12 @@ _MOST_TICKS = 12
 
 def changes_figure(changes: Changes) -> Figure:
     """Draw what has changed, the most certain first, then what is farthest from its baseline."""
-    chosen = _chosen(changes)
+    levels = {shaft: _levels(changes, monitor) for shaft, monitor in changes.monitors.items()}
+    chosen = _chosen(changes, levels)
     figure = Figure(figsize=(9.0, 1.5 * len(chosen) + 1.2), layout='constrained')
     panels = figure.subplots(len(chosen), sharex=True, squeeze=False)[:, 0]
     for axes, key in zip(panels, chosen):
-        _draw(axes, changes, key)
+        _draw(axes, changes, key, levels)
     names = [item.name for item in changes.recordings]
     places = np.arange(0, len(names), -(-len(names) // _MOST_TICKS))
     panels[-1].set_xticks(places, [names[place] for place in places], rotation=30, ha='right',
@@ -38,7 +42,19 @@ def changes_figure(changes: Changes) -> Figure:
     return figure
 
 
-def _chosen(changes: Changes) -> list[Key]:
+def _levels(changes: Changes, monitor: ShaftMonitor) -> Array:
+    """
+    Return mean and scatter of the baseline for each recording.
+
+    They are (2, recording, channel, quantity), of the bin of the recording.
+    """
+    unknown = np.full((2, *monitor.layout.shape), np.nan)
+    known = [monitor.baseline(1.0, item.state) for item in changes.recordings]
+    return np.stack([unknown if item is None else np.stack((item.mean, item.scatter))
+                     for item in known], axis=1)
+
+
+def _chosen(changes: Changes, levels: Mapping[str, Array]) -> list[Key]:
     """Return the quantities that are drawn."""
     keys = [(item.shaft, item.channel, *item.quantity) for item in changes.limits.passed()]
     keys += [key_of(item) for item in changes.changes]
@@ -47,45 +63,44 @@ def _chosen(changes: Changes) -> list[Key]:
         for channel in range(monitor.layout.channels):
             for quantity in monitor.layout.quantities:
                 key = shaft, channel, *quantity
-                values, mean, scatter = _trend(changes, key)
-                late = np.abs(values[changes.learning:] - mean) / scatter
+                values, mean, scatter = _trend(changes, key, levels)
+                late = (np.abs(values - mean) / scatter)[~np.array(changes.baseline)]
                 if np.isfinite(late).any():
                     far.append((float(np.nanmedian(late)), key))
     return [*dict.fromkeys([*keys, *(key for _, key in sorted(far, reverse=True))])][:_PANELS]
 
 
-def _trend(changes: Changes, key: Key) -> tuple[Array, float, float]:
-    """Return the values of all recordings, and mean and scatter of the baseline."""
+def _trend(changes: Changes, key: Key, levels: Mapping[str, Array]) -> tuple[Array, Array, Array]:
+    """Return the values of all recordings, and mean and scatter of the baseline of each."""
     shaft, channel, *quantity = key
     monitor = changes.monitors[shaft]
     place = monitor.layout.quantities.index(tuple(quantity))
     rows = [item.means[shaft].fitted(monitor.layout) if shaft in item.means else None
             for item in changes.recordings]
     values = np.array([np.nan if row is None else row.values[channel, place] for row in rows])
-    known = monitor.baseline(1.0)
-    assert known is not None
-    return values, float(known.mean[channel, place]), float(known.scatter[channel, place])
+    mean, scatter = levels[shaft][:, :, channel, place]
+    return values, mean, scatter
 
 
-def _draw(axes: Axes, changes: Changes, key: Key) -> None:
-    values, mean, scatter = _trend(changes, key)
+def _draw(axes: Axes, changes: Changes, key: Key, levels: Mapping[str, Array]) -> None:
+    values, mean, scatter = _trend(changes, key, levels)
     shaft, channel, kind, name = key
 
-    def unit(value: Array | float) -> Array:
+    def unit(value: Array) -> Array:
         return np.sqrt(np.maximum(value, 0.0)) if kind == 'order' else np.exp(value)
 
     low, middle, high = unit(np.array([mean - 2.0 * scatter, mean, mean + 2.0 * scatter]))
-    axes.axvspan(-0.5, changes.learning - 0.5, color='0.93', linewidth=0.0, label='baseline')
-    axes.axhspan(low, high, color='tab:blue', alpha=0.15, linewidth=0.0,
-                 label='its mean ± 2 standard deviations')
-    axes.axhline(middle, color='tab:blue', linewidth=0.8)
-    axes.plot(np.arange(values.size), unit(values), '.-', color=MEASURED, linewidth=0.6,
-              markersize=4.0)
-    layout, usual = changes.monitors[shaft].layout, changes.monitors[shaft].usual()
-    place = layout.quantities.index((kind, name))
-    draw_limits(axes, [(level, bound * usual[channel, place] if relative else bound)
+    number = np.arange(values.size)
+    axes.bar(number[np.array(changes.baseline)], 1.0, 1.0, color='0.93', linewidth=0.0,
+             transform=axes.get_xaxis_transform(), label='baseline')
+    axes.fill_between(number, low, high, step='mid', color='tab:blue', alpha=0.15, linewidth=0.0,
+                      label='its mean ± 2 standard deviations')
+    axes.step(number, middle, where='mid', color='tab:blue', linewidth=0.8)
+    axes.plot(number, unit(values), '.-', color=MEASURED, linewidth=0.6, markersize=4.0)
+    layout = changes.monitors[shaft].layout
+    draw_limits(axes, [(level, bound * middle if relative else bound)
                        for level, bound, relative in changes.limits.bounds(
-                           shaft, layout, channel, place)])
+                           shaft, layout, channel, layout.quantities.index((kind, name)))])
     title = f'{changes.monitors[shaft].words(kind, name)} of {shaft}, channel {channel}'
     change = next((item for item in changes.changes if key_of(item) == key), None)
     if change is not None:

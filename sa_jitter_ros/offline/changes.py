@@ -33,6 +33,7 @@ from sa_jitter_ros.monitoring.change_test import memory_of
 from sa_jitter_ros.monitoring.limits import LimitWatch, PassedLimit
 from sa_jitter_ros.monitoring.machine_monitor import KINDS
 from sa_jitter_ros.monitoring.monitor import Change, PARAMETERS, Settings, ShaftMonitor
+from sa_jitter_ros.monitoring.operating import OperatingBins
 from sa_jitter_ros.monitoring.quantities import (
     mean_of, monitored, MonitoredAverage)
 from sa_jitter_ros.offline.files import ARRAYS
@@ -42,8 +43,9 @@ from sa_jitter_ros.parameter_file import value_of
 CHANGES, FIGURE = 'changes.json', 'changes.png'
 MONITOR = 'change_monitor'
 #: Parameters of the node that count here, too.
-SETTINGS = {item.name: item for item in PARAMETERS
-            if item.name in ('false_alarms_per_year', 'speed_bin', 'allow_uncorrected')}
+SETTINGS = {item.name: item for item in PARAMETERS if item.name in (
+    'false_alarms_per_year', 'speed_bin', 'allow_uncorrected', 'state_bin', 'state_lowest',
+    'state_highest')}
 Key = tuple[str, int, str, str]  # shaft, channel, kind and name of a quantity
 _INTERVAL = 86400.0  # s between recordings that do not say their time
 _MOST_LINES = 6
@@ -58,7 +60,8 @@ class Recorded:
     """
     A recording: its `name`, `start` and `end` (s), `speed` (Hz), and numbers of its channels.
 
-    `means` are those of the averages of each shaft; channels have `units` and `channel_names`.
+    `means` are those of the averages of each shaft at a `state` that counts, without those
+    `discarded`; channels have `units` and `channel_names`. `reason` says why it is not compared.
     """
 
     name: str
@@ -69,6 +72,9 @@ class Recorded:
     means: Mapping[str, MonitoredAverage]
     units: tuple[str, ...] = ()
     channel_names: tuple[str, ...] = ()
+    state: float = math.nan
+    discarded: int = 0
+    reason: str = ''
 
 
 @dataclass(frozen=True)
@@ -84,17 +90,23 @@ class Changes:
     """
     What the monitors of the shafts found in `recordings`, in order of time.
 
-    The first `learning` are the baseline. `left_out` are reasons by the names of recordings;
-    `found` are those with which the present `changes` were found, `limits` the machine's.
+    Those of `baseline`, the first ones of each bin of the state, are learnt. `left_out` are
+    reasons by the names of recordings; `found` are those with which the present `changes` were
+    found, `limits` the machine's.
     """
 
-    learning: int
+    baseline: tuple[bool, ...]
     recordings: tuple[Recorded, ...]
     left_out: Mapping[str, str]
     monitors: Mapping[str, ShaftMonitor]
     events: tuple[Event, ...]
     found: Mapping[Key, str]
     limits: LimitWatch
+
+    @property
+    def learning(self) -> int:
+        """Return the number of recordings that are the baseline."""
+        return sum(self.baseline)
 
     @property
     def changes(self) -> list[Change]:
@@ -125,10 +137,13 @@ class Changes:
 
     def warnings(self) -> list[str]:
         """Return what is not compared, and what to do about it."""
+        discarded = sum(item.discarded for item in self.recordings)
         missing = sum(not all(mean.is_corrected for mean in item.means.values())
                       for item in self.recordings)
         return [*(f'{name} is not compared: it {reason}' for name, reason in
                   self.left_out.items()), *self.limits.warnings(),
+                *([f'{discarded} averages are discarded, because their operating state is outside '
+                   'state_lowest to state_highest'] if discarded else []),
                 *(f'no bearing of {shaft} is watched, and averages do not show its faults: give '
                   f'{shaft}.bearing_orders' for shaft, monitor in self.monitors.items()
                   if not monitor.layout.bearings),
@@ -174,19 +189,22 @@ def settings_of(params: Path | None, given: Sequence[str], learning: int) -> Set
 
 
 def find_changes(output: Path, names: Sequence[str], settings: Settings,
-                 machine: Machine = UNKNOWN) -> Changes:
+                 machine: Machine = UNKNOWN, *, state: str = '') -> Changes:
     """
     Return what has changed in recordings that are averaged in the folders `names` of `output`.
 
-    The `machine` names the orders.
+    The `machine` names the orders. The mean of the channel `state`, a name or a number, is the
+    operating state; it is not monitored itself.
     Raises RecordingError if too few of them can be compared.
     """
-    if not names:
-        raise _too_few(names, settings.learning_averages)
-    tables = {name: _tables(output / name / ARRAYS) for name in names}
+    tables = {name: _tables(output / name / ARRAYS, state) for name in names}
     orders = _common_orders(tables.values())
-    recorded = [_recorded(name, arrays, orders, settings) for name, arrays in tables.items()]
-    left_out: dict[str, str] = {}
+    recorded = [_recorded(name, arrays, orders, settings, state)
+                for name, arrays in tables.items()]
+    left_out = {item.name: item.reason for item in recorded if item.reason}
+    recorded = [item for item in recorded if not item.reason]
+    if not recorded:
+        raise _too_few(recorded, settings, left_out)
     usual, _ = Counter(item.channels for item in recorded).most_common(1)[0]
     for item in recorded:
         if item.channels != usual:
@@ -195,30 +213,63 @@ def find_changes(output: Path, names: Sequence[str], settings: Settings,
     recorded = [item for item in recorded if item.name not in left_out]
     apart = _in_time(recorded)
     recorded = apart or recorded
-    learning = settings.learning_averages
-    speeds = [item.speed for item in recorded[:learning]]
+    learnt = [item for item, known in zip(recorded, _baseline(recorded, settings)) if known]
+    speeds = [item.speed for item in learnt]
     low, high = min(speeds), max(speeds)
-    for item in recorded[learning:]:
+    for item in recorded:
         if not low / (1.0 + settings.speed_bin) <= item.speed <= high * (1.0 + settings.speed_bin):
             left_out[item.name] = (f'turns at {item.speed:.4g} Hz, the baseline at {low:.4g} to '
                                    f'{high:.4g} Hz: a longer baseline, or a larger speed_bin, '
                                    'compares it')
     recorded = [item for item in recorded if item.name not in left_out]
-    if len(recorded) <= learning:
-        raise _too_few(recorded, learning)
+    if all(_baseline(recorded, settings)):
+        raise _too_few(recorded, settings, left_out)
     return _watched(recorded, left_out, settings, machine, clock=bool(apart))
 
 
-def _too_few(recorded: Sequence[Any], learning: int) -> RecordingError:
-    return RecordingError(f'{len(recorded)} recordings can be compared, and {learning} are the '
-                          f'baseline: give {learning + 1} or more; their averages are written')
+def _too_few(recorded: Sequence[Any], settings: Settings, left_out: Mapping[str, str]
+             ) -> RecordingError:
+    learning = settings.learning_averages
+    of_bin = ' of each state_bin' if settings.state_bin else ''
+    first = next((f'; {name} {reason}' for name, reason in left_out.items()), '')
+    return RecordingError(f'{len(recorded)} recordings can be compared, and {learning}{of_bin} '
+                          f'are the baseline: give {learning + 1} or more; their averages are '
+                          f'written{first}')
 
 
-def _tables(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a recording, without those over the angle."""
+def _bins(recorded: Sequence[Recorded], settings: Settings) -> list[int | None]:
+    """Return the bin of the state of each recording."""
+    bins = OperatingBins(1.0, settings.state_bin)
+    return [bins.key(1.0, item.state) for item in recorded]
+
+
+def _baseline(recorded: Sequence[Recorded], settings: Settings) -> tuple[bool, ...]:
+    """Return whether each recording is among the first of its bin, which are learnt."""
+    bins = _bins(recorded, settings)
+    return tuple(bins[:place].count(key) < settings.learning_averages
+                 for place, key in enumerate(bins))
+
+
+def _tables(path: Path, state: str) -> dict[str, NDArray[Any]]:
+    """
+    Return the arrays of a recording, without those over the angle.
+
+    The channel `state` is taken out, if there is one, and its means are in `<shaft>_state`.
+    """
     with np.load(path) as arrays:
-        return {name: arrays[name] for name in arrays.files if name.endswith(
+        found = {name: arrays[name] for name in arrays.files if name.endswith(
             (*KINDS, *_HEADER, *_NAMES)) or name in ('shafts', 'channels', 'units')}
+        labels = zip(found['channels'].tolist(), found['channel_names'].tolist())
+        for place, label in enumerate(labels):
+            if state and state in map(str, label):
+                for shaft in found['shafts'].tolist():
+                    found[f'{shaft}_state'] = arrays[f'{shaft}_waveform'][:, place].mean(axis=-1)
+                for name in found.keys() & {'channels', 'channel_names', 'units'}:
+                    found[name] = np.delete(found[name], place)
+                for name in [name for name in found if name.endswith(KINDS)]:
+                    found[name] = np.delete(found[name], place, axis=1)
+                break
+    return found
 
 
 def _common_orders(tables: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, list[float]]:
@@ -232,24 +283,39 @@ def _common_orders(tables: Iterable[Mapping[str, NDArray[Any]]]) -> dict[str, li
 
 
 def _recorded(name: str, arrays: Mapping[str, NDArray[Any]], orders: Mapping[str, list[float]],
-              settings: Settings) -> Recorded:
-    means = {}
+              settings: Settings, state: str) -> Recorded:
+    means: dict[str, MonitoredAverage] = {}
+    discarded, refusal = 0, f'has no channel {state}'
     for shaft in arrays['shafts'].tolist():
         tables = {kind: arrays[f'{shaft}_{kind}'] for kind in KINDS if f'{shaft}_{kind}' in arrays}
         labels = {kind: next(tuple(arrays[f'{shaft}_{kind}{name}'].tolist()) for name in _NAMES
                              if f'{shaft}_{kind}{name}' in arrays) for kind in tables}
-        kept = np.isin(tables[KINDS[0]][0, 0, :, 0], orders[shaft])
-        tables[KINDS[0]] = tables[KINDS[0]][:, :, kept]
+        common = np.isin(tables[KINDS[0]][0, 0, :, 0], orders[shaft])
+        tables[KINDS[0]] = tables[KINDS[0]][:, :, common]
         headers = [AverageHeader(*row) for row in zip(*(
             arrays[f'{shaft}_{part}'].tolist() for part in _HEADER))]
         parts = [{kind: AverageMessage(header, table[place], labels[kind])
                   for kind, table in tables.items()} for place, header in enumerate(headers)]
-        means[shaft] = mean_of([
+        averages = [
             monitored(part[KINDS[0]], *(part.get(kind) for kind in KINDS[1:]),
-                      allow_uncorrected=settings.allow_uncorrected) for part in parts])
-    return Recorded(name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
-                    float(arrays['trigger_speed'].mean()), tuple(arrays['channels'].tolist()),
-                    means, *(tuple(arrays[key].tolist()) for key in ('units', 'channel_names')))
+                      allow_uncorrected=settings.allow_uncorrected) for part in parts]
+        if state:
+            averages = [replace(item, state=float(value)) for item, value in zip(
+                averages, arrays.get(f'{shaft}_state', ()))]
+        kept = [item for item in averages if not settings.refusal(item.state)]
+        discarded += len(averages) - len(kept)
+        if kept:
+            means[shaft] = mean_of(kept)
+        elif averages:
+            refusal = f'has no average that counts: {settings.refusal(averages[-1].state)}'
+    channels = tuple(arrays['channels'].tolist())
+    first = next(iter(means.values()), None)
+    return Recorded(
+        name, float(arrays['start_time'][0]), float(arrays['end_time'][-1]),
+        math.nan if first is None else first.header.mean_trigger_speed, channels, means,
+        tuple(arrays['units'].tolist()), tuple(arrays['channel_names'].tolist()),
+        math.nan if first is None else first.state, discarded,
+        refusal if first is None else '' if channels else f'has no channel beside {state}')
 
 
 def _listed(channels: Sequence[int]) -> str:
@@ -266,12 +332,16 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
              machine: Machine, *, clock: bool) -> Changes:
     """Return what the monitors of all shafts find."""
     shafts = dict.fromkeys(shaft for item in recorded for shaft in item.means)
+    bins = _bins(recorded, settings)
     monitors = {}
     for shaft in shafts:
         layout = max((item.means[shaft].layout for item in recorded if shaft in item.means),
                      key=lambda layout: layout.shape)
-        baseline = [fitted.values.ravel() for item in recorded[:settings.learning_averages]
-                    if shaft in item.means and (fitted := item.means[shaft].fitted(layout))]
+        # Of the fullest bin: in others the machine has another load.
+        fullest, _ = Counter(bins).most_common(1)[0]
+        baseline = [fitted.values.ravel() for item, key, known in zip(
+            recorded, bins, _baseline(recorded, settings)) if known and key == fullest
+            and shaft in item.means and (fitted := item.means[shaft].fitted(layout))]
         monitors[shaft] = ShaftMonitor(shaft, layout, settings, share=1.0 / len(shafts),
                                        memory=memory_of(np.array(baseline)), machine=machine)
     channels = [(str(number), name) for number, name in zip(
@@ -286,7 +356,7 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 continue
             mean = item.means[shaft]
             # Which speeds compare is decided already: all are in one bin.
-            mean = replace(mean, header=replace(
+            mean = replace(mean, state=item.state, header=replace(
                 mean.header, sequence=number, mean_trigger_speed=1.0,
                 start_time=item.start if clock else math.nan,
                 end_time=item.end if clock else number * _INTERVAL))
@@ -302,5 +372,5 @@ def _watched(recorded: Sequence[Recorded], left_out: Mapping[str, str], settings
                 del found[key]
                 events.append(Event(item.name, f'{monitor.words(*key[2:])} of {shaft}, channel '
                                                f'{key[1]} is back at its baseline'))
-    return Changes(settings.learning_averages, tuple(recorded), left_out, monitors, tuple(events),
-                   found, limits)
+    return Changes(_baseline(recorded, settings), tuple(recorded), left_out, monitors,
+                   tuple(events), found, limits)

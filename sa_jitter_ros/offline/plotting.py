@@ -65,11 +65,20 @@ def rows_of_channels(signals: Signals, channels: list[int], *, height: float = 2
     return figure, panels
 
 
-def draw_limits(axes: Axes, bounds: Iterable[tuple[str, float]], name: str = '') -> None:
-    """Draw limits, level and bound, as lines with their level, and the name of the quantity."""
+def draw_limits(axes: Axes, bounds: Iterable[tuple[str, Any]], name: str = '') -> None:
+    """
+    Draw limits, level and bound, as lines with their level, and the name of the quantity.
+
+    A bound is one number, or an array with one for each of the points 0, 1, ... of the axis.
+    """
     for level, bound in bounds:
-        axes.axhline(bound, color=_LEVELS[level], linestyle='--', linewidth=1.0)
-        axes.annotate(f'{level} {name}'.rstrip(), (0.995, bound), ha='right', va='bottom',
+        if np.ndim(bound):
+            axes.step(np.arange(bound.size), bound, where='mid', color=_LEVELS[level],
+                      linestyle='--', linewidth=1.0)
+        else:
+            axes.axhline(bound, color=_LEVELS[level], linestyle='--', linewidth=1.0)
+        last = float(np.ravel(bound)[-1])
+        axes.annotate(f'{level} {name}'.rstrip(), (0.995, last), ha='right', va='bottom',
                       xycoords=('axes fraction', 'data'), fontsize='x-small',
                       color=_LEVELS[level])
 
