@@ -151,6 +151,12 @@ def test_what_the_averages_lack_is_said():
         'input', 'output']), DrawnMachine(12)
     watch.update('input', machine.average())
     assert watch.missing == {'one': 'the averages of input lack order 3: see input.orders'}
+    average = machine.average()
+    average.readings[1, 0, 1] = np.nan
+    watch = watch_of(warn=1.0)
+    watch.update('input', average)
+    assert watch.missing == {
+        'one': 'order 19 of input has no standard error: take more trigger cycles'}
     watch = watch_of(channel=4, warn=1.0)
     watch.update('input', machine.average())
     assert watch.missing == {'one': 'no channel 4 among 0, 1'}

@@ -35,6 +35,7 @@ FloatArray = NDArray[np.float64]
 Labels = Callable[[int], Sequence[Sequence[str]]]
 
 _HALF = 1.96  # of a 95 % interval, standard errors
+_PARAMETERS = {'order': 'orders', 'bearing': 'bearing_orders', 'indicator': 'mesh_orders'}
 _SAME = 1e-5  # by which an order may differ from that of a limit, relative
 
 
@@ -91,6 +92,22 @@ baseline), since day 3'
                 f'{self.bound:.4g} ({self.level}{times}), since {since}')
 
 
+@dataclass(frozen=True)
+class _Watched:
+    """A limit of a shaft: of an order and the kinds of quantities that it may be, or by name."""
+
+    shaft: str
+    limit: Limit
+    kinds: tuple[str, ...]
+    order: float
+
+    def is_of(self, kind: str, name: str) -> bool:
+        """Return whether the limit is that of a quantity."""
+        return kind in self.kinds and (
+            name == self.limit.indicator if kind == 'indicator'
+            else abs(float(name) - self.order) <= _SAME * self.order)
+
+
 class LimitWatch:
     """
     Which limits of a machine are passed, by the averages of its `shafts`.
@@ -107,7 +124,7 @@ class LimitWatch:
         self._labels = labels or (lambda count: [[str(place)] for place in range(count)])
         self._since = since
         self._machine = machine
-        self._limits: dict[str, tuple[str, Limit]] = {}
+        self._limits: dict[str, _Watched] = {}
         self._passed: dict[tuple[str, int], PassedLimit] = {}
         #: Why limits are not watched, by their names.
         self.missing: dict[str, str] = {}
@@ -123,7 +140,11 @@ class LimitWatch:
                     f'machine.channels ({", ".join(named) or "none is declared"}), or a number '
                     'from 0')
             shaft = _shaft_of(place, limit, machine, shafts)
-            self._limits[name] = shaft, limit
+            kinds: tuple[str, ...] = ('indicator',) if limit.indicator else ('order', 'bearing')
+            if limit.part:
+                kinds = kinds[limit.part in machine.bearing_orders(shaft):][:1]
+            self._limits[name] = _Watched(shaft, limit, kinds, (
+                machine.orders(shaft)[limit.part] if limit.part else limit.order or math.nan))
             if shaft not in shafts:
                 self.missing[name] = f'{shaft} is not monitored: add it to shafts'
 
@@ -150,19 +171,22 @@ class LimitWatch:
         """
         usual = np.full(average.layout.shape, np.nan) if usual is None else usual
         lines = []
-        for name, (of, limit) in self._limits.items():
-            if of != shaft:
+        for name, item in self._limits.items():
+            if item.shaft != shaft:
                 continue
-            channels, quantity = self._places(shaft, limit, average.layout)
+            channels, quantity = self._places(item, average.layout)
             self.missing.pop(name, None)
             if not channels:
-                names = [item[-1] for item in self._labels(average.layout.channels)]
-                self.missing[name] = f'no channel {limit.channel} among {", ".join(names)}'
+                names = [label[-1] for label in self._labels(average.layout.channels)]
+                self.missing[name] = f'no channel {item.limit.channel} among {", ".join(names)}'
             elif quantity is None:
-                self.missing[name] = (
-                    f'the averages of {shaft} lack {_asked(limit)}: see '
-                    f'{shaft}.{"mesh_orders" if limit.indicator else "orders"}')
+                self.missing[name] = (f'the averages of {shaft} lack {_asked(item.limit)}: see '
+                                      f'{shaft}.{_PARAMETERS[item.kinds[0]]}')
             else:
+                values, noise = average.readings[:2, channels, quantity]
+                if np.isfinite(values).any() and not np.isfinite(values + noise).any():
+                    self.missing[name] = (f'{_asked(item.limit)} of {shaft} has no standard error:'
+                                          ' take more trigger cycles')
                 for channel in channels:
                     lines += self._judge(name, channel, quantity, average,
                                          float(usual[channel, quantity]))
@@ -171,32 +195,22 @@ class LimitWatch:
     def bounds(self, shaft: str, layout: Layout, channel: int, quantity: int) -> list[
             tuple[str, float, bool]]:
         """Return level, bound and whether it is relative of all limits of a quantity."""
-        return [(level, bound, bool(limit.relative)) for of, limit in self._limits.values()
-                if of == shaft for level, bound in limit.bounds.items()
-                for channels, place in [self._places(shaft, limit, layout)]
+        return [(level, bound, bool(item.limit.relative)) for item in self._limits.values()
+                if item.shaft == shaft for level, bound in item.limit.bounds.items()
+                for channels, place in [self._places(item, layout)]
                 if channel in channels and place == quantity]
 
-    def _places(self, shaft: str, limit: Limit, layout: Layout) -> tuple[list[int], int | None]:
-        """Return the places of a limit: of its channels and of its quantity."""
+    def _places(self, item: _Watched, layout: Layout) -> tuple[list[int], int | None]:
+        """Return the places of a limit: of its channels, and of its quantity if there is one."""
         return [place for place, known in enumerate(self._labels(layout.channels))
-                if limit.channel in (None, *known)], self._quantity(shaft, limit, layout)
-
-    def _quantity(self, shaft: str, limit: Limit, layout: Layout) -> int | None:
-        """Return the place of what a limit is for, None where the averages lack it."""
-        names = [name for _, name in layout.quantities]
-        if limit.indicator is not None:
-            return names.index(limit.indicator) if limit.indicator in names else None
-        kinds: tuple[str, ...] = ('order', 'bearing')
-        if limit.part:
-            kinds = kinds[limit.part in self._machine.bearing_orders(shaft):][:1]
-        order = limit.order or self._machine.orders(shaft)[str(limit.part)]
-        return next((place for place, (kind, name) in enumerate(layout.quantities)
-                     if kind in kinds and abs(float(name) - order) <= _SAME * order), None)
+                if item.limit.channel in (None, *known)], next(
+            (place for place, quantity in enumerate(layout.quantities) if item.is_of(*quantity)),
+            None)
 
     def _judge(self, name: str, channel: int, quantity: int, average: MonitoredAverage,
                usual: float) -> list[str]:
         """Judge one value by a limit; return the line that says so if its level is another."""
-        shaft, limit = self._limits[name]
+        shaft, limit = self._limits[name].shaft, self._limits[name].limit
         before = self._passed.get((name, channel))
         value, noise, doubt, corrected = average.readings[:, channel, quantity].tolist()
         error = math.sqrt(noise + doubt**2)
