@@ -30,7 +30,7 @@ from sa_jitter_ros.effects.evidence import Evidence, LineEvidence
 from sa_jitter_ros.effects.lattice import Clock
 from sa_jitter_ros.effects.speed_fluctuation import SpeedFluctuation
 from sa_jitter_ros.effects.timing import Setting, SOURCE
-from sa_jitter_ros.inference.limits import Limit, limits
+from sa_jitter_ros.inference.limits import EffectLimit, limits
 from sa_jitter_ros.inference.timing import read_timing
 from sa_jitter_ros.inference.timing_data import steering, Stretch
 from sa_jitter_ros.prediction.influence import AveragePulses
@@ -163,7 +163,7 @@ def limit_of(drawn: Stretch | Evidence, name: str) -> float:
     return np.inf if limit.upper is None else limit.upper
 
 
-def _limit(drawn: Stretch | Evidence, name: str) -> Limit:
+def _limit(drawn: Stretch | Evidence, name: str) -> EffectLimit:
     timing = read_timing([drawn], names=frozenset()) if isinstance(drawn, Stretch) else None
     (found,) = limits(timing, drawn if isinstance(drawn, Evidence) else lines(0),
                       list(EFFECTS.keys() - {name}))
@@ -191,13 +191,13 @@ class Case:
     slowest: bool = False
     interval: bool = False
 
-    def size(self, limit: Limit) -> float:
+    def size(self, limit: EffectLimit) -> float:
         """Return the size of a limit."""
         if self.slowest:
             return 1.0 / limit.lower if limit.lower else np.inf
         return (np.inf if limit.upper is None else limit.upper) - self.interval
 
-    def covers(self, limit: Limit, size: float) -> bool:
+    def covers(self, limit: EffectLimit, size: float) -> bool:
         """Return whether a limit admits a size."""
         lowest = limit.lower if self.interval and limit.lower is not None else 0.0
         return bool(self.size(limit) >= size * (1.0 - _ROUNDED) and size + self.interval >= lowest)

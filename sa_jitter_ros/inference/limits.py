@@ -46,7 +46,7 @@ _STEPS, _EXACT = 20, 0.01  # of a logarithm of power
 
 
 @dataclass(frozen=True)
-class Limit:
+class EffectLimit:
     """
     What of an effect could still be there.
 
@@ -63,7 +63,7 @@ class Limit:
 
 
 def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
-           ) -> tuple[Limit, ...]:
+           ) -> tuple[EffectLimit, ...]:
     """Return the limit of each effect that was not `found`; `evidence` may hold pulses alone."""
     rows = []
     for name, kind in EFFECTS.items():
@@ -85,7 +85,7 @@ def limits(timing: Timing | None, evidence: Evidence, found: Sequence[str]
         else:
             effect = largest(timing, name)
         parameter, limit = next(iter(parameter_ranges(kind).items()))
-        rows.append(Limit(name, parameter, limit.unit, _size(effect), lower, effect))
+        rows.append(EffectLimit(name, parameter, limit.unit, _size(effect), lower, effect))
     return tuple(rows)
 
 

@@ -23,7 +23,7 @@ from sa_jitter_ros.inference.candidates import Candidate
 from sa_jitter_ros.inference.dependence import Dependence
 from sa_jitter_ros.inference.expectation import Expectation, Lines
 from sa_jitter_ros.inference.gate import NO_GAIN, ScoreGain
-from sa_jitter_ros.inference.limits import Limit
+from sa_jitter_ros.inference.limits import EffectLimit
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.residual import Residual, UNDEFINED
 from sa_jitter_ros.inference.timing import Timing
@@ -79,7 +79,7 @@ class Trace:
     unsteadiness: float
     timing: Timing | None
     left: Check | None
-    limits: tuple[Limit, ...]
+    limits: tuple[EffectLimit, ...]
     undecided: tuple[str, ...]
     probabilities: Mapping[str, float]
     not_compared: str = ''

@@ -19,7 +19,7 @@ from sa_jitter_ros.effects.effect import DirectEffect
 from sa_jitter_ros.effects.timing import Pattern
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.candidates import Candidate
-from sa_jitter_ros.inference.limits import Limit
+from sa_jitter_ros.inference.limits import EffectLimit
 from sa_jitter_ros.inference.observation import Observation
 from sa_jitter_ros.inference.timing import Timing
 from sa_jitter_ros.prediction.prediction import predict
@@ -29,7 +29,7 @@ Change = Callable[[Sequence[Effect], Effect], float]
 _UNDECIDED = 1e-2  # change of an average by what may be there
 
 
-def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[Limit]
+def undecided_effects(change: Change, effects: Sequence[Effect], rows: Sequence[EffectLimit]
                       ) -> tuple[str, ...]:
     """
     Return the effects that, as large as their limits, would still change an average.

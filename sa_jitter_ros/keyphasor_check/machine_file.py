@@ -71,7 +71,7 @@ def machine_parameters(check: KeyphasorCheck, declared: Mapping[str, Any] = NOTH
         nodes['synchronous_averager']['interval_tolerance'] = min(
             _WIDEST, _TICKS * tick / pitch)
     target = MarkOffsets(np.array(check.findings['marks'].value),
-                            np.array(check.findings['marks'].standard_error or 0.0))
+                         np.array(check.findings['marks'].standard_error or 0.0))
     turn = np.abs(target.angles).max() * (found['ratio'] or 1.0) * max(found['orders'] or [1.0])
     if target.standard_errors.all() and target.significant and turn > _SHOWS:
         nodes['synchronous_averager'] |= {

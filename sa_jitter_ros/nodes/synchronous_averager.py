@@ -33,7 +33,7 @@ from sa_jitter_ros.nodes.messages import (
     decode_pulse_array, decode_pulse_reference, encode_geometry, known_type, PULSE_TYPES)
 from sa_jitter_ros.nodes.signals import SampleInput
 from sa_jitter_ros.parameters import require_shaft_names, Values
-from sa_jitter_ros.pulses.target_geometry import TargetGeometry
+from sa_jitter_ros.pulses.target_geometry import MarkOffsets
 from sa_jitter_ros.recordings.channel_units import channels_of
 from std_msgs.msg import Float64, Float64MultiArray
 
