@@ -60,13 +60,18 @@ def cut(fields: Mapping[str, Any], share: float) -> list[dict[str, Any]]:
 
 
 def draw(effect: str, seed: int) -> tuple[dict[str, Any], str]:
-    """Return the recording of the first machine from `seed` on with several channels."""
+    """
+    Return the recording of the first machine from `seed` on with several channels.
+
+    Those with a reference keyphasor, which may miss in one of the pieces, are left out.
+    """
     while True:
         case = draw_case((effect,) if effect else (), seed)
         machine = case.machine
-        if (machine.levels.shape[0] > 1
+        fields = record(machine, case.what, np.random.default_rng([seed, 1]))
+        if (len(fields['vibration']) > 1 and 'reference_pulse_times' not in fields
                 and machine.acquisitions * machine.trigger_cycles < _MOST_CYCLES):
-            return record(machine, case.what, np.random.default_rng([seed, 1])), declared(machine)
+            return fields, declared(machine)
         seed += 1
 
 
