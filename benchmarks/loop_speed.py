@@ -46,6 +46,7 @@ KEYPHASOR_RATE = 5000.0  # Hz
 LOOPS = (31.25, 10000.0, (1.0, 0.8, 0.6, 0.4), 1), (100.0, 25600.0, (1.0, 0.8, 0.6), 1), (
     100.0, 25600.0, (1.0, 0.8, 0.6), 2)
 _RUNS = 5  # of `close_loop`, of which the least counts
+_SHORTEST = 8.0  # s, of a recording: six acquisitions of the model
 MODEL = f"""\
 jitter_predictor:
   ros__parameters:
@@ -184,6 +185,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description='Measure prediction, recovery and the loop.')
     parser.add_argument('--scale', type=float, default=1.0, help='of all sizes')
     parser.add_argument('--rounds', type=int, default=9, help='turns of every call')
+    parser.add_argument('--loops', type=int, default=len(LOOPS), help='recordings of `close_loop`')
     parser.add_argument('--clock', type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
     scale, rounds = options.scale, options.rounds
@@ -196,8 +198,8 @@ def main() -> int:
             ('recovery', partial(recovery, max(round(100 * scale), 20), rounds)),
             ('threads', partial(recovery_by_threads, max(round(100 * scale), 20), rounds)),
             ('close_loop', lambda: [
-                close_loop(min(rounds, _RUNS), max(scale, 0.3) * seconds, *other)
-                for seconds, *other in LOOPS])):
+                close_loop(min(rounds, _RUNS), max(scale * seconds, _SHORTEST), *other)
+                for seconds, *other in LOOPS[:options.loops]])):
         print(f'loop: {name}', file=sys.stderr, flush=True)
         found[name] = measure()
     found['load'] = f'{os.getloadavg()[0]:.1f}'

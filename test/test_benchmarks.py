@@ -191,8 +191,8 @@ def test_page_is_written_from_small_runs(benchmark, process_environment, tmp_pat
     small = '--scale', '0.03', '--rounds', '1'
     found = {
         'core': run('core_speed.py', *small, environment=process_environment),
-        'loop': run('loop_speed.py', *small, environment=process_environment),
-        'graph': run('graph_speed.py', '--channels', '2', '--large', '2', '--seconds', '5',
+        'loop': run('loop_speed.py', *small, '--loops', '1', environment=process_environment),
+        'graph': run('graph_speed.py', '--channels', '2', '--large', '2', '--seconds', '4',
                      '--latency-seconds', '0', environment=process_environment)}
     graph, large = found['graph']['runs']
     assert graph['averages'] > 10
