@@ -11,6 +11,7 @@
 """Fixtures of all tests; those of nodes are the fixtures that the package gives its users."""
 
 import atexit
+import gc
 import os
 from pathlib import Path
 import shutil
@@ -33,6 +34,12 @@ settings.register_profile('repeatable', deadline=None, derandomize=True)
 settings.load_profile('repeatable')
 
 ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish():
+    """Let the garbage collector, which commands call often, leave alone what is imported."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
