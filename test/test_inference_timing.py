@@ -91,7 +91,7 @@ def without_the_middle(stretch):
     ({}, ''), ({'swing': 2e-3}, ''), ({'excess': 1.0, 'rho': 0.7}, 'correlated_jitter'),
     ({'wander': 2.0, 'band': (0.0, 0.2)}, 'phase_wander')])
 def test_what_sets_stretches_apart_has_the_power_of_its_frequency(sizes, name):
-    count, ratios = 60, []
+    count, ratios = 30, []
     for seed in range(count):
         parts = without_the_middle(machine([61, seed], **sizes))
         fit = Chooser(parts, []).fit(frozenset([name] if name else []))
@@ -118,7 +118,7 @@ def test_a_skew_shows_on_either_side_of_what_is_held_out():
 
 def test_a_delay_shows_on_either_side_of_what_is_held_out():
     """The turn that all pulses have in common is that of the whole fit, not of a part of it."""
-    for seed in range(4):
+    for seed in range(2):
         whole = machine([63, seed], delay=0.02, swing=2e-3)
         timing = read_timing(without_the_middle(whole))
         assert names_of(timing) == {'path_delay'}
@@ -129,10 +129,9 @@ def test_a_delay_shows_on_either_side_of_what_is_held_out():
 
 def test_independent_errors_beside_a_slow_motion_have_no_memory():
     """Errors with a memory explain both at first, so that jitter begins in their place."""
-    for seed in range(2):
-        timing = read_timing([machine(
-            [64, seed], excess=6.0, wander=6.0, band=(0.0, 0.1), noise=0.6, count=900)])
-        assert names_of(timing) == {'excess_jitter', 'phase_wander'}
+    timing = read_timing([machine(
+        [64, 0], excess=6.0, wander=6.0, band=(0.0, 0.1), noise=0.6, count=900)])
+    assert names_of(timing) == {'excess_jitter', 'phase_wander'}
 
 
 def test_a_beat_within_the_cycles_is_no_acceleration(rng):
@@ -148,7 +147,7 @@ def test_a_beat_within_the_cycles_is_no_acceleration(rng):
 @pytest.mark.parametrize('noise', [0.02, 0.3])
 def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
     found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))
-             for seed in range(16)]
+             for seed in range(8)]
     assert sum(bool(names) for names in found) <= 1
 
 
@@ -182,14 +181,14 @@ def test_checks_are_calibrated_on_the_declared_machine():
 @pytest.mark.parametrize('excess', [0.0, 2.0])
 def test_size_of_errors_is_as_steady_as_normal_ones_beside_the_declared(excess):
     steady = [read_timing([machine(300 + seed, count=1600, excess=excess)]).checks[-1].p_value
-              for seed in range(6)]
+              for seed in range(3)]
     # uniform errors of the same size would scatter less, and make these look unsteady
     assert stats.combine_pvalues(steady).pvalue > 1e-3
-    assert min(steady) > 0.05 / 6 / 5
+    assert min(steady) > 0.05 / len(steady) / 5
 
 
 def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
-    for seed in range(4):
+    for seed in range(2):
         parts = [machine([seed, k], count=163, excess=1.0, skew=9.5e-5) for k in range(2)]
         timing = read_timing(parts)
         assert timing.choice.best == {'clock_skew', 'jitter_scale'}, seed
@@ -198,7 +197,7 @@ def test_skew_beside_larger_jitter_is_no_jitter_with_a_long_memory():
 
 
 def test_declared_bandwidth_that_is_too_small_is_another_number():
-    for seed in range(4):
+    for seed in range(2):
         part = machine(seed, wander=2.0, band=(0.0, 0.3))
         rad = 2.0 * np.pi * MODEL.fundamental_frequency
         timing = read_timing([part], [EFFECTS['phase_wander'](2.0 * rad * UNIT, 0.09)])
@@ -223,12 +222,11 @@ def surest(checks, text):
 def test_source_that_moves_as_a_sine_does_is_no_random_motion():
     text = 'a sinusoid of the source'
     random = [surest(read_timing([machine(40 + seed, wander=3.0, band=band)]).checks, text)
-              for seed in range(3) for band in ((0.0, 0.3), (0.1, 0.15))]
+              for seed in range(2) for band in ((0.0, 0.3), (0.1, 0.15))]
     assert min(random) > 0.05 / len(random)
-    for seed in (1, 3):
-        timing = read_timing([machine(seed, wander=6.0, band=(0.2, 0.2001))])
-        assert names_of(timing) == {'phase_wander'}
-        assert surest(timing.checks, text) < 1e-6
+    timing = read_timing([machine(1, wander=6.0, band=(0.2, 0.2001))])
+    assert names_of(timing) == {'phase_wander'}
+    assert surest(timing.checks, text) < 1e-6
 
 
 def test_motion_of_a_few_swings_is_a_drift():
@@ -246,7 +244,7 @@ def test_memory_is_no_longer_than_a_third_of_a_stretch():
 
 @pytest.mark.parametrize('effect', [{'shocks': 4.0}, {'hum': 1.5}])
 def test_effect_that_nobody_knows_is_seen(effect):
-    for seed in range(3):
+    for seed in range(2):
         timing = read_timing([machine(seed, **effect)])
         assert min(check.p_value for check in timing.checks) < 1e-4
 
@@ -303,7 +301,7 @@ def test_score_of_the_true_power_is_normal(name, sizes):
     """The power of uniform errors scatters less than that of normal ones."""
     power = 2.0 * np.log(max(sizes.get('excess', 0.0), sizes.get('wander', 0.0)))
     scores = []
-    for seed in range(40):
+    for seed in range(25):
         chooser = Chooser([machine(900 + seed, count=300, **sizes)])
         fit = chooser.fit(frozenset([name]), held={(name, 0): power})
         more, seen = fit.more_than_held(name, chooser.shapes.kurtosis)
@@ -461,7 +459,7 @@ def test_distribution_of_single_errors_tells_normal_ones_beside_the_declared(rho
 
 
 def test_events_that_fade_are_no_normal_errors_with_a_memory():
-    for seed in range(3):
+    for seed in range(2):
         timing = read_timing([machine(seed, shocks=4.0)])
         events = [check.p_value for check in timing.checks if 'events' in check.text]
         assert events
