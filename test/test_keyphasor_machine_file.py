@@ -110,8 +110,7 @@ RECORDINGS = [
     *((f'motor_{name}', {}) for name in ('10V_100kHz', '30V_100kHz', 'runup_20V_40kHz')),
     *((f'rotorbalancer_{name}', {'acquisition': k})
       for name in ('weight', 'weight_5', 'without_weight') for k in (0, 6)),
-    *((f'turbine_201303{day}', {}) for day in (16, 26, 31)),
-    *((f'turbine_201304{day}', {}) for day in ('05', 15)), ('uia_bearing_rig_1', {}),
+    ('turbine_20130316', {}), ('turbine_20130405', {}), ('uia_bearing_rig_1', {}),
     ('encoder_motor_slow', {})]
 
 
