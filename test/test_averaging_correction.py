@@ -118,7 +118,7 @@ def test_attenuation_of_weak_and_absent_orders_has_a_standard_error_that_holds()
 
 
 def test_attenuation_of_five_cycles_has_a_standard_error_that_holds():
-    orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 250
+    orders, size, cycles, trials = np.array([8.0, 16.0, 32.0]), np.array([0.5, 1.0, 0.3]), 5, 120
     rng, rate, std = np.random.default_rng(8), 160.0 * SPEED, 0.3 / (2.0 * np.pi * 16.0 * SPEED)
     times, true = np.arange(1920) / rate, (2.0 + np.arange(9)) / SPEED
     wave = np.exp(2j * np.pi * SPEED * np.outer(orders, times - true[0]))
@@ -256,7 +256,7 @@ def test_measured_gearbox_with_a_slow_keyphasor(shared_data):
 
     truth = amplitudes(reference, 0.0)
     strongest = np.argmax(truth.mean(axis=0), axis=0)
-    for clock in (2560.0, 5120.0, 8000.0):
+    for clock in (2560.0, 8000.0):
         ratio = (amplitudes(np.ceil(reference * clock) / clock, clock) / truth)[
             :, strongest, np.arange(len(orders))]
         np.testing.assert_allclose(ratio[:, :3], 1.0, atol=0.01)
