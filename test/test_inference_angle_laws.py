@@ -135,7 +135,7 @@ def test_gaps_cannot_be_identified_with_a_curved_angle_law():
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('law', ['linear', 'spline'])
 def test_measured_gearbox_under_added_jitter(law, shared_data):
     recording = with_added_jitter(
         read(shared_data / 'gear0_gearbox.npz'), Normal(6e-5), seed=4)
