@@ -12,6 +12,7 @@
 
 import ast
 from collections import Counter
+from functools import cache
 from io import StringIO
 from pathlib import Path
 import sys
@@ -41,6 +42,7 @@ def docstring_lines(node):
     return set()
 
 
+@cache
 def code_lines(text):
     """Return the number of lines without blanks, comments and docstrings."""
     lines = set()
