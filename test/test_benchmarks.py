@@ -82,7 +82,7 @@ def test_intervals_of_corrected_amplitudes_hold_in_every_setting(benchmark):
 
     Lines of another shaft that a few cycles do not tell make intervals too safe.
     """
-    campaign, trials = benchmark('interval_coverage'), 16
+    campaign, trials = benchmark('interval_coverage'), 10
     inside = np.zeros((2, 0))
     for number, setting in enumerate(campaign.SETTINGS):
         corrected, _, below = campaign.setting_distances(setting, trials, seed=5000 + number)
@@ -134,7 +134,7 @@ def test_a_measured_gearbox_has_one_scale_at_all_clocks(benchmark, shared_data, 
 @pytest.mark.machines
 @pytest.mark.parametrize('cycles', [5, 10])
 def test_jitter_of_strong_orders_is_no_noise_of_absent_ones(benchmark, cycles):
-    coverage, trials = benchmark('interval_coverage'), 1200
+    coverage, trials = benchmark('interval_coverage'), 400
     raw, _ = coverage.coverage(coverage.Case(cycles, 40.0, 0.8, correct=False), trials, seed=1)
     # of few cycles in so large a jitter they are too safe, by up to 10 points (docs/theory.md)
     for width, wanted, safe in ((1.0, 0.683, 0.1), (1.96, 0.95, 0.03)):
@@ -287,11 +287,11 @@ def test_fault_campaign_finds_no_wrong_average_and_writes_its_page(
 
 @pytest.mark.campaign
 def test_fault_replay_finds_no_wrong_average(benchmark, capsys):
-    assert benchmark('fault_replay').main(['--scenes', '20', '--seed', '70000']) == 0
+    assert benchmark('fault_replay').main(['--scenes', '10', '--seed', '70000']) == 0
     for line in capsys.readouterr().out.splitlines():
         scenes, averages, wrong = re.findall(r'\d+', line)
-        assert (int(scenes), int(wrong)) == (20, 0)
-        assert int(averages) > 50
+        assert (int(scenes), int(wrong)) == (10, 0)
+        assert int(averages) > 25
 
 
 def test_soak_says_which_averages_a_full_queue_lost(benchmark):
