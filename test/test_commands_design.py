@@ -120,7 +120,7 @@ def test_the_page_shows_what_the_command_prints(tmp_path, capsys):
         assert [line.removeprefix('    ') for line in printed.strip('\n').splitlines()] == lines
 
 
-@pytest.mark.parametrize('orders', [['0.001'], ['38', '400']])
+@pytest.mark.parametrize('orders', [['0.001'], ['38', '100']])
 def test_figure_of_orders_without_iso_lines_and_of_pulses_that_could_swap(
         tmp_path, capsys, orders):
     assert design.main(['--orders', *orders, '--trigger-speed', '41.5', '--keyphasor-rate', '100',
