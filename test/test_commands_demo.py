@@ -195,7 +195,7 @@ def test_output_that_fails_at_the_end_is_one_line_and_status_2(monkeypatch, tmp_
         'watcher', **node_kwargs))
     monkeypatch.setattr(demo, 'processes', lambda plan, live=False: {})
     monkeypatch.setattr(demo, 'watch', lambda *arguments, **options: None)
-    monkeypatch.setattr(demo, 'report', report)
+    monkeypatch.setattr(demo, 'write_report', report)
     monkeypatch.setattr(demo.signal, 'signal', lambda *handler: None)
     assert demo.main(['--output', str(tmp_path)]) == 2
     assert capsys.readouterr().err == 'demo: [Errno 28] No space left on device\n'
