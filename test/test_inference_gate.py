@@ -37,7 +37,7 @@ DECLARED = {'keyphasor_rate': 5000.0, 'trigger_speed': SPEED, 'trigger_cycles': 
             'orders': ORDERS, 'noise_std': NOISE}
 
 
-def machine(*effects, seed=1, seconds=14.0, jitter=True):
+def machine(*effects, seed=1, seconds=10.0, jitter=True):
     """Return the vibration (channel, sample) and the pulse times of a plain machine."""
     declared = (DeclaredJitter('uniform', 2e-4 / math.sqrt(12.0)),) if jitter else ()
     gear = Gearbox(
