@@ -93,7 +93,7 @@ def test_false_alarms_keep_to_their_rate_with_a_learnt_baseline(law):
     shape = (40, 8)
     found, expected = alarms_of(
         LAWS[law](np.random.default_rng(7), shape), units=shape[0], quantities=shape[1],
-        learning=40, scores=2000.0, length=6000)
+        learning=40, scores=2000.0, length=4000)
     assert found <= expected + 3.0 * np.sqrt(expected)
     # each machine loses the time that its first alarm takes to build up: a third of its alarms
     assert found >= 0.5 * expected - 3.0 * np.sqrt(expected)
@@ -570,7 +570,7 @@ def test_full_disk_and_unwritable_folder_keep_the_older_file(kept, monkeypatch):
 # --- with true averages --------------------------------------------------------------------------
 
 
-def averages_of(rate, *, seed, seconds=75.0, damaged=False):
+def averages_of(rate, *, seed, seconds=50.0, damaged=False):
     """Return the arrays of averages of a simulated gear whose keyphasor is sampled at a rate."""
     harmonics = [1.0, 0.55 if damaged else 0.5, 0.25]
     gear = Gearbox(
