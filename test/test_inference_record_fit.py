@@ -10,15 +10,18 @@
 
 """Pulse errors and lines of whole recordings, against the truth of another simulator."""
 
+from functools import cache
 from itertools import pairwise, product
 
 from independent_effects import draw_case
 import numpy as np
 import pytest
-from record_recovery import fitted
+import record_recovery
 from sa_jitter_ros.inference.cycle_states import independent_power
 from sa_jitter_ros.inference.record_fit import OpenRecord
 from sa_jitter_ros.inference.slips import shortest_path
+
+fitted = cache(record_recovery.fitted)
 
 
 @pytest.mark.machines
@@ -59,7 +62,7 @@ def test_a_tone_is_no_order():
 
 @pytest.mark.machines
 def test_a_speed_that_moves_inside_the_cycle_is_found_as_such():
-    run = fitted(('speed_fluctuation',), 200)
+    run = fitted(('speed_fluctuation',), 201)
     assert np.std(run.fit.bends[:, 0]) > 5.0 * run.fit.bend_standard_errors[0]
     assert np.std(run.wrong) < 0.2 * np.std(run.true)
 
