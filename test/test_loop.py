@@ -12,14 +12,12 @@
 
 import contextlib
 from dataclasses import replace
-import doctest
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from sa_jitter_ros import json_values, loop
 from sa_jitter_ros.declaration import read_declaration
 from sa_jitter_ros.effects import make_effect
 from sa_jitter_ros.errors import DataWarning, ModelError, ParameterError, RecordingError
@@ -51,11 +49,6 @@ def recording():
 def found(recording):
     """Return the loop closed on the recording."""
     return close_loop([recording], KEYWORDS)
-
-
-def test_examples():
-    for module in (loop, json_values):
-        assert doctest.testmod(module).failed == 0
 
 
 def test_every_way_to_name_recording_and_model_finds_the_same(recording, found, tmp_path):
