@@ -78,7 +78,7 @@ def test_a_wheel_whose_shaft_twists_by_more_than_half_a_tooth_is_taken(tmp_path,
 
 def test_a_file_without_orders_names_none_and_is_taken(tmp_path, capsys):
     """It says what to add; averager and predictor take orders of their own meanwhile."""
-    write_rig(tmp_path / 'rig.npz', turns=48, orders=())
+    write_rig(tmp_path / 'rig.npz', turns=200, orders=())
     run_all(tmp_path / 'rig.npz', tmp_path / 'out', capsys)
     text = (tmp_path / 'out/machine.yaml').read_text()
     assert '# No order is known: add those of interest, as in shaft.orders: [1.0, 2.0], to' in text
