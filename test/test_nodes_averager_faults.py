@@ -80,18 +80,18 @@ class SceneBench:
         return well
 
 
-@pytest.mark.parametrize(('averaging', 'seed'), [
-    ('block', 1), pytest.param('block', 2, marks=pytest.mark.campaign), ('sliding', 3),
-    pytest.param('exponential', 4, marks=pytest.mark.campaign)])
-def test_every_average_is_true_in_spite_of_faults(ros_graph, averaging, seed):
+@pytest.mark.parametrize(('averaging', 'seed', 'scenes'), [
+    ('block', 1, 2), ('sliding', 3, 2),
+    pytest.param('exponential', 4, 1, marks=pytest.mark.campaign)])
+def test_every_average_is_true_in_spite_of_faults(ros_graph, averaging, seed, scenes):
     b = SceneBench(ros_graph, seed, averaging=averaging)
-    for _ in range(2):
+    for _ in range(scenes):
         missing = set(SHAFTS) - b.play()
         if missing:  # within buffer_seconds of faultless input
             missing -= b.play(changes=False, faults=False)
         assert not missing - b.play(changes=False, faults=False)
     status = b.bench.status()
-    assert sum(b.faults.values()) > 10
+    assert sum(b.faults.values()) > 5 * scenes
     for checker in b.checkers.values():
         assert checker.checked > 20
     assert status['averages'] == sum(checker.checked for checker in b.checkers.values())
