@@ -46,10 +46,11 @@ _TESTS = {'keyphasor_check': 'test_keyphasor_*.py', 'pulses': 'test_pulses_*.py'
 _MARKS = 'not (build or campaign or processes or style)'
 _FACTOR = 10
 _LONGEST = 600.0  # s, of a row: a search that does not end is noticed
-_OF_A_ROW = 2  # numbers, in a sample
-#: Rows that take more than 3 s, of which no sample asks.
+_OF_A_ROW = 4  # numbers, in a sample
+#: Rows that take more than 2 s, of which no sample asks.
 _SLOW = ('damaged drifting 0', 'damaged fading 0', 'damaged short 0', 'independent excess_jitter 4',
-         'independent resonance 2', 'independent speed_fluctuation 0')
+         'independent interfering_tone 0', 'independent late_recovery 0', 'independent resonance 2',
+         'independent speed_fluctuation 0')
 
 
 @dataclass(frozen=True)
@@ -194,7 +195,7 @@ def sample(count: int, seed: int) -> list[tuple[Number, str, str]]:
     """
     Draw numbers that a quick row noticed before: the number, which way it moved, and the row.
 
-    At most two numbers of a row are drawn, so that many rows are asked.
+    At most four numbers of a row are drawn, so that many rows are asked.
     """
     known = kept()
     every = [(number, *known[number.name]) for number in numbers()
