@@ -24,19 +24,20 @@ import io
 import json
 from pathlib import Path
 import tempfile
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
-from matplotlib.figure import Figure
 import numpy as np
 from sa_jitter_ros.commands import close_loop
 from sa_jitter_ros.recordings import read
 from sa_jitter_ros.recordings.channel_map import ChannelSelection
 from sa_jitter_ros.recordings.npz_format import write_npz
 from sa_jitter_ros.recordings.recording import Recording
-from sa_jitter_ros.report.plotting import AFTER, BEFORE
 from scipy import stats
 from worse_pulses import with_slower_clock
 import yaml
+
+if TYPE_CHECKING:  # loaded where something is drawn: matplotlib takes half a second
+    from matplotlib.figure import Figure
 
 CLOCKS = (2560.0, 3300.0, 4700.0, 5120.0, 6000.0, 9100.0, 13000.0)
 FITTED = 3300.0
@@ -208,8 +209,10 @@ def clock_table(data: Path) -> str:
     return '\n'.join(lines)
 
 
-def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
+def grid_figure(cases: Sequence[Case], data: Path) -> 'Figure':
     """Draw what the clock does to the pulses, and the lines before and after it is known."""
+    from matplotlib.figure import Figure
+    from sa_jitter_ros.report.plotting import AFTER, BEFORE
     figure = Figure(figsize=(10.0, 3.6), layout='constrained')
     left, right = figure.subplots(1, 2)
     for clock, colour in ((FITTED, 'tab:orange'), (6000.0, 'tab:purple')):
@@ -232,8 +235,10 @@ def grid_figure(cases: Sequence[Case], data: Path) -> Figure:
     return figure
 
 
-def error_figure(cases: Sequence[Case]) -> Figure:
+def error_figure(cases: Sequence[Case]) -> 'Figure':
     """Draw the held-out error of every case that could be used, as declared and after."""
+    from matplotlib.figure import Figure
+    from sa_jitter_ros.report.plotting import AFTER, BEFORE
     used = [case for case in cases if case.content.get('lines')]
     place = np.arange(len(used))
     figure = Figure(figsize=(10.0, 3.4), layout='constrained')

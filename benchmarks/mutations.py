@@ -48,8 +48,9 @@ _FACTOR = 10
 _LONGEST = 600.0  # s, of a row: a search that does not end is noticed
 _OF_A_ROW = 4  # numbers, in a sample
 #: Rows that take more than 2 s, of which no sample asks.
-_SLOW = ('damaged drifting 0', 'damaged fading 0', 'damaged short 0', 'independent excess_jitter 4',
-         'independent interfering_tone 0', 'independent late_recovery 0', 'independent resonance 2',
+_SLOW = ('damaged drifting 0', 'damaged fading 0', 'damaged short 0',
+         'independent excess_jitter 4', 'independent interfering_tone 0',
+         'independent late_recovery 0', 'independent resonance 2',
          'independent speed_fluctuation 0')
 
 
