@@ -295,7 +295,7 @@ def alarms(kept, learning, *, known):
 
 
 @pytest.mark.machines
-@pytest.mark.parametrize('kept', [0.0, 0.3, 0.6])
+@pytest.mark.parametrize('kept', [0.0, 0.6])
 def test_days_that_follow_each_other_are_no_change(kept):
     expected = 35.0 / 365.25
     error = np.sqrt(expected * (1.0 - expected) / 200)
