@@ -271,7 +271,7 @@ def test_torsion_that_makes_sidebands_is_within_the_limit_of_the_speed():
 @pytest.mark.machines
 def test_steady_torsion_that_averages_lose_by_is_unexplained():
     """Its lines are steady beside their sidebands: raw and corrected averages lose the same."""
-    found = traced(torsion=(Torsion(0.3, 0.05),), acquisitions=32)
+    found = traced(torsion=(Torsion(0.3, 0.05),), acquisitions=20)
     assert found.verdict == 'unexplained'
     assert 'twists steadily, 0.3 times a trigger cycle' in found.left.text
 

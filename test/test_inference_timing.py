@@ -60,7 +60,7 @@ CASES = {
 def test_effect_is_found_with_its_size(name):
     sizes, (parameter, truth) = CASES[name]
     off = []
-    for seed in range(4):
+    for seed in range(3):
         timing = read_timing([machine(seed, **sizes)])
         assert names_of(timing) == {name}, seed
         value, error = value_of(timing, name, parameter)

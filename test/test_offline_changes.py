@@ -277,9 +277,12 @@ def test_a_wrong_state_is_one_line(loads, arguments, text, capsys):
     assert text in capsys.readouterr().err.splitlines()[-1]
 
 
+UNITS = 100  # machines
+
+
 def alarms(kept, learning, *, known):
     """Return the share of series of 45 days, which remember a part of the day before, with one."""
-    rng, units, quantities = np.random.default_rng(9), 200, 12
+    rng, units, quantities = np.random.default_rng(9), UNITS, 12
     shape, state, days = (units, quantities), 0.0, []
     state = rng.standard_normal(shape)
     for _ in range(45):
@@ -298,7 +301,7 @@ def alarms(kept, learning, *, known):
 @pytest.mark.parametrize('kept', [0.0, 0.6])
 def test_days_that_follow_each_other_are_no_change(kept):
     expected = 35.0 / 365.25
-    error = np.sqrt(expected * (1.0 - expected) / 200)
+    error = np.sqrt(expected * (1.0 - expected) / UNITS)
     assert alarms(kept, 10, known=True) <= expected + 3.0 * error
     if kept == 0.6:
         assert alarms(kept, 10, known=False) > 0.5
