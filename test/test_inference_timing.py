@@ -153,7 +153,7 @@ def test_a_beat_within_the_cycles_is_no_acceleration(rng):
 def test_declared_machine_shows_nothing_beside_what_is_held_out(noise):
     found = [names_of(read_timing(without_the_middle(machine([62, seed], noise=noise))))
              for seed in range(8)]
-    assert sum(bool(names) for names in found) <= 1
+    assert not any(found)
 
 
 def test_uneven_marks_are_found_mark_by_mark():
