@@ -351,3 +351,10 @@ def test_a_damaged_recording_ends_in_one_line_or_with_a_report(benchmark, capsys
     """Of the second one a reference keyphasor is better than the vibration, in parts of it."""
     assert benchmark('damaged_recordings').main(['--first', '461', '--count', '2']) == 0
     assert 'wrong' not in capsys.readouterr().out
+
+
+@pytest.mark.machines
+def test_the_loop_counts_marks_alike_in_recordings_that_begin_at_any_of_them(benchmark, capsys):
+    compare = benchmark('channels_and_cuts')
+    assert compare.main(['--effects', 'target_geometry', '--machines', '1']) == 0
+    assert 'cut: 1 of 1 alike' in capsys.readouterr().out

@@ -20,6 +20,7 @@ from sa_jitter_ros.effects import (
     Effect, EFFECTS, enabled_effects, library, make_effect, parameter_defaults, parameter_ranges)
 from sa_jitter_ros.effects.effect import departs
 from sa_jitter_ros.effects.lattice import find_clock, smooth_on_grid
+from sa_jitter_ros.effects.target_geometry import marks_ahead
 from sa_jitter_ros.errors import ModelError, ParameterError
 from sa_jitter_ros.prediction.influence import AveragePulses
 from sa_jitter_ros.prediction.model import DeclaredModel
@@ -561,3 +562,18 @@ def test_numbers_depart_by_more_than_their_errors(declared, found, errors, expec
         next(iter(declared)), 'excess_jitter')
     assert departs(make_effect(name, **found), errors, make_effect(name, **declared), 1000
                    ) is expected
+
+
+@pytest.mark.parametrize('step', [0, 1, 2])
+def test_recordings_that_begin_at_other_marks_are_counted_alike(rng, step):
+    """Of five marks each begins trigger cycles, unless one does alone; noise decides nothing."""
+    model = DeclaredModel(keyphasor_rate=10e3, trigger_speed=25.0, trigger_cycles=12,
+                          pulses_per_revolution=5, pulses_per_trigger=step, orders=(1.0,))
+    marks = 1e-5 * rng.standard_normal(5)
+    index = rng.integers(0, 1000, (9, 1)) + np.arange(13)
+    noise = 2e-6 * rng.standard_normal((2, *index.shape))
+    for ahead in range(5):
+        errors = marks[(np.array([index, index + ahead]) * (step or 5)) % 5] + noise
+        found = marks_ahead(model, (index, errors[0]), (index, errors[1]))
+        assert found == (ahead if step else 0)
+        assert marks_ahead(model, (index, errors[0]), (index, noise[1])) == 0

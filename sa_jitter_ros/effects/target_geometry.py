@@ -36,6 +36,26 @@ def own_marks(model: DeclaredModel) -> tuple[int, int]:
     return marks // math.gcd(marks, step), step
 
 
+def marks_ahead(model: DeclaredModel, one: tuple[Array, Array], other: tuple[Array, Array]) -> int:
+    """
+    Return by how many trigger pulses the count of another recording is behind that of one.
+
+    Each recording begins at any mark: what its marks have in common tells. Both are given by the
+    `index` of trigger pulses and their `errors` in s, (acquisition, pulse); 0 if they do not tell.
+    """
+    own, _ = own_marks(model)
+    late = [errors - np.nanmean(errors, axis=1, keepdims=True) for _, errors in (one, other)]
+    known = np.isfinite(late[0])
+    count = np.bincount(one[0][known] % own, minlength=own)
+    if own == 1 or not count.all():
+        return 0
+    marks = np.bincount(one[0][known] % own, late[0][known], minlength=own) / count
+    left = [np.nansum((late[1] - marks[(other[0] + ahead) % own]) ** 2) for ahead in range(own)]
+    best = int(np.argmin(left))
+    clear = math.exp(2.0 * (ODDS + math.log(own)) / np.isfinite(late[1]).sum())
+    return best if left[0] > clear * left[best] else 0
+
+
 def _marks(setting: Setting) -> Array:
     """
     Return for each mark but the last that begins trigger cycles where it is late, alone.

@@ -123,7 +123,7 @@ def gather_pulses(recording: Recording, observation: Observation, group: Array
         read = slice(start, item.first + item.times.size + model.weights.after)
         own = slice(model.weights.before, model.weights.before + item.times.size)
         smooth = None if grid is None else grid.smooth[read]
-        first = int(pulses.number[start])
+        first = int(pulses.index[start])
         rows = []
         for motion, uncertain in zip(again, error_std):
             errors, std, unknown = smooth, 0.0, missed

@@ -280,6 +280,7 @@ def together(observations: Sequence[Observation]) -> Observation:
            for name in ('times', 'missing', 'doubtful', 'bridged')},
         displaced=np.concatenate([np.broadcast_to(
             item.pulses.displaced, item.pulses.missing.shape) for item in observations]),
+        ahead=0,
         # no interval ends where a recording begins
         starts_run=np.concatenate([first.pulses.starts_run, *(
             item.pulses.starts_run[1:] for item in observations[1:])]),

@@ -47,7 +47,8 @@ class RecordPulses:
     since the pulse before is uncertain. `doubtful` (n,): a double pulse next to this one was
     dropped, and this one may be the wrong one. `bridged` (m,), m = n + the missing ones, are the
     times with missing pulses interpolated, `reference` (m,) those of a reference keyphasor (None
-    without one); both are NaN where there is no pulse. `remarks` say how pulses were repaired.
+    without one); both are NaN where there is no pulse. `remarks` say how pulses were repaired. The
+    marks are counted from `ahead` trigger pulses before the first one.
     """
 
     times: FloatArray
@@ -58,6 +59,7 @@ class RecordPulses:
     reference: FloatArray | None = None
     remarks: tuple[str, ...] = ()
     displaced: IntArray | int = 0
+    ahead: int = 0
 
     @classmethod
     def unbroken(cls, times: FloatArray) -> 'RecordPulses':
@@ -69,6 +71,11 @@ class RecordPulses:
     def number(self) -> IntArray:
         """Return the number of trigger cycles from the first pulse to each pulse (n,)."""
         return numbered(self.missing)
+
+    @property
+    def index(self) -> IntArray:
+        """Return the number of trigger cycles from the first mark to each pulse (n,)."""
+        return self.ahead + self.number
 
     @property
     def lost(self) -> IntArray:

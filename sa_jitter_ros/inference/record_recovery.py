@@ -62,6 +62,7 @@ class RecordRecovery:
     `errors` are wrong by. `jitter_std` (s) is the size of the errors, `undeclared` the orders and
     tones (Hz) that were fitted beside the declared ones. `fits` are those of the `stretches` of
     the `bridged` pulses. `expected_std` (3,) in s is what the fits expected of errors and bends.
+    `ahead` trigger pulses before the first one the marks are counted from.
     """
 
     times: FloatArray
@@ -80,6 +81,7 @@ class RecordRecovery:
     bridged: FloatArray
     stretches: tuple[slice, ...]
     expected_std: FloatArray
+    ahead: int = 0
 
     @property
     def errors(self) -> FloatArray:

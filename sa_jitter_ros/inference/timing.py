@@ -270,7 +270,8 @@ def _stretch(model: DeclaredModel, recovery: RecordRecovery, part: slice, here: 
         grid = np.zeros(recovery.bridged.size)
         grid[recovery.number] = imposed
         grid = grid[here]
-    setting = Setting(model, unit, np.arange(here.start, here.stop), bridged, bridged - errors,
+    index = recovery.ahead + np.arange(here.start, here.stop)
+    setting = Setting(model, unit, index, bridged, bridged - errors,
                       float(recovery.bridged[0]), recovery.bridged[part], grid, rate)
     return Stretch(setting, measured, errors, max(error_std, 1e-6 * unit), prior, bends,
                    bend_std, bend_prior, reference is not None)

@@ -24,9 +24,10 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 from sa_jitter_ros.effects import Effect, EFFECTS, make_effect
 from sa_jitter_ros.effects.effect import absent, departs, DirectEffect, effects_of, Finding, RARE
-from sa_jitter_ros.effects.target_geometry import TargetGeometry
+from sa_jitter_ros.effects.target_geometry import marks_ahead, TargetGeometry
 from sa_jitter_ros.errors import ModelError
 from sa_jitter_ros.inference.benches import few_of, make_bench
 from sa_jitter_ros.inference.candidates import (
@@ -76,6 +77,8 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     used = [(replace(item, acquisitions=tuple(item.acquisitions[a] for a in item.compared)), source
              ) for item, source in zip(observations, recordings) if item.compared]
     observations, recordings = [item for item, _ in used], [source for _, source in used]
+    observations = [observations[0], *(
+        _counted_alike(item, observations[0]) for item in observations[1:])]
     observation = together(observations)
     if not choose_lines(observation).count:
         orders = ', '.join(f'{g:g}' for g in observation.orders)
@@ -83,8 +86,7 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
             f'no line is compared: no declared order ({orders}) is coherent from cycle to cycle '
             'on any channel, so that no effect could have been seen; declare orders that the '
             'vibration holds'))
-    if len(observations) == 1:
-        declared = [_counted_anew(item, observation) for item in declared]
+    declared = [_counted_anew(item, observations) for item in declared]
     bench = make_bench(observation, observations, recordings, declared)
     timing = timing_of(bench)
     if timing is not None and (unsure := timing.hidden_by):
@@ -95,13 +97,28 @@ def trace(observations: Sequence[Observation], recordings: Sequence[Recording], 
     return trace_bench(bench, timing, progress=progress)
 
 
-def _counted_anew(effect: Effect, observation: Observation) -> Effect:
+def _indices(observation: Observation) -> NDArray[np.int64]:
+    """Return the index of each trigger pulse (acquisition, pulse)."""
+    index = observation.pulses.index
+    return np.array([index[item.first] + item.number for item in observation.acquisitions])
+
+
+def _counted_alike(item: Observation, first: Observation) -> Observation:
+    """Return an observation whose marks are counted as those of the first recording."""
+    ahead = marks_ahead(item.model, *(
+        (_indices(one), one.stacked('errors')) for one in (first, item)))
+    return replace(
+        item, pulses=replace(item.pulses, ahead=ahead),
+        recoveries=tuple(replace(found, ahead=ahead) for found in item.recoveries))
+
+
+def _counted_anew(effect: Effect, observations: Sequence[Observation]) -> Effect:
     """Return the effect, a target counted from the mark with which the recording begins."""
     if not isinstance(effect, TargetGeometry) or not effect.pulse_angles:
         return effect
-    number = observation.pulses.number
-    index = np.array([number[item.first] + item.number for item in observation.acquisitions])
-    return effect.counted_anew(observation.model, index, observation.stacked('errors'))
+    return effect.counted_anew(
+        observations[0].model, np.concatenate([_indices(item) for item in observations]),
+        np.concatenate([item.stacked('errors') for item in observations]))
 
 
 def require_acquisitions(observation: Observation) -> None:
