@@ -53,7 +53,7 @@ def marks_ahead(model: DeclaredModel, one: tuple[Array, Array], other: tuple[Arr
     left = [np.nansum((late[1] - marks[(other[0] + ahead) % own]) ** 2) for ahead in range(own)]
     best = int(np.argmin(left))
     clear = math.exp(2.0 * (ODDS + math.log(own)) / np.isfinite(late[1]).sum())
-    return best if left[0] > clear * left[best] else 0
+    return best if min(left[0], np.nansum(late[1] ** 2)) > clear * left[best] else 0
 
 
 def _marks(setting: Setting) -> Array:
