@@ -1,0 +1,207 @@
+# Copyright 2026 sa_jitter_ros contributors
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except
+# in compliance with the License. You may obtain a copy of the License at
+# http://www.apache.org/licenses/LICENSE-2.0
+# Unless required by applicable law or agreed to in writing, software distributed under the License
+# is distributed on an "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express
+# or implied. See the License for the specific language governing permissions and limitations under
+# the License.
+
+"""From a rough speed to the phase of the shaft, with its errors: demodulate, smooth, again."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from sa_jitter_ros.tacholess.lines import Cells, demodulated, first_correction, noise_power
+from sa_jitter_ros.tacholess.smoother import fitted, Posterior, Seen, Walk
+from scipy.interpolate import CubicHermiteSpline
+from scipy.ndimage import uniform_filter1d
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+
+_WIDTHS = (8, 32, 128)  # cells over which the own phase of a line is constant, at first and later
+_PASSES = 3
+MOST_LINES = 8
+_WHITE = 0.75  # of the variance of overlapping cells remains where their noise is white
+_STRANGE = 25.0  # squared residual over its variance that no noise makes
+_MOST_STRANGE = 0.2  # share of such cells, beyond which the line is
+_WRONG = 5.0  # misfit of a line that is not tied to the shaft
+_LEAST = 40.0  # sum of the ratios of power of line and noise over cells, of a line that is there
+
+
+@dataclass(frozen=True)
+class Phase:
+    """
+    The angle of the shaft from cell to cell.
+
+    `posterior` has it in rad of the order `highest`, from `first` revolutions; `lines` (line,) of
+    `cells` were used, which show what is `seen`; `misfit` (line,) is the variance of residuals over that of the noise.
+    """
+
+    cells: Cells
+    seen: Seen
+    posterior: Posterior
+    walk: Walk
+    first: float
+    highest: float
+    misfit: FloatArray
+
+    @property
+    def unit(self) -> FloatArray:
+        """Return the angle and the speed of the states in revolutions and Hz."""
+        turn = 2.0 * np.pi * self.highest
+        return np.array([1.0 / turn, 1.0 / turn / self.seen.unit])
+
+    @property
+    def states(self) -> FloatArray:
+        """Return angle and speed (node, 2) at the nodes, in revolutions and Hz."""
+        return np.asarray(self.posterior.mode[:, :2] * self.unit + [self.first, 0.0])
+
+    def angle(self, times: FloatArray) -> FloatArray:
+        """Return the angle (time,) in revolutions; beyond the nodes it goes on as it was."""
+        nodes, states = self.seen.nodes, self.states
+        found = CubicHermiteSpline(nodes, states[:, 0], states[:, 1])(times)
+        bends = np.diff(states[:, 1]) / np.diff(nodes)
+        for outside, end in ((times < nodes[0], 0), (times > nodes[-1], -1)):
+            after = times[outside] - nodes[end]
+            found[outside] = states[end, 0] + after * (states[end, 1] + 0.5 * after * bends[end])
+        return np.asarray(found)
+
+    def rows(self, times: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+        """
+        Return between which nodes times lie, and the factors of their states, as `angle` has it.
+
+        The node before (time,); factors (time, 2 nodes, angle and speed) in revolutions of the
+        angle, and in Hz of the speed.
+        """
+        nodes = self.seen.nodes
+        place = np.clip(np.searchsorted(nodes, times, side='right') - 1, 0, len(nodes) - 2)
+        step = nodes[place + 1] - nodes[place]
+        u = (times - nodes[place]) / step
+        angle = np.array([[(1 + 2 * u) * (1 - u) ** 2, u * (1 - u) ** 2 * step],
+                          [u**2 * (3 - 2 * u), u**2 * (u - 1) * step]])
+        speed = np.array([[6 * u * (u - 1) / step, (1 - u) * (1 - 3 * u)],
+                          [6 * u * (1 - u) / step, u * (3 * u - 2)]])
+        scale = self.unit[:, None]
+        return (place.astype(np.intp), (angle * scale).transpose(2, 0, 1),
+                (speed * scale).transpose(2, 0, 1))
+
+    def speed(self, times: FloatArray) -> FloatArray:
+        """Return the speed (time,) in Hz between the nodes."""
+        place, _, factors = self.rows(times)
+        ends = np.stack([self.posterior.mode[place, :2], self.posterior.mode[place + 1, :2]], 1)
+        return np.asarray(np.sum(factors * ends, axis=(1, 2)))
+
+    def variance(self, place: NDArray[np.intp], rows: FloatArray) -> FloatArray:
+        """Return the variance (time,) of what rows behind nodes see of the states."""
+        width = self.posterior.mode.shape[1]
+        kept = np.array([0, 1, width, width + 1])
+        pairs = self.posterior.pairs[place][:, kept[:, None], kept]
+        flat = rows.reshape(len(rows), 4)
+        return np.asarray(np.einsum('ki,kij,kj->k', flat, pairs, flat))
+
+    def right(self, place: NDArray[np.intp], rows: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return the covariance of all states with sums, `weights` (time, sum), of what rows see."""
+        found = np.zeros((*self.posterior.mode.shape, weights.shape[1]))
+        for node in range(2):
+            for state in range(2):
+                np.add.at(found[:, state], place + node, rows[:, node, state, None] * weights)
+        return self.posterior.solved(found.reshape(-1, weights.shape[1]))
+
+    def seen_by(self, place: NDArray[np.intp], rows: FloatArray, states: FloatArray) -> FloatArray:
+        """Return what rows see (time, sum) of sums of states."""
+        each = states.reshape(*self.posterior.mode.shape, -1)
+        return np.asarray(sum(rows[:, node, state, None] * each[place + node, state]
+                              for node in range(2) for state in range(2)))
+
+    def covariance(self, place: NDArray[np.intp], rows: FloatArray) -> FloatArray:
+        """Return the covariance (time, time) of what rows see."""
+        return self.seen_by(place, rows, self.right(place, rows, np.eye(len(place))))
+
+
+def phase_of(vibration: FloatArray, sample_rate: float, angle: FloatArray, revolutions: int,
+             lines: list[tuple[float, int]]) -> Phase | None:
+    """Return the phase by lines (order, channel) along a rough angle; None if none is there."""
+    times = np.arange(angle.size) / sample_rate
+    found = None
+    for number in range(_PASSES):
+        cells = demodulated(vibration, sample_rate, angle, revolutions, lines)
+        found = _smoothed(cells, found)
+        if found is None:
+            return None
+        lines = list(zip(found.cells.orders.tolist(), found.cells.channels.tolist()))
+        if number < _PASSES - 1:
+            angle = found.angle(times)
+            if not np.all(np.diff(angle) > 0.0):
+                return None
+    return found
+
+
+def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
+    """Return the phase by the lines of cells, the strongest of them."""
+    correction = first_correction(cells) if before is None else np.zeros(len(cells.times))
+    widths = _WIDTHS if before is None else _WIDTHS[-1:]
+    walk = None if before is None else before.walk
+    for width in widths:
+        seen, kept = _seen(cells, correction, width, trusted=before is not None)
+        cells = cells.chosen(kept)
+        if not len(cells.orders):
+            return None
+        walk, posterior = fitted(seen, walk)
+        highest = float(cells.orders.max())
+        ends = np.stack([posterior.mode[:-1, :2], posterior.mode[1:, :2]], axis=1)
+        mean = np.sum(ends * seen.taper, axis=(1, 2))
+        correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])
+    misfit = _misfit(seen, posterior)
+    if np.any(misfit > _WRONG):
+        return _smoothed(cells.chosen(misfit <= _WRONG), before)
+    # Residuals that are larger than the noise of the cells count as noise.
+    fair = replace(seen, precision=seen.precision / np.maximum(misfit, 1.0)[:, None])
+    return Phase(cells, fair, Posterior(fair, walk), walk, float(cells.angle[0]), highest, misfit)
+
+
+def _seen(cells: Cells, correction: FloatArray, width: int, *, trusted: bool
+          ) -> tuple[Seen, NDArray[np.bool_]]:
+    """
+    Return what the lines show about an angle, and which of them are strong enough to be kept.
+
+    About an angle that is `trusted`, cells that no noise explains are left out.
+    """
+    turn = 2.0 * np.pi * cells.orders[:, None]
+    present = np.isfinite(cells.values)
+    still = np.where(present, cells.values, 0.0) * np.exp(-1j * turn * correction)
+    power = noise_power(np.where(present, still, np.nan))
+    width = min(width, max(still.shape[1] // 2, 1))
+    own = np.unwrap(np.angle(_mean(still, width)), axis=1)
+    still = still * np.exp(-1j * own)
+    share = np.maximum(_mean(present.astype(float), width).real, 1e-3)
+    size = np.maximum(_mean(still, width).real / share, 1e-30)
+    precision = np.where(present, 2.0 * size**2 / power, 0.0)
+    strange = precision * (np.abs(still - size) / size) ** 2 > 2.0 * _STRANGE
+    precision[strange & trusted & (strange.mean(axis=1) < _MOST_STRANGE)[:, None]] = 0.0
+    phase = own + still.imag / size + turn * (cells.angle - cells.angle[0] + correction)
+    weight = precision.sum(axis=1)
+    kept = weight > 2.0 * _LEAST
+    strong = np.argsort(-weight * cells.orders**2 * kept)[:MOST_LINES]
+    kept &= np.isin(np.arange(len(kept)), strong)
+    orders = cells.orders[kept]
+    return Seen(cells.times, cells.moments, orders / orders.max(initial=1e-9), phase[kept],
+                precision[kept]), kept
+
+
+def _mean(values: NDArray[np.generic], width: int) -> ComplexArray:
+    """Return running means (line, cell)."""
+    return np.asarray(uniform_filter1d(values.real, width, axis=1, mode='nearest')
+                      + 1j * uniform_filter1d(values.imag, width, axis=1, mode='nearest'))
+
+
+def _misfit(seen: Seen, posterior: Posterior) -> FloatArray:
+    """Return the variance (line,) of the residuals over what the noise of the cells makes."""
+    rows, precision = seen.rows, seen.precision
+    known = np.sum((rows @ posterior.pairs) * rows, axis=2).T
+    left = np.sum((precision > 0.0) * (1.0 - precision * known), axis=1)
+    return np.asarray(np.sum(precision * posterior.rest**2, axis=1)
+                      / np.maximum(left, 1.0) / _WHITE)
