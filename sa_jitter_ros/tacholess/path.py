@@ -16,6 +16,7 @@ from scipy.ndimage import maximum_filter1d
 
 FloatArray = NDArray[np.float64]
 
+RULED_OUT = -20.0  # nats, more than a frame of any comb loses
 # A step of the path up to this share of the largest one costs so many nats.
 _COSTS = ((1.0 / 16.0, 0.0), (1.0 / 4.0, 0.5), (1.0, 2.0))
 
@@ -54,4 +55,4 @@ def without(evidence: NDArray[np.float32], path: NDArray[np.intp], reach: NDArra
     """Return the evidence with `reach` (frame,) cells on either side of a path ruled out."""
     cells = np.arange(evidence.shape[1])
     near = np.abs(cells - path[:, None]) <= reach[:, None]
-    return np.where(near, np.float32(-20.0), evidence)
+    return np.where(near, np.float32(RULED_OUT), evidence)

@@ -27,6 +27,7 @@ _PASSES = 3
 MOST_LINES = 8
 _WHITE = 0.75  # of the variance of overlapping cells remains where their noise is white
 _STRANGE = 25.0  # squared residual over its variance that no noise makes
+_FEWEST_BINS = 8  # over which the slow part of the noise is measured
 _MOST_STRANGE = 0.2  # share of such cells, beyond which the line is
 _WRONG = 5.0  # misfit of a line that is not tied to the shaft
 _LEAST = 40.0  # sum of the ratios of power of line and noise over cells, of a line that is there
@@ -141,7 +142,9 @@ def phase_of(vibration: FloatArray, sample_rate: float, angle: FloatArray, revol
 
 
 def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
-    """Return the phase by the lines of cells, the strongest of them."""
+    """Return the phase by the lines of cells, the strongest of them; None if none is there."""
+    if not len(cells.orders):
+        return None
     correction = first_correction(cells) if before is None else np.zeros(len(cells.times))
     widths = _WIDTHS if before is None else _WIDTHS[-1:]
     walk = None if before is None else before.walk
@@ -155,11 +158,12 @@ def _smoothed(cells: Cells, before: Phase | None) -> Phase | None:
         ends = np.stack([posterior.mode[:-1, :2], posterior.mode[1:, :2]], axis=1)
         mean = np.sum(ends * seen.taper, axis=(1, 2))
         correction = mean / (2.0 * np.pi * highest) - (cells.angle - cells.angle[0])
-    misfit = _misfit(seen, posterior)
+    misfit, slow = _misfit(seen, posterior)
     if np.any(misfit > _WRONG):
         return _smoothed(cells.chosen(misfit <= _WRONG), before)
     # Residuals that are larger than the noise of the cells count as noise.
-    fair = replace(seen, precision=seen.precision / np.maximum(misfit, 1.0)[:, None])
+    fair = replace(seen, precision=seen.precision / np.maximum(1.0, np.maximum(
+        misfit, slow))[:, None])
     return Phase(cells, fair, Posterior(fair, walk), walk, float(cells.angle[0]), highest, misfit)
 
 
@@ -189,7 +193,7 @@ def _seen(cells: Cells, correction: FloatArray, width: int, *, trusted: bool
     kept &= np.isin(np.arange(len(kept)), strong)
     orders = cells.orders[kept]
     return Seen(cells.times, cells.moments, orders / orders.max(initial=1e-9), phase[kept],
-                precision[kept]), kept
+                precision[kept], (still.real / size - 1.0)[kept]), kept
 
 
 def _mean(values: NDArray[np.generic], width: int) -> ComplexArray:
@@ -198,10 +202,14 @@ def _mean(values: NDArray[np.generic], width: int) -> ComplexArray:
                       + 1j * uniform_filter1d(values.imag, width, axis=1, mode='nearest'))
 
 
-def _misfit(seen: Seen, posterior: Posterior) -> FloatArray:
-    """Return the variance (line,) of the residuals over what the noise of the cells makes."""
+def _misfit(seen: Seen, posterior: Posterior) -> tuple[FloatArray, FloatArray]:
+    """Return variances (line,) over those of white noise: of residuals, and of the slow noise."""
     rows, precision = seen.rows, seen.precision
     known = np.sum((rows @ posterior.pairs) * rows, axis=2).T
     left = np.sum((precision > 0.0) * (1.0 - precision * known), axis=1)
-    return np.asarray(np.sum(precision * posterior.rest**2, axis=1)
-                      / np.maximum(left, 1.0) / _WHITE)
+    found = np.sum(precision * posterior.rest**2, axis=1) / np.maximum(left, 1.0) / _WHITE
+    # The phase follows what is slow in the noise; the amplitude shows how much of that there is.
+    band = max(int(0.5 * np.sum(precision * known)), _FEWEST_BINS)
+    slow = np.abs(np.fft.rfft(np.sqrt(precision) * seen.amplitude, axis=1)[:, 1:band + 1]) ** 2
+    level = slow.mean(axis=1) / np.maximum(np.count_nonzero(precision, axis=1), 1)
+    return found, np.where(level > 1.0 + 3.0 / np.sqrt(slow.shape[1]), level, 1.0)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sa_jitter_ros.errors import SignalError
 from sa_jitter_ros.tacholess.evidence import comb, Spectra, spectra_of
-from sa_jitter_ros.tacholess.path import best_path, without
+from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
 FloatArray = NDArray[np.float64]
 
@@ -61,11 +61,17 @@ class _Track:
     total: float
     other: float
     other_speed: float
+    near: float
 
     @property
     def margin(self) -> float:
-        """Return by how much a frame speaks for the path, rather than for another."""
-        return (self.total - max(self.other, 0.0)) / len(self.path)
+        """
+        Return by how much a frame speaks for the path, rather than for another.
+
+        In the share `near` of the speeds no other could be told from it.
+        """
+        other = max(self.other, _AMBIGUOUS * self.near * self.total)
+        return (self.total - other) / len(self.path)
 
 
 def rough_speed(vibration: FloatArray, sample_rate: float, orders: FloatArray,
@@ -101,9 +107,10 @@ def _track(spectra: Spectra, orders: FloatArray, speed_range: tuple[float, float
     evidence = comb(spectra, speeds, orders)
     path, total = best_path(evidence, largest)
     near = np.ceil(_NEAR * spectra.step / (orders.min() * speeds[path]) / step).astype(np.intp)
-    other, other_total = best_path(without(evidence, path, near), largest)
+    apart = without(evidence, path, near)
+    other, other_total = best_path(apart, largest)
     return _Track(spectra, speeds, evidence, path, total, other_total,
-                  float(np.median(speeds[other])))
+                  float(np.median(speeds[other])), float(np.mean(apart <= RULED_OUT)))
 
 
 def _by_order(spectra: Spectra, speed: FloatArray, orders: FloatArray) -> FloatArray:
@@ -132,8 +139,8 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
     if edge > _AT_EDGE:
         raise SignalError(f'the speed stays at the end of speed_range, {ranged}: widen it')
     for ratio in _RATIOS:
-        if low <= ratio * middle <= high:
-            continue  # a path there has been compared
+        if np.mean(found > _PRESENT) > 0.5 or low <= ratio * middle <= high:
+            continue  # most orders are there, or a path at this speed has been compared
         other = max(float(_by_order(track.spectra, speed * ratio * shift, orders).sum())
                     for shift in (0.998, 1.0, 1.002))
         if other > _BETTER * found.sum():

@@ -56,7 +56,7 @@ class Seen:
 
     `times` (cell,); `moments` (cell, 2) of the time from them, and of its square, over the taper;
     `orders` (line,) over the highest; `phase` (line, cell) in rad with `precision` (line, cell),
-    which is 0 where a line shows nothing.
+    which is 0 where a line shows nothing; `amplitude` (line, cell) over its running mean, less 1.
     """
 
     times: FloatArray
@@ -64,6 +64,7 @@ class Seen:
     orders: FloatArray
     phase: FloatArray
     precision: FloatArray
+    amplitude: FloatArray
 
     @cached_property
     def unit(self) -> float:
