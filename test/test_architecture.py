@@ -44,6 +44,8 @@ CORE = {
         'asammdf', 'errors', 'h5py', 'nptdms', 'parameters', 'pulses', 'pyuff', 'rosbags',
         'samples'},
     'simulation': SCIENCE | {'errors'},
+    'tacholess': SCIENCE | {
+        'averaging', 'errors', 'machine', 'parameters', 'recordings'},
     'inference': SCIENCE | {
         'averaging', 'effects', 'errors', 'number_text', 'prediction', 'pulses', 'recordings',
         'samples'},
@@ -54,7 +56,7 @@ CORE = {
     'offline': SCIENCE | {
         'averaging', 'distributed', 'errors', 'json_values', 'keyphasor_check', 'loop', 'machine',
         'matplotlib', 'monitoring', 'parameter_file', 'parameters', 'pulses', 'recordings',
-        'samples'},
+        'samples', 'tacholess'},
     'report': SCIENCE | {
         'averaging', 'effects', 'errors', 'inference', 'json_values', 'matplotlib',
         'number_text', 'parameter_file', 'prediction', 'pulses', 'recordings', 'version'},

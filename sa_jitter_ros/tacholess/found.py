@@ -54,12 +54,13 @@ class CorrectedAmplitudes:
     """
     Amplitudes of an average by found pulses, and how they were corrected.
 
-    `amplitudes` (channel, order) are complex peaks with `standard_errors`; `how` (order,) says
-    whether an order is free of bias because its own noise had no part in the pulses.
+    `amplitudes` (channel, order) are complex peaks with `standard_errors`; `expected` is what was
+    undone; `how` (order,) says whether the noise of an order had a part in the pulses.
     """
 
     amplitudes: ComplexArray
     standard_errors: FloatArray
+    expected: ExpectedAmplitudes
     how: tuple[str, ...]
 
 
@@ -83,6 +84,7 @@ class FoundPulses:
     used: tuple[tuple[float, int], ...]
     reason: str
     channels: int
+    start_time: float
     _phase: Phase = field(repr=False)
     _rows: FloatArray = field(repr=False)
     _nodes: NDArray[np.intp] = field(repr=False)
@@ -91,28 +93,18 @@ class FoundPulses:
     def between(cls, phase: Phase, first: int, last: int, start: float, orders: FloatArray,
                 channels: int, reason: str) -> 'FoundPulses':
         """Return the pulses between two nodes of a phase."""
-        nodes, states = phase.seen.nodes[first:last + 1], phase.states[first:last + 1]
-        turns = np.arange(math.ceil(states[0, 0]), math.floor(states[-1, 0]) + 1)
-        times = np.interp(turns, states[:, 0], nodes)
-        for _ in range(4):
-            times = times - (phase.angle(times) - turns) / phase.speed(times)
-        times = np.clip(times, nodes[0], nodes[-1])
+        ends = phase.states[[first, last], 0]
+        times = phase.times_of(np.arange(math.ceil(ends[0]), math.floor(ends[1]) + 1))
         place, rows, slopes = phase.rows(times)
         speed = phase.speed(times)
-        shown = cls(times + start, times, speed, speed, tuple(orders.tolist()), tuple(zip(
-            phase.cells.orders.tolist(), phase.cells.channels.tolist())), reason, channels, phase,
-            rows, place)
-        own = phase.variance(place, rows)
-        mean = shown._with_mean()
-        about = np.sqrt(np.maximum(own - 2.0 * mean + mean.mean(), 0.0))
-        return cls(shown.times, about / speed, speed, np.sqrt(phase.variance(place, slopes)),
-                   shown.orders, shown.used, reason, channels, phase, rows, place)
-
-    def _with_mean(self) -> FloatArray:
-        """Return the covariance (pulse,) in turns^2 of each pulse's angle with that of all."""
-        together = self._phase.right(self._nodes, self._rows, np.full((len(self.times), 1), 1.0 / len(
-            self.times)))
-        return self._phase.seen_by(self._nodes, self._rows, together)[:, 0]
+        # About the mean over all pulses: what they have in common is the arbitrary angle.
+        together = phase.right(place, rows, np.full((times.size, 1), 1.0 / times.size))
+        mean = phase.seen_by(place, rows, together)[:, 0]
+        variance = phase.variance(place, rows) - 2.0 * mean + mean.mean()
+        return cls(times + start, np.sqrt(np.maximum(variance, 0.0)) / speed, speed,
+                   np.sqrt(phase.variance(place, slopes)), tuple(orders.tolist()), tuple(zip(
+                       phase.cells.orders.tolist(), phase.cells.channels.tolist())), reason,
+                   channels, start, phase, rows, place)
 
     def angle_covariance(self, first: int, count: int) -> FloatArray:
         """Return the covariance (pulse, pulse) in rad^2 of the angle at pulses in a row."""
@@ -165,6 +157,23 @@ class FoundPulses:
             wanted, mean, np.sqrt(np.maximum(square - mean**2, 0.0)),
             np.where(used, mean * np.exp(inside), mean), used)
 
+    def bridged(self, pulse_times: ArrayLike, pulses_per_revolution: int = 1) -> FloatArray:
+        """
+        Return the pulses of a tach (pulse,) in s with those that it lost put in.
+
+        They divide each gap evenly by the angle found. Gaps beyond the pulses found stay.
+        """
+        times = np.sort(np.asarray(pulse_times, dtype=np.float64))
+        inside = (times >= self.times[0]) & (times <= self.times[-1])
+        angle = self._phase.angle(times - self.start_time)
+        count = np.rint(np.diff(angle) * pulses_per_revolution).astype(int)
+        lost = [np.linspace(angle[k], angle[k + 1], count[k] + 1)[1:-1]
+                for k in np.flatnonzero((count > 1) & inside[1:] & inside[:-1])]
+        if not lost:
+            return times
+        return np.sort(np.concatenate([times, self.start_time + self._phase.times_of(
+            np.concatenate(lost))]))
+
     def correct(self, average: Average, *, ratio: float = 1.0) -> CorrectedAmplitudes:
         """
         Return the amplitudes of an average by these pulses, without what their errors did.
@@ -181,7 +190,7 @@ class FoundPulses:
         how = tuple('bias corrected: its own phase was used' if used else
                     'free of bias: other lines or channels were used'
                     for used in expected.used.any(axis=0))
-        return CorrectedAmplitudes(amplitudes, errors, how)
+        return CorrectedAmplitudes(amplitudes, errors, expected, how)
 
 
 def _amplitudes(errors: FloatArray, orders: FloatArray, seed: int) -> FloatArray:

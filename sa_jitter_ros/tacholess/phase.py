@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complex128]
 
 _WIDTHS = (8, 32, 128)  # cells over which the own phase of a line is constant, at first and later
 _PASSES = 3
+_NEWTON = 4  # steps to a time of a pulse
 MOST_LINES = 8
 _WHITE = 0.75  # of the variance of overlapping cells remains where their noise is white
 _STRANGE = 25.0  # squared residual over its variance that no noise makes
@@ -70,6 +71,15 @@ class Phase:
             after = times[outside] - nodes[end]
             found[outside] = states[end, 0] + after * (states[end, 1] + 0.5 * after * bends[end])
         return np.asarray(found)
+
+    def times_of(self, turns: FloatArray) -> FloatArray:
+        """Return when the angle is so many revolutions, between the nodes."""
+        nodes, states = self.seen.nodes, self.states
+        times = np.interp(turns, states[:, 0], nodes)
+        for _ in range(_NEWTON):
+            times = np.clip(times - (self.angle(times) - turns) / self.speed(times),
+                            nodes[0], nodes[-1])
+        return np.asarray(times)
 
     def rows(self, times: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
         """
