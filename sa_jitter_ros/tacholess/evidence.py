@@ -111,7 +111,10 @@ def comb(spectra: Spectra, speeds: FloatArray, orders: FloatArray) -> NDArray[np
     found = np.zeros((len(spectra.times), len(speeds)), np.float32)
     last = spectra.evidence.shape[1] - 1
     for order in orders:
-        place = np.rint(order * speeds / spectra.step).astype(int)
-        within = place <= last
-        found[:, within] += spectra.evidence[:, place[within]]
+        place = order * speeds / spectra.step
+        place = place[place < last]
+        below = place.astype(int)
+        share = (place - below).astype(np.float32)
+        found[:, :place.size] += (1.0 - share) * spectra.evidence[:, below]
+        found[:, :place.size] += share * spectra.evidence[:, below + 1]
     return found

@@ -30,6 +30,7 @@ _MOST_CELLS = 4000
 _FEWEST_CELLS = 24
 _LOST = 0.02  # turns of the highest order by which its angle may be unknown from node to node
 _SURPRISE = 0.4  # rad of the highest order that a cell may differ from what is foreseen
+_COMPARED, _SLIPPED = 12, 1.0  # cells within which phase and spectra part by so many turns
 _SAME = 1e-6  # relative
 
 
@@ -81,7 +82,7 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     if phase is None:
         raise SignalError('no line is strong and steady enough to follow its phase: give other '
                           'orders, fewer in hold_out, or a sensor nearer to their source')
-    first, last, reason = _stretch(phase, start)
+    first, last, reason = _stretch(phase, rough, start)
     return FoundPulses.between(phase, first, last, start, wanted, len(samples), reason)
 
 
@@ -146,13 +147,14 @@ def _phase(samples: FloatArray, rate: float, rough: Rough, lines: list[tuple[flo
     return phase_of(samples, rate, angle, revolutions, lines)
 
 
-def _stretch(phase: Phase, start: float) -> tuple[int, int, str]:
+def _stretch(phase: Phase, rough: Rough, start: float) -> tuple[int, int, str]:
     """Return the first and last node of the longest stretch in which the phase is known."""
     pairs, width = phase.posterior.pairs, phase.posterior.mode.shape[1]
     step = np.sqrt(pairs[:, 0, 0] + pairs[:, width, width] - 2.0 * pairs[:, 0, width])
     cells = np.diff(phase.seen.nodes) / phase.seen.unit
     surprise = np.sqrt(phase.walk.shaft * cells**5 / 20.0)  # of the angle, by a change of the jerk
     known = (step / (2.0 * np.pi) < _LOST) & (surprise < _SURPRISE)
+    known &= _agree(phase, rough)
     known[[0, -1]] = False  # no cell beyond it
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
     begins, ends = edges[::2], edges[1::2]
@@ -166,3 +168,14 @@ def _stretch(phase: Phase, start: float) -> tuple[int, int, str]:
         ('before', first, 1), ('after', last, len(known) - 1)) if k != end]
     return first, last, (f'{" and ".join(lost)} the lines are too weak, or change too fast, to '
                          'follow their phase' if lost else '')
+
+
+def _agree(phase: Phase, rough: Rough) -> NDArray[np.bool_]:
+    """Return in which cells (cell,) phase and spectra have the same speed."""
+    nodes = phase.seen.nodes
+    speed = np.exp(np.interp(nodes, rough.times, np.log(rough.speed)))
+    turns = np.cumsum((phase.states[:, 1] - speed) * np.gradient(nodes)) * phase.highest
+    cells = min(_COMPARED, len(nodes) // 2)
+    apart = np.abs(turns[cells:] - turns[:-cells]) > _SLIPPED
+    wrong = np.convolve(apart, np.ones(cells), mode='full') > 0.5
+    return np.asarray(~wrong[:len(nodes) - 1])

@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complex128]
 _PIECE = 1 << 19  # samples of a channel at a time, so that memory stays small
 _CAP = 4.0  # amplitude over noise beyond which a line has no more to say of the first phase
 _TURN = 0.6  # of the strongest order, between cells, within which the first phase is sought
+_USUAL = 0.25  # of it, beyond which a change is unlikely
 _OVERLAP = 4.0 / 3.0  # noise of tapered cells that overlap by half, over that of single ones
 NOISE_CELLS = 64  # over which noise is constant
 
@@ -146,5 +147,6 @@ def first_correction(cells: Cells) -> FloatArray:
     highest = cells.orders.max()
     steps = np.linspace(-_TURN, _TURN, 97) / highest
     agreement = np.real(np.exp(-2j * np.pi * steps[:, None] * cells.orders) @ turns)
+    agreement -= len(seen) * (steps[:, None] * highest / _USUAL) ** 2
     path, _ = best_path(agreement.T.astype(np.float32), 12.0)
     return np.concatenate([[0.0], np.cumsum(uniform_filter1d(steps[path], 3, mode='nearest'))])

@@ -22,6 +22,7 @@ FloatArray = NDArray[np.float64]
 
 _WINDOWS = (24.0, 12.0, 6.0, 3.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
+_STEP = 0.35  # of a bin of the highest order, between speeds
 _COARSEST = 0.02  # step of the speeds, relative
 _NEAR = 2.5  # bins of the lowest order within which a path is the same
 _AMBIGUOUS = 0.8  # share of the evidence of the best path that no other may have
@@ -29,6 +30,7 @@ _BETTER = 1.25  # and that no other ratio outside the range may exceed
 _PRESENT = 0.4  # nats a frame, of an order that is there
 _AT_EDGE = 0.3  # share of the frames in which the speed may be at the end of its range
 _RATIOS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
+_AGAIN = 2  # times that the path is sought about the one before
 _FINER = 0.04  # relative change of the speed that the second path may make
 
 
@@ -94,13 +96,15 @@ def rough_speed(vibration: FloatArray, sample_rate: float, orders: FloatArray,
     speed = best.speeds[best.path]
     _require_one(best, speed, orders, speed_range)
     found = Rough(best.spectra.times, speed, _by_order(best.spectra, speed, orders))
-    return _finer(vibration, sample_rate, orders, found, spacing)
+    for _ in range(_AGAIN):
+        found = _finer(vibration, sample_rate, orders, found, spacing)
+    return found
 
 
 def _track(spectra: Spectra, orders: FloatArray, speed_range: tuple[float, float],
            maximum_rate: float) -> _Track:
     low, high = np.log(speed_range)
-    step = min(0.5 * spectra.step / (orders.max() * np.exp(high)), _COARSEST)
+    step = min(_STEP * spectra.step / (orders.max() * np.exp(high)), _COARSEST)
     speeds = np.exp(np.linspace(low, high, int((high - low) / step) + 2))
     step = float(np.log(speeds[1] / speeds[0]))
     largest = maximum_rate * (spectra.times[1] - spectra.times[0]) / step
