@@ -42,7 +42,7 @@ def find_pulses(vibration: ArrayLike, sample_rate: float, *,
     Return when the tach shaft begins its revolutions, found from the vibration alone.
 
     `vibration` (channel, sample), or (sample,) for one channel, has lines at `orders`, multiples
-    of the speed of the tach shaft; with a `machine` they are its shafts and meshes. The speed is
+    of the speed of the tach shaft; with a `machine` they are those of its meshes. The speed is
     sought within `speed_range`, (lowest, highest) in Hz; it changes by at most `maximum_rate`,
     relative and per s. Samples that are not finite are gaps. The phase of orders in `hold_out` is
     not used: averages of them are free of bias. Where phase 0 lies on the shaft is arbitrary.
@@ -108,10 +108,8 @@ def _orders(orders: Sequence[float] | None, machine: Machine | None) -> FloatArr
         if not isinstance(machine, Machine):
             raise ParameterError(f'machine is of type {type(machine).__name__}: give a Machine, '
                                  'Machine.read(path)')
-        places = machine.places()
-        orders = [machine.ratio(shaft) for shaft in machine.shafts] + [
-            order for name, order in places.items()
-            if name.startswith('mesh ') and name.endswith('x')]
+        orders = [order for name, order in machine.places().items()
+                  if name.startswith('mesh ') and name.endswith('x')]
     found = np.unique(np.round(numbers('orders', orders), 9))
     if not found.size or not np.all(np.isfinite(found)) or found[0] <= 0.0:
         raise ParameterError(f'orders are {found.tolist()}: give one or more, all above 0')

@@ -88,6 +88,8 @@ class FoundPulses:
     _phase: Phase = field(repr=False)
     _rows: FloatArray = field(repr=False)
     _nodes: NDArray[np.intp] = field(repr=False)
+    _expected: dict[tuple[bytes, int], ExpectedAmplitudes] = field(
+        init=False, repr=False, default_factory=dict)
 
     @classmethod
     def between(cls, phase: Phase, first: int, last: int, start: float, orders: FloatArray,
@@ -137,6 +139,12 @@ class FoundPulses:
         Raises ParameterError for fewer than 2 revolutions, or more than there are.
         """
         wanted = np.asarray(numbers('orders', orders))
+        if (wanted.tobytes(), revolutions) not in self._expected:
+            self._expected[wanted.tobytes(), revolutions] = self._find_expected(
+                wanted, revolutions)
+        return self._expected[wanted.tobytes(), revolutions]
+
+    def _find_expected(self, wanted: FloatArray, revolutions: int) -> ExpectedAmplitudes:
         whole = len(self.times) - 1
         if not 2 <= revolutions <= whole:
             raise ParameterError(f'revolutions is {revolutions}: give 2 to {whole}, those between '

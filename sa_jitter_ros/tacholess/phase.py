@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 _WIDTHS = (8, 32, 128)  # cells over which the own phase of a line is constant, at first and later
-_PASSES = 3
+_PASSES = 2
 _NEWTON = 4  # steps to a time of a pulse
 MOST_LINES = 8
 _WHITE = 0.75  # of the variance of overlapping cells remains where their noise is white

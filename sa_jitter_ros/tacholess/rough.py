@@ -20,16 +20,16 @@ from sa_jitter_ros.tacholess.path import best_path, RULED_OUT, without
 
 FloatArray = NDArray[np.float64]
 
-_WINDOWS = (24.0, 12.0, 6.0, 3.0)  # revolutions, if the orders are one apart
+_WINDOWS = (24.0, 12.0, 6.0)  # revolutions, if the orders are one apart
 _FRAMES = 6  # in a recording, at least
 _STEP = 0.35  # of a bin of the highest order, between speeds
 _COARSEST = 0.02  # step of the speeds, relative
 _NEAR = 2.5  # bins of the lowest order within which a path is the same
 _AMBIGUOUS = 0.8  # share of the evidence of the best path that no other may have
-_BETTER = 1.25  # and that no other ratio outside the range may exceed
+_FEW = 0.4  # less of it, if there is only one order
 _PRESENT = 0.4  # nats a frame, of an order that is there
 _AT_EDGE = 0.3  # share of the frames in which the speed may be at the end of its range
-_RATIOS = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2.0, 3.0, 4.0)
+_STILL = 12.0  # revolutions of a window, where run-ups stand still
 _AGAIN = 2  # times that the path is sought about the one before
 _FINER = 0.04  # relative change of the speed that the second path may make
 
@@ -97,7 +97,9 @@ def rough_speed(vibration: FloatArray, sample_rate: float, orders: FloatArray,
     _require_one(best, speed, orders, speed_range)
     found = Rough(best.spectra.times, speed, _by_order(best.spectra, speed, orders))
     for _ in range(_AGAIN):
+        _require_most(found, orders)
         found = _finer(vibration, sample_rate, orders, found, spacing)
+    _require_most(found, orders)
     return found
 
 
@@ -134,23 +136,23 @@ def _require_one(track: _Track, speed: FloatArray, orders: FloatArray,
     if track.total <= 0.0 or found.max() < _PRESENT:
         raise SignalError(f'no lines of the orders {_text(orders)} stand out {ranged}: give the '
                           'orders that the vibration has, or a sensor nearer to their source')
-    middle = float(np.median(speed))
-    if track.other > _AMBIGUOUS * track.total:
+    if track.other > (_AMBIGUOUS - _FEW / len(orders)**2) * track.total:
         raise SignalError(
-            f'two combs of the orders {_text(orders)} fit, at {middle:.4g} Hz and at '
+            f'two combs of the orders {_text(orders)} fit, at {np.median(speed):.4g} Hz and '
+            'at '
             f'{track.other_speed:.4g} Hz: narrow speed_range, or give more orders of the machine')
     edge = np.mean((track.path <= 1) | (track.path >= len(track.speeds) - 2))
     if edge > _AT_EDGE:
         raise SignalError(f'the speed stays at the end of speed_range, {ranged}: widen it')
-    for ratio in _RATIOS:
-        if np.mean(found > _PRESENT) > 0.5 or low <= ratio * middle <= high:
-            continue  # most orders are there, or a path at this speed has been compared
-        other = max(float(_by_order(track.spectra, speed * ratio * shift, orders).sum())
-                    for shift in (0.998, 1.0, 1.002))
-        if other > _BETTER * found.sum():
-            raise SignalError(
-                f'the orders {_text(orders)} fit better at {ratio * middle:.4g} Hz, outside '
-                f'speed_range, than at {middle:.4g} Hz: check orders and speed_range')
+
+
+def _require_most(found: Rough, orders: FloatArray) -> None:
+    """Raise SignalError unless most orders are there: half of them may be those of a multiple."""
+    present = np.count_nonzero(found.evidence > _PRESENT)
+    if 2 * present <= len(orders):
+        raise SignalError(f'only {present} of the orders {_text(orders)} stand out at '
+                          f'{np.median(found.speed):.4g} Hz, which may be a guess: give those that '
+                          'the vibration has')
 
 
 def _text(orders: FloatArray) -> str:
@@ -170,20 +172,13 @@ def _finer(vibration: FloatArray, sample_rate: float, orders: FloatArray, rough:
     before = np.minimum(place.astype(np.intp), samples - 2)
     share = place - before
     turned = vibration[:, before] * (1.0 - share) + vibration[:, before + 1] * share
-    tracks = []
-    for revolutions in _WINDOWS[1:3]:
-        if ((angle[-1] - angle[0]) * spacing / revolutions - 1.0) * 4.0 < _FRAMES:
-            continue
-        spectra = spectra_of(turned, rate, revolutions / spacing,
-                             min(orders.max() * (1.0 + _FINER), 0.49 * rate))
-        tracks.append(_track(spectra, orders, (1.0 - _FINER, 1.0 + _FINER),
-                             _FINER / (spectra.times[1] - spectra.times[0])))
-    if not tracks:
+    seconds = _STILL / spacing  # a turn is the second of this time
+    if ((angle[-1] - angle[0]) / seconds - 1.0) * 4.0 < _FRAMES:
         return rough
-    best = max(tracks, key=lambda track: track.total / len(track.path))
-    ratio = best.speeds[best.path]
-    middle = best.spectra.times + angle[0]
-    return Rough(np.interp(middle, angle, np.arange(samples) / sample_rate),
-                 ratio * np.exp(np.interp(np.interp(middle, even, times), rough.times,
-                                          np.log(rough.speed))),
-                 _by_order(best.spectra, ratio, orders))
+    spectra = spectra_of(turned, rate, seconds, min(orders.max() * (1.0 + _FINER), 0.49 * rate))
+    track = _track(spectra, orders, (1.0 - _FINER, 1.0 + _FINER),
+                   _FINER / (spectra.times[1] - spectra.times[0]))
+    ratio = track.speeds[track.path]
+    middle = np.interp(spectra.times + angle[0], even, times)
+    return Rough(middle, ratio * np.exp(np.interp(middle, rough.times, np.log(rough.speed))),
+                 _by_order(spectra, ratio, orders))
